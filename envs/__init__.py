@@ -1,0 +1,71 @@
+"""Tasks with hidden physics, and the registry: `names`, `get`, `make`, `make_vec`, `make_dm`.
+
+A new task is one file, one MJCF and one import line here. Importing this package also registers every task with
+gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v0")` works.
+"""
+
+from __future__ import annotations
+
+import difflib
+
+import gymnasium
+
+from envs.adapters import DmEnv, GymEnv, GymVectorEnv
+from envs.bandit import Bandit
+from envs.batch import BatchEnv
+from envs.physics import MujocoTask
+from envs.slippery_cartpole import SlipperyCartpole
+from envs.task import InputError, Latent, Task
+from envs.tilted_cartpole import TiltedCartpole
+
+__all__ = ["BatchEnv", "InputError", "Latent", "MujocoTask", "Task", "get", "make", "make_dm", "make_vec", "names"]
+
+TASKS: dict[str, type[Task]] = {cls.name: cls for cls in (Bandit, TiltedCartpole, SlipperyCartpole)}
+
+
+def names() -> list[str]:
+    """The registered tasks."""
+    return list(TASKS)
+
+
+def closest(kind: str, given: str, known: list[str]) -> InputError:
+    """The error for a name that is not known: it names the nearest one."""
+    near = difflib.get_close_matches(given, known, 1, 0.3)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}")
+
+
+def get(name: str) -> Task:
+    """The task of that name. Raises InputError, naming the nearest, if there is none."""
+    if name not in TASKS:
+        raise closest("task", name, names())
+    return TASKS[name]()
+
+
+def make(name: str, privileged: bool = False, render_mode: str | None = None) -> GymEnv:
+    """A gymnasium environment; `privileged` appends theta to the observation, for experts."""
+    return GymEnv(get(name), privileged, render_mode)
+
+
+def make_vec(name: str, n: int, privileged: bool = False) -> GymVectorEnv:
+    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool."""
+    return GymVectorEnv(get(name), n, privileged)
+
+
+def make_registered_vec(name: str, num_envs: int = 1, privileged: bool = False) -> GymVectorEnv:
+    """`make_vec` as gymnasium.make_vec calls it."""
+    return make_vec(name, num_envs, privileged)
+
+
+def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmEnv:
+    """A dm_env environment."""
+    return DmEnv(get(name), privileged, seed)
+
+
+for _task in (cls() for cls in TASKS.values()):
+    gymnasium.register(
+        _task.gym_id,
+        entry_point="envs:make",
+        vector_entry_point="envs:make_registered_vec",
+        kwargs={"name": _task.name},
+    )

@@ -1,0 +1,65 @@
+"""The five-armed bandit of the paper, Eq. (4). One arm, theta, pays more often; the expert knows which.
+
+Tier 2. State and observation: the last pay-out (0 at the start). The reward counts best-arm pulls, the paper's own
+score; the pay-out itself is in the observation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs.task import Array, Latent, Painter, Task
+
+ARMS = 5
+
+
+class Bandit(Task):
+    name = "bandit"
+    latents = (Latent("best_arm", "", 0, ARMS - 1, "categorical"),)
+    horizon = 100
+    episodes = 1
+    action_space = spaces.Discrete(ARMS)
+    observation = {"payout": (0.0, 1.0)}
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        return np.zeros(1)
+
+    def sample_noise(self, rng: np.random.Generator) -> Array:
+        return rng.random((self.horizon, 1))
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        """P(s' = 1 | a, theta) [N, 1]: 3/4 for the best arm, 1/4 for the others."""
+        return np.where(action == theta, 0.75, 0.25)
+
+    def apply_noise(self, outcome: Array, noise: Array) -> Array:
+        return (noise < outcome).astype(float)
+
+    def log_prob(self, next_state: Array, outcome: Array) -> Array:
+        return np.log(np.where(next_state == 1, outcome, 1 - outcome))[..., 0]
+
+    def observe(self, state: Array) -> Array:
+        return state
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        return (action == theta)[:, 0].astype(float)
+
+    def expert_probs(self, obs: Array, theta: Array) -> Array:
+        """pi_exp(a | s, theta): 6/10 for the best arm, 1/10 for each of the others."""
+        return np.where(np.arange(ARMS) == theta, 0.6, 0.1)
+
+    def painter(self, theta: Array) -> Painter:
+        """Five arms; the best has a green base, the pulled one is filled: bright if it paid."""
+
+        def paint(state: Array, action: Array) -> NDArray[np.uint8]:
+            picture = np.full((240, 320, 3), 255, np.uint8)
+            for arm in range(ARMS):
+                columns = slice(60 * arm + 22, 60 * arm + 58)
+                picture[60:150, columns] = 225
+                picture[165:180, columns] = (40, 160, 70) if arm == theta[0] else 200
+                if arm == action[0]:
+                    picture[60:150, columns] = (250, 190, 40) if state[0] == 1 else (110, 110, 110)
+            return picture
+
+        return paint

@@ -1,0 +1,31 @@
+"""What the cartpole tasks share: a cart on a rail holds a mark while its pole stays up, on an axle, under process noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envs.physics import MujocoTask
+from envs.task import Array
+
+
+class Cartpole(MujocoTask):
+    """Joints `slider` (m) and `hinge` (rad, 0 is upright); action: the drive's force in units of its gear."""
+
+    horizon = 150
+    expert_noise = 0.02
+    process_noise = {"slider": (0.004, 0.1), "hinge": (0.004, 0.1)}
+    observation = {"x": (-4, 4), "cos": (-1, 1), "sin": (-1, 1), "velocity": (-20, 20), "pole_velocity": (-40, 40)}
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        x, pole, velocity, pole_velocity = rng.uniform(-1, 1, 4) * (0.5, 0.05, 0.05, 0.05)
+        return self.state(slider=(x, velocity), hinge=(pole, pole_velocity))
+
+    def observe(self, state: Array) -> Array:
+        pole = self.qpos(state, "hinge")
+        readings = [self.qpos(state, "slider"), np.cos(pole), np.sin(pole)]
+        return np.stack([*readings, self.qvel(state, "slider"), self.qvel(state, "hinge")], -1)
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        upright = (1 + np.cos(self.qpos(next_state, "hinge"))) / 2
+        at_mark = np.exp(-0.5 * (self.qpos(next_state, "slider") / 0.25) ** 2)
+        return upright * (0.3 + 0.7 * at_mark)

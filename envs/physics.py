@@ -1,0 +1,219 @@
+"""MuJoCo, batched: one model per environment in one mujoco.rollout thread pool. The only file that steps MuJoCo."""
+
+from __future__ import annotations
+
+import copy
+import os
+from abc import abstractmethod
+from functools import cached_property
+from typing import ClassVar, Protocol
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from envs import render
+from envs.task import ASSETS, Array, Painter, Simulator, Task
+
+STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+class Edit(Protocol):
+    """What a latent may change in a model, by the element's name; values are absolute or times the MJCF's own."""
+
+    def body_tilt(self, name: str, angle: float) -> None:
+        """Turn a body about its parent's y axis; rad."""
+
+    def body_mass(self, name: str, scale: float) -> None:
+        """Scale a body's mass and inertia."""
+
+    def tendon_friction(self, name: str, value: float) -> None:
+        """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
+
+
+def _tilt(angle: float) -> list[float]:
+    return [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+
+
+class ModelEdit:
+    """Edits a compiled model in place. Nominal values are kept, so that scales never compound."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.model, self._nominal, self._data = model, copy.copy(model), mujoco.MjData(model)
+
+    def body_tilt(self, name: str, angle: float) -> None:
+        self.model.body(name).quat[:] = _tilt(angle)
+
+    def body_mass(self, name: str, scale: float) -> None:
+        self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
+        self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
+
+    def tendon_friction(self, name: str, value: float) -> None:
+        self.model.tendon_frictionloss[self.model.tendon(name).id] = value
+
+    def finish(self) -> None:
+        """Recompute what MuJoCo derives from the edited fields (subtree masses, invweight0, ...)."""
+        mujoco.mj_setConst(self.model, self._data)
+
+
+class SpecEdit:
+    """The same edits before compilation: the reference that tests hold ModelEdit to."""
+
+    def __init__(self, spec: mujoco.MjSpec) -> None:
+        self.spec = spec
+
+    def body_tilt(self, name: str, angle: float) -> None:
+        self.spec.body(name).quat = _tilt(angle)
+
+    def body_mass(self, name: str, scale: float) -> None:
+        for geom in self.spec.body(name).geoms:
+            geom.mass *= scale
+
+    def tendon_friction(self, name: str, value: float) -> None:
+        self.spec.tendon(name).frictionloss = value
+
+
+class Physics(Simulator):
+    """n models, each with its own theta, stepped in a thread pool; OMP_NUM_THREADS sets its size."""
+
+    def __init__(self, task: MujocoTask, n: int) -> None:
+        super().__init__(task, n)
+        self._mujoco_task = task
+        self._edits = [ModelEdit(copy.copy(task.model)) for _ in range(n)]
+        self.models = [edit.model for edit in self._edits]
+        threads = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
+        self._threads = threads if threads > 1 else 0
+        self._pools: dict[int, rollout.Rollout] = {}
+        self._datas = [mujoco.MjData(task.model) for _ in range(max(threads, 1))]
+        for i in range(n):
+            self.set_theta(i, self.theta[i])
+
+    def set_theta(self, i: int, theta: Array) -> None:
+        self.theta[i] = theta
+        self._mujoco_task.apply_latent(self._edits[i], theta)
+        self._edits[i].finish()
+
+    def outcome(self, state: Array, action: Array) -> Array:
+        return self.rollout(state, action[:, None])[:, -1]
+
+    def rollout(self, state: Array, action: Array) -> Array:
+        """Open loop: states [N, S] and actions [N, T, A] -> noise-free states [N, T * substeps, S]."""
+        n, steps, substeps = len(state), action.shape[1], self._mujoco_task.substeps
+        control = np.repeat(self._mujoco_task.control(action), substeps, axis=1)
+        out = np.empty((n, steps * substeps, state.shape[1]))
+        models = self.models * (n // len(self.models))
+        threads = self._threads if n > 1 else 0
+        if threads not in self._pools:
+            self._pools[threads] = rollout.Rollout(nthread=threads)
+        # Arrays are float64 and contiguous already; without a warm start, the solver starts from scratch in every
+        # control step, so that the next state is a function of this state alone.
+        self._pools[threads].rollout(
+            models,
+            self._datas[: max(threads, 1)],
+            np.ascontiguousarray(state),
+            control,
+            nstep=steps * substeps,
+            state=out,
+            sensordata=np.empty((n, steps * substeps, models[0].nsensordata)),
+            skip_checks=True,
+        )
+        return out
+
+
+class MujocoTask(Task):
+    """A task whose outcome is MuJoCo's next state: x' = f(x, a, theta) + w, w ~ N(0, diag sigma^2), a control step.
+
+    The state [S] is MuJoCo's full physics state (time, qpos, qvel, act). Joints are read by name.
+    """
+
+    substeps: ClassVar[int] = 8
+    process_noise: ClassVar[dict[str, tuple[float, float]]]  # joint -> std of (position, velocity) a control step
+
+    @abstractmethod
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        """Set theta [L] in a model."""
+
+    def control(self, action: Array) -> Array:
+        """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default one to one."""
+        return action
+
+    def spec(self) -> mujoco.MjSpec:
+        """The nominal model, from assets/<name>.xml."""
+        return mujoco.MjSpec.from_file(str(ASSETS / f"{self.name}.xml"))
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The compiled nominal model. Never edited: environments copy it."""
+        return self.spec().compile()
+
+    @property
+    def control_dt(self) -> float:  # type: ignore[override]
+        return float(self.model.opt.timestep) * self.substeps
+
+    def qpos(self, state: Array, joint: str) -> Array:
+        """Position [...] of a hinge or slide joint in states [..., S]; rad or m."""
+        return state[..., 1 + self._address(joint)[0]]
+
+    def qvel(self, state: Array, joint: str) -> Array:
+        """Velocity [...] of a hinge or slide joint; rad/s or m/s."""
+        return state[..., 1 + self.model.nq + self._address(joint)[1]]
+
+    def state(self, **joints: tuple[float, float]) -> Array:
+        """A state [S] with the named joints' (position, velocity), all others at the MJCF's rest."""
+        state = np.zeros(mujoco.mj_stateSize(self.model, STATE.value))
+        state[1 : 1 + self.model.nq] = self.model.qpos0
+        for joint, (position, velocity) in joints.items():
+            q, v = self._address(joint)
+            state[1 + q], state[1 + self.model.nq + v] = position, velocity
+        return state
+
+    def _address(self, joint: str) -> tuple[int, int]:
+        if joint not in self._addresses:
+            accessor = self.model.joint(joint)
+            self._addresses[joint] = (int(accessor.qposadr[0]), int(accessor.dofadr[0]))
+        return self._addresses[joint]
+
+    @cached_property
+    def _addresses(self) -> dict[str, tuple[int, int]]:
+        return {}
+
+    @cached_property
+    def _noisy(self) -> tuple[NDArray[np.int64], Array]:
+        """Indices [Z] into the state and standard deviations [Z]."""
+        index, sigma = [], []
+        for joint, stds in self.process_noise.items():
+            q, v = self._address(joint)
+            index += [1 + q, 1 + self.model.nq + v]
+            sigma += list(stds)
+        return np.array(index), np.array(sigma)
+
+    def simulator(self, n: int) -> Physics:
+        return Physics(self, n)
+
+    def painter(self, theta: Array) -> Painter:
+        physics = self.simulator(1)
+        physics.set_theta(0, theta)
+        return render.Painter(physics.models[0])
+
+    def sample_noise(self, rng: np.random.Generator) -> Array:
+        return rng.standard_normal((self.horizon, len(self._noisy[0])))
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        physics = self.simulator(len(state))
+        for i, row in enumerate(theta):
+            physics.set_theta(i, row)
+        return physics.outcome(state, action)
+
+    def apply_noise(self, outcome: Array, noise: Array) -> Array:
+        index, sigma = self._noisy
+        outcome[:, index] += sigma * noise
+        return outcome
+
+    def log_prob(self, next_state: Array, outcome: Array) -> Array:
+        index, sigma = self._noisy
+        z = (next_state[..., index] - outcome[..., index]) / sigma
+        return -0.5 * (z**2).sum(-1) - np.log(sigma).sum() - 0.5 * len(sigma) * np.log(2 * np.pi)
+
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -1,0 +1,49 @@
+"""Pictures of MuJoCo states without a screen: EGL, else OSMesa, else InputError."""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import os
+import subprocess
+import sys
+from functools import cache
+
+import mujoco
+import numpy as np
+from mujoco.rendering.classic import gl_context
+from numpy.typing import NDArray
+
+from envs.task import Array, InputError
+
+_PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
+
+
+@cache
+def backend() -> str:
+    """The GL backend that works here: MUJOCO_GL if it is set, else egl or osmesa. Raises InputError if none does."""
+    # A failed import leaves PyOpenGL on the wrong platform, so each is tried in a process of its own.
+    wanted = os.environ.get("MUJOCO_GL")
+    for name in (wanted,) if wanted else ("egl", "osmesa"):
+        environ = {**os.environ, "MUJOCO_GL": name}
+        if subprocess.run([sys.executable, "-c", _PROBE], env=environ, capture_output=True).returncode == 0:
+            return name
+    raise InputError(f"no GL for pictures: tried {wanted or 'egl and osmesa'}; install libegl1 or libosmesa6")
+
+
+class Painter:
+    """Draws states of one model through its camera `view`. Raises InputError where no GL works."""
+
+    def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
+        if (name := backend()) in ("egl", "osmesa"):
+            gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
+        self._model, self._data = model, mujoco.MjData(model)
+        self._renderer = mujoco.Renderer(model, height, width)
+        atexit.register(self._renderer.close)  # before the GL library is gone
+
+    def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
+        """Full physics state [S] -> picture [H, W, 3]."""
+        mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, "view")
+        return self._renderer.render()

@@ -1,0 +1,41 @@
+"""A cartpole whose pole rides on a spinning axle; hidden Coulomb friction in the bearing drags the pole round.
+
+Tier 2. A motor in the cart spins the axle at a constant speed. A slippery bearing leaves the pole alone; a sticky one
+drags it with a torque of theta N m, and the pole must lean against the drag (its m g l is .49 N m). Expecting the
+wrong friction loses the mark or the pole, while one control step shows the friction only through process noise.
+
+Latent: friction, N m, uniform: the `frictionloss` of a fixed tendon over pole and axle joints (coefficients 1, -1).
+The axle turns faster than the pole ever does in play, so the drag has one sign. Noise and reward as in `Cartpole`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envs.cartpole import Cartpole
+from envs.physics import Edit
+from envs.task import Array, Latent
+
+SPIN = 10.0  # rad/s
+
+
+class SlipperyCartpole(Cartpole):
+    name = "slippery_cartpole"
+    latents = (Latent("friction", "N m", 0.0, 0.35),)
+    process_noise = {**Cartpole.process_noise, "axle": (0.004, 0.1)}
+    observation = {**Cartpole.observation, "slip": (-10, 10)}
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        edit.tendon_friction("bearing", float(theta[0]))
+
+    def control(self, action: Array) -> Array:
+        return np.concatenate([action, np.full_like(action, SPIN)], -1)
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        start = super().init_state(rng)
+        self.qvel(start, "axle")[...] = SPIN
+        return start
+
+    def observe(self, state: Array) -> Array:
+        """The cartpole's readings, and how far the axle's speed is off its set point (rad/s)."""
+        return np.append(super().observe(state), self.qvel(state, "axle")[..., None] - SPIN, -1)

@@ -1,0 +1,224 @@
+"""The task contract: one hidden-physics problem, stated once over a batch axis.
+
+Shape letters, used in the whole project:
+
+    N environments   S state         O observation   A action   L latents
+    B trials         E episodes      T steps         K grid values of theta
+    Z noise draws a step             D dimensions of a learned latent
+
+A *trial* is E episodes in a row under one hidden theta. A discrete action is one integer column, so that
+actions are always [N, A]. A task holds no state of its own: states, thetas and random streams are passed in.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal, Protocol
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+ASSETS = Path(__file__).resolve().parents[1] / "assets"
+
+
+class InputError(ValueError):
+    """Bad input from outside: one line that says what was given and what would be right."""
+
+
+@dataclass(frozen=True)
+class Latent:
+    """One hidden physical parameter and its distribution p(theta).
+
+    distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
+    low..high, equally likely.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
+
+    def ppf(self, u: Array) -> Array:
+        """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""
+        if self.distribution == "uniform":
+            return self.low + np.asarray(u) * (self.high - self.low)
+        if self.distribution == "loguniform":
+            return self.low * (self.high / self.low) ** np.asarray(u)
+        return np.floor(self.low + np.asarray(u) * (self.high - self.low + 1))
+
+    def cdf(self, theta: Array) -> Array:
+        """The inverse of ppf; for a categorical latent the lower edge of its bin."""
+        if self.distribution == "uniform":
+            return (theta - self.low) / (self.high - self.low)
+        if self.distribution == "loguniform":
+            return np.log(theta / self.low) / np.log(self.high / self.low)
+        return (theta - self.low) / (self.high - self.low + 1)
+
+    def grid(self, k: int) -> Array:
+        """[K] equally likely values: the mid-quantiles, or every category."""
+        if self.distribution == "categorical":
+            return np.arange(self.low, self.high + 1)
+        return self.ppf((np.arange(k) + 0.5) / k)
+
+    def encode(self, theta: Array) -> Array:
+        """theta [...] -> features [..., F]: one-hot if categorical, else 2 cdf - 1 in [-1, 1]."""
+        if self.distribution == "categorical":
+            return (np.asarray(theta)[..., None] == self.grid(0)).astype(float)
+        return (2 * self.cdf(np.asarray(theta)) - 1)[..., None]
+
+    @property
+    def features(self) -> int:
+        """F, the width of `encode`."""
+        return int(self.high - self.low) + 1 if self.distribution == "categorical" else 1
+
+
+class Painter(Protocol):
+    """State [S] and the action [A] that led to it -> picture [H, W, 3]."""
+
+    def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]: ...
+
+
+class Simulator:
+    """The noise-free part of p(s'|s, a, theta) for n thetas; environment i of a batch has theta number i mod n."""
+
+    def __init__(self, task: Task, n: int) -> None:
+        self.task, self.theta = task, np.tile([lat.low for lat in task.latents], (n, 1)).astype(float)
+
+    def set_theta(self, i: int, theta: Array) -> None:
+        """Give environment i the latents theta [L]."""
+        self.theta[i] = theta
+
+    def outcome(self, state: Array, action: Array) -> Array:
+        """State [N, S], action [N, A] -> what the noise acts on [N, ...], one control step later."""
+        return self.task.outcome(state, action, np.tile(self.theta, (len(state) // len(self.theta), 1)))
+
+
+class Task(ABC):
+    """A family of MDPs M_theta with theta ~ p(theta), an observation that hides theta, and a reward for scoring.
+
+    Transitions have two parts: a deterministic *outcome* (the next state of a physics engine, or the probability
+    of a pay-out) and noise that acts on it, so that p(s'|s, a, theta) has a closed form.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int] = 0
+    latents: ClassVar[tuple[Latent, ...]]
+    horizon: ClassVar[int]
+    episodes: ClassVar[int] = 5  # of one trial
+    control_dt: ClassVar[float] = 1.0  # s
+    expert_noise: ClassVar[float] = 0.0  # std of the expert's action around its mean; the action range is [-1, 1]
+    action_space: ClassVar[spaces.Box | spaces.Discrete]
+    observation: ClassVar[dict[str, tuple[float, float]]]  # name -> bounds, in the order of `observe`
+
+    @abstractmethod
+    def init_state(self, rng: np.random.Generator) -> Array:
+        """A start state [S] ~ p(s_0), independent of theta."""
+
+    @abstractmethod
+    def sample_noise(self, rng: np.random.Generator) -> Array:
+        """The unit noise of a whole episode [T, Z]."""
+
+    @abstractmethod
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        """The noise-free outcome [N, ...] of one control step; state [N, S], action [N, A], theta [N, L]."""
+
+    @abstractmethod
+    def apply_noise(self, outcome: Array, noise: Array) -> Array:
+        """Outcome [N, ...] and unit noise [N, Z] -> next state [N, S]."""
+
+    @abstractmethod
+    def log_prob(self, next_state: Array, outcome: Array) -> Array:
+        """log p(s'|s, a, theta) [...] of next states [..., S] whose noise-free outcome is given."""
+
+    @abstractmethod
+    def observe(self, state: Array) -> Array:
+        """State [N, S] -> observation [N, O], in the units of `observation`."""
+
+    @abstractmethod
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        """[N], at most one a step. Imitators never see it: it scores them."""
+
+    def terminated(self, state: Array) -> NDArray[np.bool_]:
+        """[N] whether the episode ends in this state; by default never."""
+        return np.zeros(len(state), bool)
+
+    def simulator(self, n: int) -> Simulator:
+        """n environments, each with its own theta."""
+        return Simulator(self, n)
+
+    def expert_probs(self, obs: Array, theta: Array) -> Array | None:
+        """[N, actions] of a closed-form expert; None where the expert is a network under assets/experts."""
+        return None
+
+    @abstractmethod
+    def painter(self, theta: Array) -> Painter:
+        """Draws one environment of that theta [L]. Raises InputError where no picture can be made."""
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """Finite bounds, which `observe` clips to."""
+        low, high = np.array(list(self.observation.values()), np.float32).T
+        return spaces.Box(low, high)
+
+    @property
+    def gym_id(self) -> str:
+        """deconf/SlipperyCartpole-v0, say."""
+        return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        """theta [L] ~ p(theta)."""
+        return np.array([lat.ppf(rng.random()) for lat in self.latents])
+
+    def theta_grid(self, k: int) -> Array:
+        """[K, L] equally likely thetas: the product of the latents' grids, k a latent."""
+        axes = np.meshgrid(*(lat.grid(k) for lat in self.latents), indexing="ij")
+        return np.stack([axis.ravel() for axis in axes], -1)
+
+    def encode_theta(self, theta: Array) -> Array:
+        """theta [..., L] -> features [..., F] of about unit size, for experts and oracles alone."""
+        return np.concatenate([lat.encode(theta[..., i]) for i, lat in enumerate(self.latents)], -1)
+
+    def check_theta(self, theta: object, n: int) -> Array:
+        """Any array-like -> [N, L]. Raises InputError for a wrong shape or a value out of bounds."""
+        try:
+            array = np.asarray(theta, float)
+            array = np.broadcast_to(array, (n, len(self.latents))).copy()
+        except (TypeError, ValueError):
+            raise InputError(
+                f"theta of {self.name} was {theta!r}; it must be {len(self.latents)} number(s), or one row for each"
+                f" of the {n} environment(s)"
+            ) from None
+        for i, lat in enumerate(self.latents):
+            bad = ~((array[:, i] >= lat.low) & (array[:, i] <= lat.high))
+            if lat.distribution == "categorical":
+                bad |= array[:, i] != np.floor(array[:, i])
+            if bad.any():
+                kind = "a whole number" if lat.distribution == "categorical" else "a number"
+                raise InputError(
+                    f"{lat.name} of {self.name} was {array[bad, i][0]:g}; it must be {kind} from {lat.low:g} to"
+                    f" {lat.high:g} {lat.unit}".rstrip()
+                )
+        return array
+
+    def check_action(self, action: object, n: int) -> Array:
+        """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist."""
+        width = 1 if isinstance(self.action_space, spaces.Discrete) else self.action_space.shape[0]
+        try:
+            array = np.asarray(action, float)
+        except (TypeError, ValueError):
+            raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
+        if array.shape != (n, width):
+            raise InputError(f"action of {self.name} had shape {array.shape}; it must be ({n}, {width})")
+        if not np.isfinite(array).all():
+            raise InputError(f"action of {self.name} held NaN or infinity; every entry must be a finite number")
+        if isinstance(self.action_space, spaces.Discrete):
+            if ((array != np.floor(array)) | (array < 0) | (array >= self.action_space.n)).any():
+                last = int(self.action_space.n) - 1
+                raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")
+            return array
+        return np.clip(array, self.action_space.low, self.action_space.high)

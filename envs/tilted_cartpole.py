@@ -1,0 +1,22 @@
+"""A cartpole on a rail that is tilted by a hidden angle.
+
+Tier 2. Gravity pulls cart and pole down the rail, so that both the angle at which the pole balances and the force that
+holds the cart move with theta: whoever expects the wrong tilt loses the pole. One control step shows the tilt only
+through process noise.
+
+Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward: upright * (.3 + .7 at the mark).
+"""
+
+from __future__ import annotations
+
+from envs.cartpole import Cartpole
+from envs.physics import Edit
+from envs.task import Array, Latent
+
+
+class TiltedCartpole(Cartpole):
+    name = "tilted_cartpole"
+    latents = (Latent("tilt", "rad", -0.3, 0.3),)
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        edit.body_tilt("rail", float(theta[0]))
