@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from envs.physics import MujocoTask
 from envs.task import Array
+
+FALLEN = 1.2  # rad
 
 
 class Cartpole(MujocoTask):
@@ -29,3 +32,7 @@ class Cartpole(MujocoTask):
         upright = (1 + np.cos(self.qpos(next_state, "hinge"))) / 2
         at_mark = np.exp(-0.5 * (self.qpos(next_state, "slider") / 0.25) ** 2)
         return upright * (0.3 + 0.7 * at_mark)
+
+    def terminated(self, state: Array) -> NDArray[np.bool_]:
+        """The pole has fallen. (Without this, experts whirl it round like a propeller, and theta hardly matters.)"""
+        return np.abs(self.qpos(state, "hinge")) > FALLEN

@@ -21,7 +21,7 @@ SPIN = 10.0  # rad/s
 
 class SlipperyCartpole(Cartpole):
     name = "slippery_cartpole"
-    latents = (Latent("friction", "N m", 0.0, 0.35),)
+    latents = (Latent("friction", "N m", 0.0, 0.3),)
     process_noise = {**Cartpole.process_noise, "axle": (0.004, 0.1)}
     observation = {**Cartpole.observation, "slip": (-10, 10)}
 

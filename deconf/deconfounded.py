@@ -1,0 +1,194 @@
+"""Deconfounded imitation learning, Tier 2: Algorithm 1 (training) and Algorithm 2 (deployment) of the paper.
+
+q_phi and p_psi learn from exploration that is blind to theta, by Eq. (6). Latents theta_hat_H are inferred on whole
+expert trials, and a latent-conditional policy pi_eta(a | s, theta_hat) is cloned. At test time the agent samples
+theta_hat from its belief, acts, and updates the belief on what follows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.equations import gaussian_kl, imitation_loss, inference_loss, reparametrise
+from deconf.nets import (
+    ActionHead,
+    Batch,
+    DynamicsHead,
+    Progress,
+    Scaler,
+    Signature,
+    no_progress,
+    seeded,
+    torch_generator,
+)
+from envs.task import Array
+from experts.demos import Agent, Trials
+
+Explore = Callable[[Agent | None, np.random.Generator], Trials]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments: trials of exploration."""
+
+
+@dataclass(frozen=True)
+class DeconfoundedConfig:
+    """Widths and amounts. Each round explores, then updates belief and dynamics, then the policy."""
+
+    belief: Literal["evidence", "gru"] = "evidence"
+    width: int = 64
+    latent: int = 4
+    beta: float = 1e-3
+    rounds: int = 8
+    inference_updates: int = 300  # a round
+    inference_batch: int = 16  # trials
+    imitation_updates: int = 500  # a round, and four times as many at the end
+    imitation_batch: int = 1024  # steps
+    learning_rate: float = 1e-3
+    random_share: float = 0.1  # of exploring actions that are uniformly random
+    resample: Literal["step", "episode"] = "step"
+
+
+class DeconfoundedAgent(Agent):
+    """Algorithm 2. resample: draw theta_hat anew every step, or once an episode."""
+
+    def __init__(self, belief: Belief, policy: ActionHead, scaler: Scaler, resample: str) -> None:
+        self.belief, self.policy, self.scaler, self.resample = belief, policy, scaler, resample
+
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        self._rng, self._memory = torch_generator(rng), self.belief.start(n)
+        self._latent: Tensor | None = None
+
+    def reset(self) -> None:
+        self._latent = None
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        if self._latent is None or self.resample == "step":
+            self._latent = reparametrise(*self.belief.posterior(self._memory), self._rng)
+        features = torch.cat([self.scaler(torch.as_tensor(obs)), self._latent], -1)
+        return self.policy.sample(features, self._rng).double().numpy()
+
+    @torch.no_grad()
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self._memory = self.belief.update(self._memory, Batch.step(obs, action, next_obs, alive))
+
+
+class Explorer(Agent):
+    """The latent-conditional policy under latents that know nothing of theta, with some random actions.
+
+    Latents are drawn once an episode from those inferred on expert trials, which is what the prior stands for.
+    """
+
+    def __init__(self, policy: ActionHead, scaler: Scaler, latents: Tensor, random_share: float) -> None:
+        self.policy, self.scaler, self.latents, self.random_share = policy, scaler, latents, random_share
+
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        self._n, self._rng, self._torch = n, rng, torch_generator(rng)
+        self.reset()
+
+    def reset(self) -> None:
+        self._latent = self.latents[torch.randint(len(self.latents), (self._n,), generator=self._torch)]
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        features = torch.cat([self.scaler(torch.as_tensor(obs)), self._latent], -1)
+        action = self.policy.sample(features, self._torch).double().numpy()
+        actions = self.policy.signature.actions
+        noise = self._rng.integers(actions, size=action.shape) if actions else self._rng.uniform(-1, 1, action.shape)
+        return np.where(self._rng.random((len(action), 1)) < self.random_share, noise, action)
+
+
+def fit(
+    trials: Trials,
+    explore: Explore,
+    config: DeconfoundedConfig,
+    rng: np.random.Generator,
+    progress: Progress = no_progress,
+) -> DeconfoundedAgent:
+    """Algorithm 1. trials: of the expert, without theta. explore: see `Explore`; it is called once a round."""
+    expert, signature = Batch.of(trials), Signature.of(trials)
+    steps = expert.mask.bool()
+    first = explore(None, rng)
+    seen = Batch.of(first)
+    real = seen.mask.bool()
+    scaler = Scaler(torch.cat([seen.obs[real], expert.obs[steps]]).numpy())
+    change = Scaler((seen.next_obs - seen.obs)[real].numpy())
+    kind = {"evidence": EvidenceBelief, "gru": GruBelief}[config.belief]
+    with seeded(rng):
+        belief = kind(config.latent, config.width, signature, scaler, change)
+        dynamics = DynamicsHead(config.latent, config.width, signature, scaler, change)
+        policy = ActionHead(signature.obs + config.latent, config.width, signature)
+    generator = torch_generator(rng)
+    total = config.rounds * (config.inference_updates + config.imitation_updates) + 4 * config.imitation_updates
+    done = 0
+    inference = torch.optim.Adam([*belief.parameters(), *dynamics.parameters()], config.learning_rate)
+    imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
+
+    def infer(data: Batch) -> None:
+        """One update of phi and psi."""
+        batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator)]
+        mean, std = (x[:, :-1] for x in belief(batch))
+        theta_hat = reparametrise(mean, std, generator)
+        log_next = dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)
+        loss = inference_loss(log_next, gaussian_kl(mean, std), batch.mask, config.beta)
+        _descend(inference, loss)
+        progress(done, total, {"inference": loss.item()})
+
+    def imitate(mean: Tensor, std: Tensor) -> None:
+        """One update of eta, on steps of expert trials whose theta_hat_H is N(mean, std^2) [B, D]."""
+        index = torch.randint(len(where), (config.imitation_batch,), generator=generator)
+        trial = where[index, 0]
+        theta_hat = reparametrise(mean[trial], std[trial], generator)
+        features = torch.cat([scaler(obs[index]), theta_hat], -1)
+        log_policy = policy.log_prob(features, action[index])
+        loss = imitation_loss(log_policy, torch.ones_like(log_policy))
+        _descend(imitation, loss)
+        progress(done, total, {"imitation": loss.item()})
+
+    where, obs, action = steps.nonzero(), expert.obs[steps], expert.action[steps]
+    data = [first]
+    for _ in range(config.rounds):
+        joined = Batch.of(Trials.concatenate(data))
+        for _ in range(config.inference_updates):
+            done += 1
+            infer(joined)
+        mean, std = final_belief(belief, expert)
+        for _ in range(config.imitation_updates):
+            done += 1
+            imitate(mean, std)
+        data.append(explore(Explorer(policy, scaler, reparametrise(mean, std, generator), config.random_share), rng))
+    imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(imitation, 4 * config.imitation_updates)
+    for _ in range(4 * config.imitation_updates):
+        done += 1
+        imitate(mean, std)
+        schedule.step()
+    return DeconfoundedAgent(belief, policy, scaler, config.resample)
+
+
+@torch.no_grad()
+def final_belief(belief: Belief, trials: Batch) -> tuple[Tensor, Tensor]:
+    """q_phi(theta_hat_H | tau) of whole trials: mean and std [B, D]."""
+    means, stds = [], []
+    for part in torch.arange(len(trials)).split(64):
+        batch = trials[part]
+        mean, std = belief(batch)
+        last = batch.mask.sum(1).long()
+        means.append(mean[torch.arange(len(part)), last])
+        stds.append(std[torch.arange(len(part)), last])
+    return torch.cat(means), torch.cat(stds)
+
+
+def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], 1.0)
+    optimizer.step()

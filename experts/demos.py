@@ -1,0 +1,159 @@
+"""Trials: the data that imitators learn from, the agents that make it, and the loop that runs them."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs import BatchEnv, InputError
+from envs.task import Array
+from experts.policy import Expert
+
+
+@dataclass(frozen=True)
+class Trials:
+    """B trials of E episodes of T steps each, without theta. Arrays are read-only.
+
+    obs [B, E, T + 1, O] float32; action [B, E, T, A] float32; mask [B, E, T] bool, whether step t took place (False
+    once an episode has ended early); actions: the number of discrete actions, or 0 for actions in [-1, 1].
+    Raises InputError for shapes that do not fit each other, or NaN.
+    """
+
+    obs: NDArray[np.float32]
+    action: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    actions: int = 0
+
+    def __post_init__(self) -> None:
+        b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
+        if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
+            raise InputError(
+                f"Trials of obs {self.obs.shape}, action {self.action.shape}, mask {self.mask.shape}; they must be"
+                " [B, E, T + 1, O], [B, E, T, A] and [B, E, T]"
+            )
+        if not (np.isfinite(self.obs).all() and np.isfinite(self.action).all()):
+            raise InputError("Trials held NaN or infinity; every observation and action must be finite")
+        for array in (self.obs, self.action, self.mask):
+            array.setflags(write=False)
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    def __getitem__(self, index: slice | NDArray[np.int64]) -> Trials:
+        return Trials(self.obs[index], self.action[index], self.mask[index], self.actions)
+
+    @staticmethod
+    def concatenate(parts: list[Trials]) -> Trials:
+        """All trials of all parts, in order."""
+        arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("obs", "action", "mask"))
+        return Trials(*arrays, actions=parts[0].actions)
+
+    def save(self, file: Path) -> None:
+        """Write an .npz file, atomically."""
+        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:
+            np.savez_compressed(handle, obs=self.obs, action=self.action, mask=self.mask, actions=self.actions)
+        os.replace(handle.name, file)
+
+    @staticmethod
+    def load(file: Path) -> Trials:
+        """Read what `save` wrote. Raises InputError if the file is missing or damaged."""
+        try:
+            with np.load(file, allow_pickle=False) as data:
+                return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
+        except (OSError, KeyError, ValueError, EOFError) as error:
+            raise InputError(f"no trials could be read from {file}: {error}") from None
+
+
+class Agent(ABC):
+    """Something that acts in N trials side by side, from its own history alone."""
+
+    @abstractmethod
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        """Forget everything: n new trials start, each under a theta of its own."""
+
+    def reset(self) -> None:  # noqa: B027 (most agents need nothing here)
+        """A new episode of the same trials starts: theta stays."""
+
+    @abstractmethod
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        """Observation [N, O] -> action [N, A]."""
+
+    def observe(  # noqa: B027 (agents without memory need nothing here)
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        """What followed: one transition a trial; where `alive` [N] is False, the episode had ended before it."""
+
+
+class ExpertAgent(Agent):
+    """The expert; it reads theta from the environment, or is told another: told [N, L]."""
+
+    def __init__(self, env: BatchEnv, expert: Expert, told: Array | None = None) -> None:
+        self.env, self.expert, self.told = env, expert, told
+
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        self._rng = rng
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        return self.expert.act(obs, self.env.theta if self.told is None else self.told, self._rng)
+
+
+class RandomAgent(Agent):
+    """Uniform actions: the zero of every score."""
+
+    def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
+        self.space = space
+
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        self._rng = rng
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        if isinstance(self.space, spaces.Discrete):
+            return self._rng.integers(self.space.n, size=(len(obs), 1)).astype(float)
+        return self._rng.uniform(-1, 1, (len(obs), *self.space.shape))
+
+
+def run_trials(
+    env: BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None
+) -> tuple[Trials, Array]:
+    """N trials of `episodes` episodes each -> Trials and returns [N, E].
+
+    seed: of the environments and, apart from them, of the agent. theta: forced [N, L], else drawn from p(theta).
+    """
+    task, n = env.task, env.n
+    obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
+    mask = np.zeros((n, episodes, task.horizon), bool)
+    returns = np.zeros((n, episodes))
+    action: Array | None = None
+    agent.begin(n, np.random.default_rng([seed, 1]))
+    for e in range(episodes):
+        if e == 0:
+            now = env.reset(seed, None if theta is None else {"theta": theta})
+        else:
+            now = env.reset(options={"keep_theta": True})
+            agent.reset()
+        obs[:, e, 0] = now
+        for t in range(task.horizon):
+            alive = env.alive
+            chosen = agent.act(now)
+            then, reward, _, _ = env.step(chosen)
+            agent.observe(now, chosen, then, alive)
+            if action is None:
+                action = np.zeros((n, episodes, task.horizon, chosen.shape[-1]), np.float32)
+            obs[:, e, t + 1] = np.where(alive[:, None], then, obs[:, e, t])
+            action[:, e, t] = np.where(alive[:, None], chosen, 0)
+            mask[:, e, t] = alive
+            returns[:, e] += reward
+            now = then
+            if not env.alive.any():
+                obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
+                break
+    assert action is not None
+    discrete = int(task.action_space.n) if isinstance(task.action_space, spaces.Discrete) else 0
+    return Trials(obs, action, mask, discrete), returns

@@ -1,0 +1,97 @@
+"""Experts: policies that see theta. A closed form where the task has one, else a small network in safetensors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from scipy.special import log_ndtr
+
+from envs import InputError, Task
+from envs.task import ASSETS, Array
+
+
+class Expert(ABC):
+    """pi_exp(a | s, theta), batched and Markov."""
+
+    @abstractmethod
+    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+        """Observation [N, O], theta [N, L] -> sampled action [N, A]."""
+
+    @abstractmethod
+    def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
+        """log pi_exp(a | s, theta) [N]."""
+
+
+class DiscreteExpert(Expert):
+    """The closed form that a task states as `expert_probs`."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
+
+    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+        cumulative = np.cumsum(self._probs(obs, theta), -1)
+        return (rng.random((len(obs), 1)) * cumulative[:, -1:] > cumulative).sum(-1, keepdims=True).astype(float)
+
+    def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
+        return np.log(np.take_along_axis(self._probs(obs, theta), action.astype(int), -1)[:, 0])
+
+    def _probs(self, obs: Array, theta: Array) -> Array:
+        probs = self.task.expert_probs(obs, theta)
+        assert probs is not None
+        return np.broadcast_to(probs, (len(obs), probs.shape[-1]))
+
+
+class NetworkExpert(Expert):
+    """clip(mu(s, theta) + sigma eps, -1, 1): a tanh network's mean with the task's expert noise sigma."""
+
+    def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
+        self.task, self.weights = task, weights
+
+    def mean(self, obs: Array, theta: Array) -> Array:
+        """mu [N, A], clipped to [-1, 1]."""
+        w = self.weights
+        hidden = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
+        for i in range(len(w) // 2 - 1):
+            hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
+        last = len(w) // 2 - 1
+        return np.clip(hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"], -1, 1).astype(float)
+
+    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+        mean = self.mean(obs, theta)
+        return np.clip(mean + self.task.expert_noise * rng.standard_normal(mean.shape), -1, 1)
+
+    def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
+        """A Gaussian censored at the action bounds: density inside, tail mass on -1 and 1."""
+        sigma = self.task.expert_noise
+        z = (action - self.mean(obs, theta)) / sigma
+        inside = -0.5 * z**2 - np.log(sigma * np.sqrt(2 * np.pi))
+        return np.where(action >= 1, log_ndtr(-z), np.where(action <= -1, log_ndtr(z), inside)).sum(-1)
+
+
+def path(task: Task) -> Path:
+    """Where the weights of a task's expert lie; its card lies beside them as .json."""
+    return ASSETS / "experts" / f"{task.name}.safetensors"
+
+
+def load(task: Task, file: Path | None = None) -> Expert:
+    """The task's expert. Raises InputError if its weights are missing, damaged or of the wrong shape."""
+    if isinstance(task.action_space.sample(), np.integer):
+        return DiscreteExpert(task)
+    file = file or path(task)
+    remedy = f"run `python -m experts.train --task {task.name}`"
+    if not file.is_file():
+        raise InputError(f"no expert weights at {file}; {remedy}")
+    try:
+        weights = load_file(file)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
+    inputs = len(task.observation) + sum(lat.features for lat in task.latents)
+    found = weights["0.weight"].shape[1] if "0.weight" in weights else None
+    if found != inputs or not all(np.isfinite(array).all() for array in weights.values()):
+        raise InputError(f"expert weights at {file} take {found} inputs, {task.name} gives {inputs}; {remedy}")
+    return NetworkExpert(task, weights)

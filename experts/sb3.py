@@ -1,0 +1,66 @@
+"""Our batched environments as a Stable-Baselines3 VecEnv, for training experts fast."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+import envs
+
+
+class Sb3VecEnv(VecEnv):
+    """n privileged environments; a finished one is reset in the same step, as SB3 expects."""
+
+    def __init__(self, task: envs.Task, n: int, seed: int) -> None:
+        self.env = envs.GymVectorEnv(task, n, privileged=True)
+        super().__init__(n, self.env.single_observation_space, self.env.single_action_space)
+        self.env.batch.seed(seed)
+        self._returns = np.zeros(n)
+        self._lengths = np.zeros(n, int)
+
+    def reset(self) -> Any:
+        return self.env.reset()[0]
+
+    def step_async(self, actions: Any) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        batch = self.env.batch
+        actions = self._actions[:, None] if self._actions.ndim == 1 else self._actions
+        obs, reward, terminated, truncated = batch.step(actions)
+        done = terminated | truncated
+        self._returns += reward
+        self._lengths += 1
+        infos: list[dict[str, Any]] = [{} for _ in done]
+        for i in np.flatnonzero(done):
+            infos[i] = {
+                "terminal_observation": obs[i].copy(),
+                "TimeLimit.truncated": bool(truncated[i]),
+                "episode": {"r": self._returns[i], "l": self._lengths[i], "t": 0.0},
+            }
+        if done.any():
+            self._returns[done], self._lengths[done] = 0, 0
+            obs = batch.reset(where=done)
+        return obs, reward.astype(np.float32), done, infos
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [getattr(self.env, attr_name, None) for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        self.env.batch.seed(seed)
+        return [seed] * self.num_envs
