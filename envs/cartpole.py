@@ -20,7 +20,7 @@ class Cartpole(MujocoTask):
     observation = {"x": (-4, 4), "cos": (-1, 1), "sin": (-1, 1), "velocity": (-20, 20), "pole_velocity": (-40, 40)}
 
     def init_state(self, rng: np.random.Generator) -> Array:
-        x, pole, velocity, pole_velocity = rng.uniform(-1, 1, 4) * (0.5, 0.05, 0.05, 0.05)
+        x, pole, velocity, pole_velocity = rng.uniform(-1, 1, 4) * (0.3, 0.05, 0.05, 0.05)
         return self.state(slider=(x, velocity), hinge=(pole, pole_velocity))
 
     def observe(self, state: Array) -> Array:

@@ -22,7 +22,7 @@ SPIN = 10.0  # rad/s
 class SlipperyCartpole(Cartpole):
     name = "slippery_cartpole"
     latents = (Latent("friction", "N m", 0.0, 0.3),)
-    process_noise = {**Cartpole.process_noise, "axle": (0.004, 0.1)}
+    process_noise = {"slider": (0.004, 0.1), "hinge": (0.004, 0.2), "axle": (0.004, 0.1)}
     observation = {**Cartpole.observation, "slip": (-10, 10)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:

@@ -12,10 +12,7 @@ actions are always [N, A]. A task holds no state of its own: states, thetas and 
 
 from __future__ import annotations
 
-import sys
-import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, Protocol
@@ -226,24 +223,3 @@ class Task(ABC):
             return array
         return np.clip(array, self.action_space.low, self.action_space.high)
 
-
-def check_folder(folder: Path) -> None:
-    """Make an output folder. Raises InputError if it cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"output folder {folder} cannot be written: {error.strerror}; give another one") from None
-
-
-def exit_on_bad_input(main: Callable[[], None]) -> None:
-    """Run a command; bad input ends it with one line and exit code 2, Ctrl-C with 130."""
-    try:
-        main()
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is kept", file=sys.stderr)
-        sys.exit(130)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import time
@@ -17,9 +16,9 @@ import torch
 from safetensors.numpy import save_file
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
-from tqdm import tqdm
 
 import envs
+from envs.console import Progress, check_folder, run_command, write_json
 from experts import policy
 from experts.demos import ExpertAgent, RandomAgent, run_trials
 from experts.sb3 import Sb3VecEnv
@@ -37,15 +36,14 @@ PPO_SETTINGS = {
 class _Progress(BaseCallback):
     def __init__(self, total: int) -> None:
         super().__init__()
-        self._bar = tqdm(total=total, unit="step", unit_scale=True, mininterval=5 if not os.isatty(2) else 0.2)
+        self._bar = Progress(total, "training")
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or []]
-        self._bar.set_postfix({"return": f"{np.mean(returns):.1f}" if returns else "-"}, refresh=False)
-        self._bar.update(self.num_timesteps - self._bar.n)
+        self._bar.update(self.num_timesteps - self._bar.done, f"return {np.mean(returns):.1f}" if returns else "")
 
 
 def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.ndarray]:
@@ -82,7 +80,7 @@ def main() -> None:
     if not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
     file = args.out or policy.path(task)
-    envs.task.check_folder(file.parent)
+    check_folder(file.parent)
     start = time.time()
     weights = train(task, args.steps, args.seed)
     partial = file.with_suffix(".partial")
@@ -109,9 +107,9 @@ def main() -> None:
             "python": platform.python_version(),
         },
     }
-    file.with_suffix(".json").write_text(json.dumps(card, indent=2) + "\n")
+    write_json(file.with_suffix(".json"), card)
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
 
 
 if __name__ == "__main__":
-    envs.task.exit_on_bad_input(main)
+    run_command(main)

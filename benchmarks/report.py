@@ -1,0 +1,135 @@
+"""Pictures, video and a self-contained report.html from the files of a finished run."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import imageio.v2 as imageio
+import matplotlib
+
+matplotlib.use("Agg")
+import jinja2
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+import envs
+from benchmarks import score
+
+COLOURS = {
+    "expert": "black",
+    "interventional": "tab:green",
+    "conditional": "tab:red",
+    "deconfounded": "tab:blue",
+    "deconfounded_episode": "tab:cyan",
+    "naive_rnn": "tab:orange",
+    "oracle_bc": "tab:gray",
+    "blind_bc": "tab:brown",
+    "random": "lightgray",
+}
+EXACT = ("expert", "interventional", "conditional", "random")  # drawn dashed
+
+
+def adaptation(results: dict[str, Any], file: Path) -> None:
+    """Score over the episodes of a trial, each method a line; later episodes than were trained on are shaded."""
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    trained = 0
+    for name, entry in results["methods"].items():
+        values = entry["score"] + entry.get("score_beyond", [])
+        trained = len(entry["score"])
+        style = "--" if name in EXACT else "-"
+        axes.plot(range(1, len(values) + 1), values, style, marker="o", ms=4, color=COLOURS.get(name), label=name)
+    longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
+    if longest > trained:
+        axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
+        axes.text(trained + 0.6, 0.02, "longer than trained on", color="0.45", fontsize=8)
+    axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def learning(curves: dict[str, list[dict[str, Any]]], title: str, file: Path) -> None:
+    """Training losses over updates, one panel a loss; a thin line a seed."""
+    kinds = sorted({kind for seeds in curves.values() for curve in seeds for kind in curve})
+    figure, panels = plt.subplots(1, max(len(kinds), 1), figsize=(4.5 * max(len(kinds), 1), 3.4), layout="constrained")
+    for panel, kind in zip(np.atleast_1d(panels), kinds, strict=False):
+        for name, seeds in curves.items():
+            for i, curve in enumerate(curve for curve in seeds if kind in curve):
+                label = name if i == 0 else None
+                panel.plot(*np.array(curve[kind]).T, color=COLOURS.get(name), lw=0.9, alpha=0.8, label=label)
+        panel.set(xlabel="update", title=f"{title}: {kind} loss")
+        panel.legend(frameon=False, fontsize=8)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def _labelled(frame: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray(frame)
+    ImageDraw.Draw(image).text((8, 6), text, fill=(20, 20, 20), font_size=16)
+    return np.asarray(image)
+
+
+def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], file: Path) -> None:
+    """Recorded states of several agents under one theta, side by side. Raises InputError where no GL works.
+
+    A clip holds state [T, S], action [T, A] and theta [L].
+    """
+    columns = []
+    for name, clip in clips.items():
+        paint = task.painter(clip["theta"])
+        frames = zip(clip["state"], clip["action"], strict=True)
+        columns.append([_labelled(paint(state, action), name) for state, action in frames])
+    settings = {"quality": 6, "macro_block_size": 8} if file.suffix == ".mp4" else {}
+    rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
+    with imageio.get_writer(file, fps=rate, **settings) as writer:
+        for row in zip(*columns, strict=True):
+            writer.append_data(np.concatenate(row, 1))
+
+
+_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ results.task }}</title>
+<style>body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}
+img,video{max-width:100%}table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:right;
+border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}</style>
+<h1>{{ results.task }} (v{{ results.task_version }}), preset {{ results.preset }}</h1>
+<p>Scores: 0 = random actions, 1 = the expert that sees theta. {{ results.seeds|length }} seed(s),
+{{ results.eval_trials }} trials each, {{ "%.0f"|format(results.wall_s) }} s.</p>
+<table><tr><th>method<th>return<th colspan="{{ episodes }}">score of each episode<th>last<th>95% interval</tr>
+{% for name, m in methods %}<tr><td>{{ name }}<td>{{ "%.1f"|format(m.last_return) }}
+{% for s in m.score %}<td>{{ "%.2f"|format(s) }}{% endfor %}<td><b>{{ "%.2f"|format(m.score_last) }}</b>
+<td>{% if m.ci95 %}{{ "%.2f"|format(m.ci95[0]) }} .. {{ "%.2f"|format(m.ci95[1]) }}{% else %}-{% endif %}</tr>
+{% endfor %}</table>
+{% for name, data in pictures %}<h2>{{ name }}</h2><img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
+{% endfor %}{% if movie %}<h2>One hidden theta, last episode of a trial</h2>
+<video controls loop muted src="data:video/mp4;base64,{{ movie }}"></video>{% endif %}
+<h2>How it was made</h2><pre>{{ how }}</pre></html>
+"""
+
+
+def page(results: dict[str, Any], folder: Path) -> str:
+    """The report as one HTML file that needs no other."""
+
+    def encoded(file: Path) -> str:
+        return base64.b64encode(file.read_bytes()).decode()
+
+    methods = [
+        (name, {**entry, "last_return": np.mean(entry["return"], 0)[-1]})
+        for name, entry in sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"])
+    ]
+    pictures = [(p.stem.capitalize(), encoded(p)) for p in (folder / "adaptation.png", folder / "learning.png")]
+    movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
+    how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
+    template = jinja2.Environment(autoescape=True).from_string(_PAGE)
+    episodes = len(methods[0][1]["score"])
+    return template.render(
+        results=results, methods=methods, pictures=pictures, movie=movie, how=how, episodes=episodes
+    )
+
+
+__all__ = ["adaptation", "learning", "page", "score", "video"]

@@ -1,0 +1,82 @@
+"""What commands share: one line for bad input, output folders, and progress on a terminal or in a log."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from envs.task import InputError
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Run a command; bad input ends it with one line and exit code 2, Ctrl-C with 130."""
+    try:
+        main()
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; what was finished is kept", file=sys.stderr)
+        sys.exit(130)
+
+
+def check_folder(folder: Path) -> None:
+    """Make an output folder. Raises InputError if it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"output folder {folder} cannot be written: {error.strerror}; give another one") from None
+
+
+def write_atomically(file: Path, data: str | bytes) -> None:
+    """The file holds all of data, or what it held before."""
+    partial = file.with_name(f".{file.name}.{os.getpid()}")
+    partial.write_bytes(data.encode() if isinstance(data, str) else data)
+    os.replace(partial, file)
+
+
+def write_json(file: Path, data: Any) -> None:
+    """JSON, atomically."""
+    write_atomically(file, json.dumps(data, indent=2) + "\n")
+
+
+class Progress:
+    """A bar with an ETA on a terminal; elsewhere a plain line now and then."""
+
+    def __init__(self, total: int, label: str, every_s: float = 15) -> None:
+        self.total, self.done, self._label, self._every = total, 0, label, every_s
+        self._start = self._last = time.monotonic()
+        self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False) if sys.stderr.isatty() else None
+
+    def update(self, n: int, note: str = "") -> None:
+        """n more are done."""
+        self.done += n
+        if self._bar is not None:
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(n)
+        elif time.monotonic() - self._last > self._every:
+            self._last = time.monotonic()
+            left = (self._last - self._start) * (self.total / self.done - 1)
+            print(f"{self._label}: {self.done / self.total:4.0%}, {left:.0f} s left {note}".rstrip(), flush=True)
+
+    def line(self, text: str) -> None:
+        """Print a line that stays."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            print(text, flush=True)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.close()
