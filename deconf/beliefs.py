@@ -16,9 +16,23 @@ from deconf.nets import Batch, Scaler, Signature, mlp
 
 
 class Belief(nn.Module, ABC):
-    """q_phi; the prior is N(0, 1) in each of D dimensions."""
+    """q_phi and the prior p(theta_hat), a Gaussian in each of D dimensions: N(0, 1) until `set_prior`."""
 
-    latent: int
+    prior_mean: Tensor
+    prior_std: Tensor
+
+    def __init__(self, latent: int) -> None:
+        super().__init__()
+        self.register_buffer("prior_mean", torch.zeros(latent))
+        self.register_buffer("prior_std", torch.ones(latent))
+
+    def set_prior(self, theta_hat: Tensor) -> None:
+        """Fit the prior to latents [B, D] inferred on whole trials (empirical Bayes).
+
+        Without it, early samples are spread over more of the latent space than there is data for.
+        """
+        self.prior_mean.copy_(theta_hat.mean(0))
+        self.prior_std.copy_(theta_hat.std(0).clamp(min=0.05))
 
     @abstractmethod
     def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -41,13 +55,14 @@ class EvidenceBelief(Belief):
     """The order-free belief: a product of the prior and one Gaussian factor for each transition.
 
     Given theta the dynamics are Markov, so that p(theta | tau) depends on the set of transitions alone. Each adds
-    precision w >= 0 and evidence v to sums; then q = N(sum v / (1 + sum w), 1 / (1 + sum w)). No recurrence, and its
-    form is safe at any length: more evidence means a narrower belief, not another regime of a network.
+    precision w >= 0 and evidence v to sums; from a prior N(m, 1 / p), q = N((p m + sum v) / (p + sum w),
+    1 / (p + sum w)). No recurrence, and its form is safe at any length: more evidence means a narrower belief, not
+    another regime of a network.
     """
 
     def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
-        super().__init__()
-        self.latent, self.signature, self.obs, self.change = latent, signature, obs, change
+        super().__init__(latent)
+        self.signature, self.obs, self.change = signature, obs, change
         self.net = mlp(2 * signature.obs + signature.action_features, width, 2 * latent)
 
     def evidence(self, batch: Batch) -> Tensor:
@@ -62,14 +77,15 @@ class EvidenceBelief(Belief):
         return self.posterior(torch.cat([torch.zeros_like(sums[:, :1]), sums], 1))
 
     def start(self, n: int) -> Tensor:
-        return torch.zeros(n, 2 * self.latent)
+        return torch.zeros(n, 2 * len(self.prior_mean))
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self.evidence(step)
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         value, weight = memory.chunk(2, -1)
-        return value / (1 + weight), (1 + weight).rsqrt()
+        prior = self.prior_std**-2
+        return (prior * self.prior_mean + value) / (prior + weight), (prior + weight).rsqrt()
 
 
 class GruMemory(nn.Module):
@@ -103,8 +119,7 @@ class GruBelief(Belief):
     """The paper's belief: GruMemory, then linear to a mean and a softplus variance."""
 
     def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
-        super().__init__()
-        self.latent = latent
+        super().__init__(latent)
         self.memory = GruMemory(width, signature, obs)
         self.out = nn.Linear(width, 2 * latent)
 

@@ -138,7 +138,8 @@ def fit(
         mean, std = (x[:, :-1] for x in belief(batch))
         theta_hat = reparametrise(mean, std, generator)
         log_next = dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)
-        loss = inference_loss(log_next, gaussian_kl(mean, std), batch.mask, config.beta)
+        kl = gaussian_kl(mean, std, belief.prior_mean, belief.prior_std)
+        loss = inference_loss(log_next, kl, batch.mask, config.beta)
         _descend(inference, loss)
         progress(done, total, {"inference": loss.item()})
 
@@ -160,6 +161,8 @@ def fit(
         for _ in range(config.inference_updates):
             done += 1
             infer(joined)
+        mean, std = final_belief(belief, expert)
+        belief.set_prior(reparametrise(mean, std, generator))
         mean, std = final_belief(belief, expert)
         for _ in range(config.imitation_updates):
             done += 1

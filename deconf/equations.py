@@ -22,9 +22,10 @@ def belief_update(log_belief: Array, log_dynamics: Array, log_policy: Array | No
     return joint - np.logaddexp.reduce(joint, axis=-1, keepdims=True)
 
 
-def gaussian_kl(mean: Tensor, std: Tensor) -> Tensor:
-    """KL( N(mean, std^2) || N(0, 1) ), summed over the last axis: [..., D] -> [...]."""
-    return 0.5 * (mean**2 + std**2 - 1 - 2 * std.log()).sum(-1)
+def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor) -> Tensor:
+    """KL( N(mean, std^2) || N(prior_mean, prior_std^2) ), summed over the last axis: [..., D] -> [...]."""
+    ratio = std / prior_std
+    return 0.5 * (((mean - prior_mean) / prior_std) ** 2 + ratio**2 - 1 - 2 * ratio.log()).sum(-1)
 
 
 def inference_loss(log_next: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tensor:
