@@ -67,10 +67,13 @@ class EvidenceBelief(Belief):
 
     def evidence(self, batch: Batch) -> Tensor:
         """Evidence v and precision w of each transition, [..., 2 D]; zero where the mask is."""
-        change = self.change(batch.next_obs - batch.obs)
-        inputs = [self.obs(batch.obs), self.signature.encode_action(batch.action), change]
+        keep = batch.mask.bool()
+        real = batch[keep]
+        change = self.change(real.next_obs - real.obs)
+        inputs = [self.obs(real.obs), self.signature.encode_action(real.action), change]
         value, raw = self.net(torch.cat(inputs, -1)).chunk(2, -1)
-        return torch.cat([value, F.softplus(raw - 3)], -1) * batch.mask[..., None]
+        evidence = torch.cat([value, F.softplus(raw - 3)], -1)
+        return evidence.new_zeros(*keep.shape, evidence.shape[-1]).masked_scatter(keep[..., None], evidence)
 
     def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
         sums = self.evidence(batch).cumsum(1)

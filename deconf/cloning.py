@@ -71,7 +71,7 @@ def fit(
     for update in range(config.updates):
         index = torch.randint(len(obs), (config.batch,), generator=generator)
         log_policy = policy.log_prob(features[index], action[index])
-        loss = imitation_loss(log_policy, torch.ones_like(log_policy))
+        loss = imitation_loss(log_policy)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -135,11 +135,13 @@ def fit(
     def infer(data: Batch) -> None:
         """One update of phi and psi."""
         batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator)]
-        mean, std = (x[:, :-1] for x in belief(batch))
+        keep = batch.mask.bool()
+        mean, std = (x[:, :-1][keep] for x in belief(batch))
+        real = batch[keep]
         theta_hat = reparametrise(mean, std, generator)
-        log_next = dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)
+        log_next = dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)
         kl = gaussian_kl(mean, std, belief.prior_mean, belief.prior_std)
-        loss = inference_loss(log_next, kl, batch.mask, config.beta)
+        loss = inference_loss(log_next, kl, config.beta)
         _descend(inference, loss)
         progress(done, total, {"inference": loss.item()})
 
@@ -150,7 +152,7 @@ def fit(
         theta_hat = reparametrise(mean[trial], std[trial], generator)
         features = torch.cat([scaler(obs[index]), theta_hat], -1)
         log_policy = policy.log_prob(features, action[index])
-        loss = imitation_loss(log_policy, torch.ones_like(log_policy))
+        loss = imitation_loss(log_policy)
         _descend(imitation, loss)
         progress(done, total, {"imitation": loss.item()})
 

@@ -28,18 +28,18 @@ def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor
     return 0.5 * (((mean - prior_mean) / prior_std) ** 2 + ratio**2 - 1 - 2 * ratio.log()).sum(-1)
 
 
-def inference_loss(log_next: Tensor, kl: Tensor, mask: Tensor, beta: float) -> Tensor:
-    """Eq. (6) with its sign turned, averaged over the steps that took place.
+def inference_loss(log_next: Tensor, kl: Tensor, beta: float) -> Tensor:
+    """Eq. (6) with its sign turned, averaged over steps.
 
-    log_next: log p_psi(s_{t+1} | s_t, a_t, theta_hat) for theta_hat ~ q_phi(. | tau_:t), kl: of q_phi(. | tau_:t) from
-    the prior, and mask, all [B, T].
+    log_next: log p_psi(s_{t+1} | s_t, a_t, theta_hat) for theta_hat ~ q_phi(. | tau_:t), and kl: of q_phi(. | tau_:t)
+    from the prior, both [M].
     """
-    return -((log_next - beta * kl) * mask).sum() / mask.sum()
+    return -(log_next - beta * kl).mean()
 
 
-def imitation_loss(log_policy: Tensor, mask: Tensor) -> Tensor:
-    """The last line of Algorithm 1: minus log pi_eta(a | s, ...), averaged over the steps that took place; [B, T]."""
-    return -(log_policy * mask).sum() / mask.sum()
+def imitation_loss(log_policy: Tensor) -> Tensor:
+    """The last line of Algorithm 1: minus log pi_eta(a | s, ...) [M], averaged over steps."""
+    return -log_policy.mean()
 
 
 def reparametrise(mean: Tensor, std: Tensor, rng: torch.Generator) -> Tensor:

@@ -72,7 +72,7 @@ def fit(
             chunk = batch[:, begin : begin + config.chunk]
             states = memory(chunk, state)
             features = torch.cat([states[:, :-1], memory.obs(chunk.obs)], -1)
-            loss = imitation_loss(policy.log_prob(features, chunk.action), chunk.mask)
+            loss = imitation_loss(policy.log_prob(features, chunk.action)[chunk.mask.bool()])
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_([*memory.parameters(), *policy.parameters()], 1.0)
