@@ -1,0 +1,1 @@
+"""Commands that measure: run, certify, speed."""

@@ -127,9 +127,7 @@ def page(results: dict[str, Any], folder: Path) -> str:
     how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
     template = jinja2.Environment(autoescape=True).from_string(_PAGE)
     episodes = len(methods[0][1]["score"])
-    return template.render(
-        results=results, methods=methods, pictures=pictures, movie=movie, how=how, episodes=episodes
-    )
+    return template.render(results=results, methods=methods, pictures=pictures, movie=movie, how=how, episodes=episodes)
 
 
 __all__ = ["adaptation", "learning", "page", "score", "video"]

@@ -30,7 +30,9 @@ def summarise(returns: dict[str, dict[int, Array]], episodes: int) -> dict[str, 
 
     `episodes` is the length of the trials trained on; what agents did in later ones, if any, is told apart.
     """
-    random, expert = (float(np.mean([r[:, :episodes] for r in returns[name].values()])) for name in ("random", "expert"))
+    random, expert = (
+        float(np.mean([r[:, :episodes] for r in returns[name].values()])) for name in ("random", "expert")
+    )
     methods = {}
     for name, by_seed in returns.items():
         means = np.array([by_seed[seed].mean(0) for seed in sorted(by_seed)])

@@ -1,0 +1,1 @@
+"""Deconfounded imitation learning: beliefs, methods, exact references."""

@@ -1,7 +1,7 @@
 """q_phi(theta_hat | tau): two beliefs behind one interface.
 
-A belief turns a history into a Gaussian over theta_hat, for all prefixes of a batch of trials at once (`forward`) or
-one transition at a time (`start`, `update`, `posterior`). Both give the same numbers.
+A belief keeps a memory of a history and reads a Gaussian over theta_hat from it (`posterior`). Memories come for all
+prefixes of a batch of trials at once (`forward`), or one transition at a time (`start`, `update`), alike.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Belief(nn.Module, ABC):
         self.prior_std.copy_(theta_hat.std(0).clamp(min=0.05))
 
     @abstractmethod
-    def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Mean and std [B, T + 1, D] after 0, 1, ..., T transitions, episodes joined end to end."""
+    def forward(self, batch: Batch) -> Tensor:
+        """Memories [B, T + 1, M] after 0, 1, ..., T transitions, episodes joined end to end."""
 
     @abstractmethod
     def start(self, n: int) -> Tensor:
@@ -48,47 +48,51 @@ class Belief(nn.Module, ABC):
 
     @abstractmethod
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std [N, D]."""
+        """Mean and std [..., D] of q_phi given memories [..., M]."""
 
 
 class EvidenceBelief(Belief):
-    """The order-free belief: a product of the prior and one Gaussian factor for each transition.
+    """The order-free belief: a sum of evidence over transitions, read by a small network.
 
-    Given theta the dynamics are Markov, so that p(theta | tau) depends on the set of transitions alone. Each adds
-    precision w >= 0 and evidence v to sums; from a prior N(m, 1 / p), q = N((p m + sum v) / (p + sum w),
-    1 / (p + sum w)). No recurrence, and its form is safe at any length: more evidence means a narrower belief, not
-    another regime of a network.
+    Given theta the dynamics are Markov, so that p(theta | tau) depends on the *set* of transitions alone: log p(theta |
+    tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
+    sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
+    size however long the trial. Without a transition, q is the prior.
     """
 
     def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
         super().__init__(latent)
-        self.signature, self.obs, self.change = signature, obs, change
-        self.net = mlp(2 * signature.obs + signature.action_features, width, 2 * latent)
+        self.signature, self.obs, self.change, self.width = signature, obs, change, width // 4
+        self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width)
+        self.out = mlp(2 * self.width + 1, width, 2 * latent)
 
-    def evidence(self, batch: Batch) -> Tensor:
-        """Evidence v and precision w of each transition, [..., 2 D]; zero where the mask is."""
+    def _terms(self, batch: Batch) -> Tensor:
+        """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
         keep = batch.mask.bool()
         real = batch[keep]
         change = self.change(real.next_obs - real.obs)
         inputs = [self.obs(real.obs), self.signature.encode_action(real.action), change]
-        value, raw = self.net(torch.cat(inputs, -1)).chunk(2, -1)
-        evidence = torch.cat([value, F.softplus(raw - 3)], -1)
-        return evidence.new_zeros(*keep.shape, evidence.shape[-1]).masked_scatter(keep[..., None], evidence)
+        evidence = self.evidence(torch.cat(inputs, -1))
+        terms = torch.cat([evidence, torch.ones_like(evidence[:, :1])], -1)
+        return terms.new_zeros(*keep.shape, self.width + 1).masked_scatter(keep[..., None], terms)
 
-    def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        sums = self.evidence(batch).cumsum(1)
-        return self.posterior(torch.cat([torch.zeros_like(sums[:, :1]), sums], 1))
+    def forward(self, batch: Batch) -> Tensor:
+        terms = self._terms(batch)
+        return torch.cat([torch.zeros_like(terms[:, :1]), terms], 1).cumsum(1)
 
     def start(self, n: int) -> Tensor:
-        return torch.zeros(n, 2 * len(self.prior_mean))
+        return self.prior_mean.new_zeros(n, self.width + 1)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        return memory + self.evidence(step)
+        return memory + self._terms(step)
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        value, weight = memory.chunk(2, -1)
-        prior = self.prior_std**-2
-        return (prior * self.prior_mean + value) / (prior + weight), (prior + weight).rsqrt()
+        total, count = memory[..., :-1], memory[..., -1:]
+        n = 1 + count
+        mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
+        std = (F.softplus(raw) + 1e-6).sqrt()
+        none = count == 0
+        return torch.where(none, self.prior_mean, mean), torch.where(none, self.prior_std, std)
 
 
 class GruMemory(nn.Module):
@@ -103,7 +107,7 @@ class GruMemory(nn.Module):
 
     def start(self, n: int) -> Tensor:
         """The memory [N, W] of empty histories."""
-        return torch.zeros(n, self.width)
+        return self.gru.bias_hh_l0.new_zeros(n, self.width)
 
     def forward(self, batch: Batch, memory: Tensor) -> Tensor:
         """Transitions [B, T, ...] after a memory [B, W] -> memories [B, T + 1, W]."""
@@ -126,8 +130,8 @@ class GruBelief(Belief):
         self.memory = GruMemory(width, signature, obs)
         self.out = nn.Linear(width, 2 * latent)
 
-    def forward(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        return self.posterior(self.memory(batch, self.start(len(batch))))
+    def forward(self, batch: Batch) -> Tensor:
+        return self.memory(batch, self.start(len(batch)))
 
     def start(self, n: int) -> Tensor:
         return self.memory.start(n)

@@ -23,6 +23,7 @@ class CloningConfig:
     updates: int = 4000
     batch: int = 1024
     learning_rate: float = 1e-3
+    device: str = "cpu"
 
 
 class MemorylessAgent(Agent):
@@ -32,14 +33,14 @@ class MemorylessAgent(Agent):
         self.policy, self.scaler, self.side = policy, scaler, side
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng = torch_generator(rng)
+        self._rng = torch_generator(rng, self.scaler.mean.device)
 
     @torch.no_grad()
     def act(self, obs: NDArray[np.float32]) -> Array:
-        features = self.scaler(torch.as_tensor(obs))
+        features = self.scaler(obs)
         if self.side is not None:
-            features = torch.cat([features, torch.as_tensor(self.side(), dtype=torch.float32)], -1)
-        return self.policy.sample(features, self._rng).double().numpy()
+            features = torch.cat([features, torch.as_tensor(self.side()).to(features)], -1)
+        return self.policy.sample(features, self._rng).double().cpu().numpy()
 
 
 def fit(
@@ -55,21 +56,21 @@ def fit(
     theta [B, F]: features of each trial's theta, for the oracle, whose agent then asks `side` for those [N, F] of the
     environments it acts in. Without both: blind BC.
     """
-    data = Batch.of(trials)
+    data = Batch.of(trials, config.device)
     keep = data.mask.bool()
     obs, action = data.obs[keep], data.action[keep]
-    scaler = Scaler(obs.numpy())
+    scaler = Scaler(obs)
     features = scaler(obs)
     if theta is not None:
-        per_step = torch.as_tensor(theta, dtype=torch.float32)[:, None].expand(-1, keep.shape[1], -1)
+        per_step = torch.as_tensor(theta).to(features)[:, None].expand(-1, keep.shape[1], -1)
         features = torch.cat([features, per_step[keep]], -1)
     with seeded(rng):
-        policy = ActionHead(features.shape[-1], config.width, Signature.of(trials))
+        policy = ActionHead(features.shape[-1], config.width, Signature.of(trials)).to(config.device)
     optimizer = torch.optim.Adam(policy.parameters(), config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    generator = torch_generator(rng)
+    generator = torch_generator(rng, config.device)
     for update in range(config.updates):
-        index = torch.randint(len(obs), (config.batch,), generator=generator)
+        index = torch.randint(len(obs), (config.batch,), generator=generator, device=config.device)
         log_policy = policy.log_prob(features[index], action[index])
         loss = imitation_loss(log_policy)
         optimizer.zero_grad()

@@ -46,10 +46,12 @@ class DeconfoundedConfig:
     beta: float = 1e-3
     rounds: int = 8
     inference_updates: int = 300  # a round
-    inference_batch: int = 16  # trials
+    inference_batch: int = 16  # trials, whose every step is evidence
+    inference_steps: int = 2048  # of them, whose next observation is predicted
     imitation_updates: int = 500  # a round, and four times as many at the end
     imitation_batch: int = 1024  # steps
     learning_rate: float = 1e-3
+    device: str = "cpu"
     random_share: float = 0.1  # of exploring actions that are uniformly random
     resample: Literal["step", "episode"] = "step"
 
@@ -61,49 +63,66 @@ class DeconfoundedAgent(Agent):
         self.belief, self.policy, self.scaler, self.resample = belief, policy, scaler, resample
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng, self._memory = torch_generator(rng), self.belief.start(n)
+        self._memory = self.belief.start(n)
+        self._rng = torch_generator(rng, self._memory.device)
         self._latent: Tensor | None = None
 
     def reset(self) -> None:
         self._latent = None
 
-    @torch.no_grad()
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def latent(self) -> Tensor:
+        """The theta_hat [N, D] to act under now."""
         if self._latent is None or self.resample == "step":
             self._latent = reparametrise(*self.belief.posterior(self._memory), self._rng)
-        features = torch.cat([self.scaler(torch.as_tensor(obs)), self._latent], -1)
-        return self.policy.sample(features, self._rng).double().numpy()
+        return self._latent
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        features = torch.cat([self.scaler(obs), self.latent()], -1)
+        return self.policy.sample(features, self._rng).double().cpu().numpy()
 
     @torch.no_grad()
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        self._memory = self.belief.update(self._memory, Batch.step(obs, action, next_obs, alive))
+        self._memory = self.belief.update(self._memory, Batch.step(obs, action, next_obs, alive, self._rng.device))
 
 
-class Explorer(Agent):
-    """The latent-conditional policy under latents that know nothing of theta, with some random actions.
+class Explorer(DeconfoundedAgent):
+    """The imitator itself, so far, with some random actions; blind to theta but for what its own history tells.
 
-    Latents are drawn once an episode from those inferred on expert trials, which is what the prior stands for.
+    In every other trial its latents are drawn once an episode from those inferred on expert trials (which is what the
+    prior stands for) instead of from the belief, so that each expert's behaviour is tried under each theta.
     """
 
-    def __init__(self, policy: ActionHead, scaler: Scaler, latents: Tensor, random_share: float) -> None:
-        self.policy, self.scaler, self.latents, self.random_share = policy, scaler, latents, random_share
+    def __init__(
+        self, belief: Belief, policy: ActionHead, scaler: Scaler, latents: Tensor, random_share: float
+    ) -> None:
+        super().__init__(belief, policy, scaler, "step")
+        self.latents, self.random_share = latents, random_share
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._n, self._rng, self._torch = n, rng, torch_generator(rng)
-        self.reset()
+        super().begin(n, rng)
+        self._numpy, self._blind = rng, torch.arange(n, device=self._rng.device)[:, None] % 2 == 0
+        self._drawn = self._draw()
+
+    def _draw(self) -> Tensor:
+        n, device = len(self._blind), self._rng.device
+        return self.latents[torch.randint(len(self.latents), (n,), generator=self._rng, device=device)]
 
     def reset(self) -> None:
-        self._latent = self.latents[torch.randint(len(self.latents), (self._n,), generator=self._torch)]
+        self._drawn = self._draw()
 
-    @torch.no_grad()
+    def latent(self) -> Tensor:
+        return torch.where(self._blind, self._drawn, super().latent())
+
     def act(self, obs: NDArray[np.float32]) -> Array:
-        features = torch.cat([self.scaler(torch.as_tensor(obs)), self._latent], -1)
-        action = self.policy.sample(features, self._torch).double().numpy()
-        actions = self.policy.signature.actions
-        noise = self._rng.integers(actions, size=action.shape) if actions else self._rng.uniform(-1, 1, action.shape)
-        return np.where(self._rng.random((len(action), 1)) < self.random_share, noise, action)
+        action, actions = super().act(obs), self.policy.signature.actions
+        if actions:
+            other = self._numpy.integers(actions, size=action.shape).astype(float)
+        else:
+            other = self._numpy.uniform(-1, 1, action.shape)
+        return np.where(self._numpy.random((len(action), 1)) < self.random_share, other, action)
 
 
 def fit(
@@ -114,40 +133,44 @@ def fit(
     progress: Progress = no_progress,
 ) -> DeconfoundedAgent:
     """Algorithm 1. trials: of the expert, without theta. explore: see `Explore`; it is called once a round."""
-    expert, signature = Batch.of(trials), Signature.of(trials)
+    device = config.device
+    expert, signature = Batch.of(trials, device), Signature.of(trials)
     steps = expert.mask.bool()
     first = explore(None, rng)
-    seen = Batch.of(first)
+    seen = Batch.of(first, device)
     real = seen.mask.bool()
-    scaler = Scaler(torch.cat([seen.obs[real], expert.obs[steps]]).numpy())
-    change = Scaler((seen.next_obs - seen.obs)[real].numpy())
+    scaler = Scaler(torch.cat([seen.obs[real], expert.obs[steps]]))
+    change = Scaler((seen.next_obs - seen.obs)[real])
     kind = {"evidence": EvidenceBelief, "gru": GruBelief}[config.belief]
     with seeded(rng):
-        belief = kind(config.latent, config.width, signature, scaler, change)
-        dynamics = DynamicsHead(config.latent, config.width, signature, scaler, change)
-        policy = ActionHead(signature.obs + config.latent, config.width, signature)
-    generator = torch_generator(rng)
+        belief = kind(config.latent, config.width, signature, scaler, change).to(device)
+        dynamics = DynamicsHead(config.latent, config.width, signature, scaler, change).to(device)
+        policy = ActionHead(signature.obs + config.latent, config.width, signature).to(device)
+    generator = torch_generator(rng, device)
     total = config.rounds * (config.inference_updates + config.imitation_updates) + 4 * config.imitation_updates
     done = 0
     inference = torch.optim.Adam([*belief.parameters(), *dynamics.parameters()], config.learning_rate)
+    cooling = torch.optim.lr_scheduler.CosineAnnealingLR(inference, config.rounds * config.inference_updates)
     imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
 
     def infer(data: Batch) -> None:
         """One update of phi and psi."""
-        batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator)]
+        batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator, device=device)]
         keep = batch.mask.bool()
-        mean, std = (x[:, :-1][keep] for x in belief(batch))
-        real = batch[keep]
+        picked = torch.randint(int(keep.sum()), (config.inference_steps,), generator=generator, device=device)
+        mean, std = belief.posterior(belief(batch)[:, :-1][keep][picked])
+        real = batch[keep][picked]
         theta_hat = reparametrise(mean, std, generator)
         log_next = dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)
         kl = gaussian_kl(mean, std, belief.prior_mean, belief.prior_std)
         loss = inference_loss(log_next, kl, config.beta)
         _descend(inference, loss)
+        cooling.step()
         progress(done, total, {"inference": loss.item()})
 
     def imitate(mean: Tensor, std: Tensor) -> None:
         """One update of eta, on steps of expert trials whose theta_hat_H is N(mean, std^2) [B, D]."""
-        index = torch.randint(len(where), (config.imitation_batch,), generator=generator)
+        index = torch.randint(len(where), (config.imitation_batch,), generator=generator, device=device)
         trial = where[index, 0]
         theta_hat = reparametrise(mean[trial], std[trial], generator)
         features = torch.cat([scaler(obs[index]), theta_hat], -1)
@@ -158,18 +181,20 @@ def fit(
 
     where, obs, action = steps.nonzero(), expert.obs[steps], expert.action[steps]
     data = [first]
+    latents: Tensor | None = None
     for _ in range(config.rounds):
-        joined = Batch.of(Trials.concatenate(data))
+        if latents is not None:
+            data.append(explore(Explorer(belief, policy, scaler, latents, config.random_share), rng))
+        joined = Batch.of(Trials.concatenate(data), device)
         for _ in range(config.inference_updates):
             done += 1
             infer(joined)
         mean, std = final_belief(belief, expert)
-        belief.set_prior(reparametrise(mean, std, generator))
-        mean, std = final_belief(belief, expert)
+        latents = reparametrise(mean, std, generator)
+        belief.set_prior(latents)
         for _ in range(config.imitation_updates):
             done += 1
             imitate(mean, std)
-        data.append(explore(Explorer(policy, scaler, reparametrise(mean, std, generator), config.random_share), rng))
     imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(imitation, 4 * config.imitation_updates)
     for _ in range(4 * config.imitation_updates):
@@ -182,14 +207,11 @@ def fit(
 @torch.no_grad()
 def final_belief(belief: Belief, trials: Batch) -> tuple[Tensor, Tensor]:
     """q_phi(theta_hat_H | tau) of whole trials: mean and std [B, D]."""
-    means, stds = [], []
-    for part in torch.arange(len(trials)).split(64):
+    memories = []
+    for part in torch.arange(len(trials), device=trials.mask.device).split(64):
         batch = trials[part]
-        mean, std = belief(batch)
-        last = batch.mask.sum(1).long()
-        means.append(mean[torch.arange(len(part)), last])
-        stds.append(std[torch.arange(len(part)), last])
-    return torch.cat(means), torch.cat(stds)
+        memories.append(belief(batch)[torch.arange(len(part), device=part.device), batch.mask.sum(1).long()])
+    return belief.posterior(torch.cat(memories))
 
 
 def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:

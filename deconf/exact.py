@@ -16,6 +16,32 @@ from experts.demos import Agent
 from experts.policy import Expert
 
 
+class Grid:
+    """K equally likely thetas, and what one transition of each of N environments says about them."""
+
+    def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
+        self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k)
+        self._simulator = env.task.simulator(len(self.theta))
+        for i, theta in enumerate(self.theta):
+            self._simulator.set_theta(i, theta)
+
+    def prior(self, n: int) -> Array:
+        """Log-belief [N, K] before any evidence."""
+        return np.full((n, len(self.theta)), -np.log(len(self.theta)))
+
+    def log_dynamics(self, state: Array, action: Array, next_state: Array) -> Array:
+        """log p(s' | s, a, theta) [N, K]; state, next_state [N, S], action [N, A]."""
+        n, k = len(state), len(self.theta)
+        outcome = self._simulator.outcome(np.repeat(state, k, 0), np.repeat(action, k, 0)).reshape(n, k, -1)
+        return self.env.task.log_prob(next_state[:, None], outcome)
+
+    def log_policy(self, obs: Array, action: Array) -> Array:
+        """log pi_exp(a | s, theta) [N, K]; obs [N, O], action [N, A]."""
+        n, k = len(obs), len(self.theta)
+        thetas = np.tile(self.theta, (n, 1))
+        return self.expert.log_prob(np.repeat(obs, k, 0), np.repeat(action, k, 0), thetas).reshape(n, k)
+
+
 class ExactAgent(Agent):
     """Samples theta from the grid posterior every step, and acts as the expert of that theta.
 
@@ -25,32 +51,21 @@ class ExactAgent(Agent):
 
     def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, k: int = 21) -> None:
         self.env, self.expert, self.conditional = env, expert, conditional
-        self.grid = env.task.theta_grid(k)
-        self._simulator = env.task.simulator(len(self.grid))
-        for i, theta in enumerate(self.grid):
-            self._simulator.set_theta(i, theta)
+        self.grid = Grid(env, expert, k)
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng = rng
-        self.log_belief = np.full((n, len(self.grid)), -np.log(len(self.grid)))
+        self._rng, self.log_belief = rng, self.grid.prior(n)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
         cumulative = np.exp(self.log_belief).cumsum(-1)
         index = (self._rng.random((len(obs), 1)) * cumulative[:, -1:] > cumulative).sum(-1)
-        return self.expert.act(obs, self.grid[index], self._rng)
+        return self.expert.act(obs, self.grid.theta[index], self._rng)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        n, k = self.log_belief.shape
-        repeated = np.repeat(action, k, 0)
-        outcome = self._simulator.outcome(np.repeat(self._state, k, 0), repeated).reshape(n, k, -1)
-        log_dynamics = self.env.task.log_prob(self.env.state[:, None], outcome)
-        log_policy = None
-        if self.conditional:
-            grid = np.tile(self.grid, (n, 1))
-            log_policy = self.expert.log_prob(np.repeat(obs, k, 0), repeated, grid).reshape(n, k)
-        self.log_belief = np.where(
-            alive[:, None], belief_update(self.log_belief, log_dynamics, log_policy), self.log_belief
-        )
+        log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
+        log_policy = self.grid.log_policy(obs, action) if self.conditional else None
+        updated = belief_update(self.log_belief, log_dynamics, log_policy)
+        self.log_belief = np.where(alive[:, None], updated, self.log_belief)

@@ -30,6 +30,7 @@ class NaiveConfig:
     batch: int = 64
     chunk: int = 50
     learning_rate: float = 1e-3
+    device: str = "cpu"
 
 
 class RnnAgent(Agent):
@@ -39,34 +40,33 @@ class RnnAgent(Agent):
         self.memory, self.policy = memory, policy
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng, self._state = torch_generator(rng), self.memory.start(n)
+        self._state = self.memory.start(n)
+        self._rng = torch_generator(rng, self._state.device)
 
     @torch.no_grad()
     def act(self, obs: NDArray[np.float32]) -> Array:
-        features = torch.cat([self._state, self.memory.obs(torch.as_tensor(obs))], -1)
-        return self.policy.sample(features, self._rng).double().numpy()
+        features = torch.cat([self._state, self.memory.obs(obs)], -1)
+        return self.policy.sample(features, self._rng).double().cpu().numpy()
 
     @torch.no_grad()
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        self._state = self.memory.update(self._state, Batch.step(obs, action, next_obs, alive))
+        self._state = self.memory.update(self._state, Batch.step(obs, action, next_obs, alive, self._state.device))
 
 
-def fit(
-    trials: Trials, config: NaiveConfig, rng: np.random.Generator, progress: Progress = no_progress
-) -> RnnAgent:
+def fit(trials: Trials, config: NaiveConfig, rng: np.random.Generator, progress: Progress = no_progress) -> RnnAgent:
     """Clone the expert's trials; chunks of a trial are seen in order, the memory passed on between them."""
-    data, signature = Batch.of(trials), Signature.of(trials)
+    data, signature = Batch.of(trials, config.device), Signature.of(trials)
     with seeded(rng):
-        memory = GruMemory(config.width, signature, Scaler(data.obs[data.mask.bool()].numpy()))
-        policy = ActionHead(config.width + signature.obs, config.width, signature)
+        memory = GruMemory(config.width, signature, Scaler(data.obs[data.mask.bool()])).to(config.device)
+        policy = ActionHead(config.width + signature.obs, config.width, signature).to(config.device)
     optimizer = torch.optim.Adam([*memory.parameters(), *policy.parameters()], config.learning_rate)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    generator = torch_generator(rng)
+    generator = torch_generator(rng, config.device)
     update = 0
     while update < config.updates:
-        batch = data[torch.randint(len(data), (config.batch,), generator=generator)]
+        batch = data[torch.randint(len(data), (config.batch,), generator=generator, device=config.device)]
         state: Tensor = memory.start(config.batch)
         for begin in range(0, batch.mask.shape[1], config.chunk):
             chunk = batch[:, begin : begin + config.chunk]

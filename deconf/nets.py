@@ -34,9 +34,9 @@ def seeded(rng: np.random.Generator) -> Iterator[None]:
         yield
 
 
-def torch_generator(rng: np.random.Generator) -> torch.Generator:
+def torch_generator(rng: np.random.Generator, device: str | torch.device = "cpu") -> torch.Generator:
     """A torch generator drawn from a numpy one."""
-    return torch.Generator().manual_seed(int(rng.integers(2**31)))
+    return torch.Generator(device).manual_seed(int(rng.integers(2**31)))
 
 
 def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
@@ -77,14 +77,14 @@ class Scaler(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, data: NDArray[np.float32]) -> None:
+    def __init__(self, data: Tensor) -> None:
         super().__init__()
         std = data.std(0)
-        self.register_buffer("mean", torch.as_tensor(data.mean(0)))
-        self.register_buffer("std", torch.as_tensor(np.where(std > 1e-6, std, 1.0).astype(np.float32)))
+        self.register_buffer("mean", data.mean(0))
+        self.register_buffer("std", torch.where(std > 1e-6, std, torch.ones_like(std)))
 
-    def forward(self, x: Tensor) -> Tensor:
-        return (x - self.mean) / self.std
+    def forward(self, x: Tensor | NDArray[np.float32]) -> Tensor:
+        return (torch.as_tensor(x, device=self.mean.device) - self.mean) / self.std
 
 
 class ActionHead(nn.Module):
@@ -111,7 +111,7 @@ class ActionHead(nn.Module):
         if self.signature.actions:
             return torch.multinomial(F.softmax(self.net(features), -1), 1, generator=rng).float()
         mean, std = self._gaussian(features)
-        return (mean + std * torch.randn(mean.shape, generator=rng)).clamp(-1, 1)
+        return (mean + std * torch.randn(mean.shape, generator=rng, device=rng.device)).clamp(-1, 1)
 
 
 class DynamicsHead(nn.Module):
@@ -146,22 +146,28 @@ class Batch:
     mask: Tensor
 
     @staticmethod
-    def of(trials: Trials) -> Batch:
+    def of(trials: Trials, device: str | torch.device = "cpu") -> Batch:
         """Join the episodes of each trial."""
         mask = trials.mask.reshape(len(trials), -1)
         order = np.argsort(~mask, axis=1, kind="stable")[:, : mask.sum(1).max()]
 
         def join(array: NDArray[np.float32]) -> Tensor:
             flat = array.reshape(*mask.shape, -1)
-            return torch.as_tensor(np.take_along_axis(flat, order[..., None], 1))
+            return torch.as_tensor(np.take_along_axis(flat, order[..., None], 1), device=device)
 
         steps = join(mask.astype(np.float32))[..., 0]
         return Batch(join(trials.obs[:, :, :-1]), join(trials.action), join(trials.obs[:, :, 1:]), steps)
 
     @staticmethod
-    def step(obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]) -> Batch:
+    def step(
+        obs: NDArray[np.float32],
+        action: Array,
+        next_obs: NDArray[np.float32],
+        alive: NDArray[np.bool_],
+        device: torch.device,
+    ) -> Batch:
         """One transition each of N trials, without a time axis."""
-        return Batch(*(torch.as_tensor(x, dtype=torch.float32) for x in (obs, action, next_obs, alive)))
+        return Batch(*(torch.as_tensor(x, dtype=torch.float32, device=device) for x in (obs, action, next_obs, alive)))
 
     def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | None, ...]) -> Batch:
         return Batch(self.obs[index], self.action[index], self.next_obs[index], self.mask[index])

@@ -16,6 +16,8 @@ ARMS = 5
 
 
 class Bandit(Task):
+    """Outcomes are pay-out probabilities, noise is uniform: exact beliefs are Eq. (8) and (9)."""
+
     name = "bandit"
     latents = (Latent("best_arm", "", 0, ARMS - 1, "categorical"),)
     horizon = 100

@@ -35,7 +35,9 @@ class BatchEnv:
 
     def seed(self, seed: int | Sequence[int | None] | None) -> None:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
-        seeds = [seed] * self.n if seed is None else [seed + i for i in range(self.n)] if isinstance(seed, int) else seed
+        seeds = (
+            [seed] * self.n if seed is None else [seed + i for i in range(self.n)] if isinstance(seed, int) else seed
+        )
         self._streams = [
             [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seeds
         ]

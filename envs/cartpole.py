@@ -1,4 +1,4 @@
-"""What the cartpole tasks share: a cart on a rail holds a mark while its pole stays up, on an axle, under process noise."""
+"""What the cartpole tasks share: a cart holds a mark on its rail while its pole stays up, under process noise."""
 
 from __future__ import annotations
 

@@ -20,6 +20,8 @@ SPIN = 10.0  # rad/s
 
 
 class SlipperyCartpole(Cartpole):
+    """The third joint, `axle` (rad), turns at `SPIN`; its reaction force is taken by the cart's rail."""
+
     name = "slippery_cartpole"
     latents = (Latent("friction", "N m", 0.0, 0.3),)
     process_noise = {"slider": (0.004, 0.1), "hinge": (0.004, 0.2), "axle": (0.004, 0.1)}

@@ -15,13 +15,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -222,4 +222,3 @@ class Task(ABC):
                 raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")
             return array
         return np.clip(array, self.action_space.low, self.action_space.high)
-

@@ -15,6 +15,8 @@ from envs.task import Array, Latent
 
 
 class TiltedCartpole(Cartpole):
+    """Moves the rail's body."""
+
     name = "tilted_cartpole"
     latents = (Latent("tilt", "rad", -0.3, 0.3),)
 

@@ -1,0 +1,1 @@
+"""Policies that see theta, and the trials they make."""

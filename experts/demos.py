@@ -52,8 +52,10 @@ class Trials:
     @staticmethod
     def concatenate(parts: list[Trials]) -> Trials:
         """All trials of all parts, in order."""
-        arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("obs", "action", "mask"))
-        return Trials(*arrays, actions=parts[0].actions)
+        obs, action, mask = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("obs", "action", "mask")
+        )
+        return Trials(obs, action, mask, parts[0].actions)
 
     def save(self, file: Path) -> None:
         """Write an .npz file, atomically."""
@@ -130,7 +132,7 @@ def run_trials(
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
-    action: Array | None = None
+    action: NDArray[np.float32] | None = None
     agent.begin(n, np.random.default_rng([seed, 1]))
     for e in range(episodes):
         if e == 0:

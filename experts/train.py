@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import stable_baselines3
@@ -23,7 +24,7 @@ from experts import policy
 from experts.demos import ExpertAgent, RandomAgent, run_trials
 from experts.sb3 import Sb3VecEnv
 
-PPO_SETTINGS = {
+PPO_SETTINGS: dict[str, Any] = {
     "n_steps": 128,
     "batch_size": 2048,
     "n_epochs": 10,
@@ -60,9 +61,9 @@ def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.n
         device="cpu",
     )
     model.learn(steps, callback=_Progress(steps))
-    hidden = [layer for layer in model.policy.mlp_extractor.policy_net if hasattr(layer, "weight")]
+    layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
     weights = {}
-    for i, layer in enumerate([*hidden, model.policy.action_net]):
+    for i, layer in enumerate(layer for layer in layers if isinstance(layer, torch.nn.Linear)):
         weights[f"{i}.weight"] = layer.weight.detach().numpy()
         weights[f"{i}.bias"] = layer.bias.detach().numpy()
     return weights

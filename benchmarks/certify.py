@@ -1,0 +1,221 @@
+"""Is a task confounded, and by how much? `python benchmarks/certify.py --task slippery_cartpole`
+
+Four measurements, none of which needs a trained imitator but the last: what it costs to expect the wrong theta, how
+loudly actions and dynamics speak of theta, what the exact policies make of it, and what a policy without memory does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+import envs
+from benchmarks.score import normalise
+from deconf import cloning
+from deconf.equations import belief_update
+from deconf.exact import ExactAgent, Grid
+from envs.console import check_folder, run_command, write_json
+from envs.task import Array
+from experts import policy
+from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from experts.policy import Expert
+
+EPISODES = 5
+LEVELS = 5  # of theta in the stakes matrix, for one latent
+THRESHOLDS = {
+    "blind_bc": ("<=", 0.7),
+    "told_wrong_theta": ("<=", 0.65),
+    "conditional_last": ("<=", 0.7),
+    "interventional_last": (">=", 0.95),
+}
+
+
+class Witness(ExpertAgent):
+    """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give."""
+
+    def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid) -> None:
+        super().__init__(env, expert)
+        self.grid = grid
+
+    def begin(self, n: int, rng: np.random.Generator) -> None:
+        super().begin(n, rng)
+        self.log_belief = self.grid.prior(n)
+        self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
+        self.actions: list[Array] = []
+        self.beliefs: list[Array] = []  # [N, K], after each episode
+
+    def reset(self) -> None:
+        self.beliefs.append(np.exp(self.log_belief))
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        self._state = self.env.state
+        return super().act(obs)
+
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        task = self.env.task
+        log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
+        true = task.log_prob(self.env.state, self.env.simulator.outcome(self._state, action))
+        self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
+        acted = self.expert.log_prob(obs, action, self.env.theta)
+        self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
+        self.log_belief = np.where(alive[:, None], belief_update(self.log_belief, log_dynamics), self.log_belief)
+
+
+def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Array, Array, Array]:
+    """Levels [J, L]; scores [J, J] of the expert under the row's theta, told the column's; mean returns [J, J].
+
+    Each row is scored by its own expert and its own random actions.
+    """
+    levels = task.theta_grid(max(2, round(LEVELS ** (1 / len(task.latents)))))
+    j = len(levels)
+    true = np.repeat(levels, j * trials, 0)
+    told = np.tile(np.repeat(levels, trials, 0), (j, 1))
+    env = envs.BatchEnv(task, j * j * trials)
+    _, returns = run_trials(env, ExpertAgent(env, expert, told), 1, seed, true)
+    _, random = run_trials(env, RandomAgent(task.action_space), 1, seed, true)
+    matrix = returns.reshape(j, j, trials).mean(-1)
+    zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
+    one = np.diag(matrix)[:, None]
+    return levels, normalise(matrix, zero, one), matrix
+
+
+def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
+    """[J, J] pairs at least half of the range apart in some latent; any two different categories are."""
+    far = np.zeros((len(levels), len(levels)), bool)
+    for i, latent in enumerate(task.latents):
+        values = levels[:, i]
+        if latent.distribution == "categorical":
+            far |= values[:, None] != values
+        else:
+            far |= np.abs(latent.cdf(values)[:, None] - latent.cdf(values)) >= 0.5 - 1e-9
+    return far
+
+
+def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, seed: int = 0) -> dict[str, Any]:
+    """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert."""
+    env = envs.BatchEnv(task, trials)
+
+    def returns(agent: Agent) -> Array:
+        return run_trials(env, agent, EPISODES, seed)[1].mean(0)
+
+    witness = Witness(env, expert, Grid(env, expert, grid))
+    one, zero = returns(witness).mean(), returns(RandomAgent(task.action_space)).mean()
+    truth = env.theta.copy()  # the same in every run: seeds are shared
+    beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
+    interventional = returns(ExactAgent(env, expert, False, grid))
+    conditional = returns(ExactAgent(env, expert, True, grid))
+    levels, matrix, raw = stakes(task, expert, max(trials // 2, 8), seed)
+
+    demo_env = envs.BatchEnv(task, 2 * trials)
+    demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, seed + 1)
+    blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
+
+    scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
+    measured = {
+        "blind_bc": float(normalise(blind, zero, one).mean()),
+        "told_wrong_theta": float(matrix[far_pairs(task, levels)].mean()),
+        "conditional_last": float(scored["cond"][-1]),
+        "interventional_last": float(scored["int"][-1]),
+    }
+    checks = {}
+    for name, (relation, bound) in THRESHOLDS.items():
+        holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
+        checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
+    dynamics, actions = (float(np.concatenate(x).mean()) for x in (witness.dynamics, witness.actions))
+    return {
+        "task": task.name,
+        "task_version": task.version,
+        "verdict": "passed" if all(check["passed"] for check in checks.values()) else "failed",
+        "checks": checks,
+        "return_random": float(zero),
+        "return_expert": float(one),
+        "interventional": {"return": interventional.tolist(), "score": scored["int"].tolist()},
+        "conditional": {"return": conditional.tolist(), "score": scored["cond"].tolist()},
+        "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": actions / dynamics},
+        "inferability": [inferability(task, belief, witness.grid.theta, truth) for belief in beliefs],
+        "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
+        "trials": trials,
+        "grid": len(witness.grid.theta),
+        "seed": seed,
+        "versions": {"python": platform.python_version(), "mujoco": version("mujoco"), "numpy": np.__version__},
+    }
+
+
+def inferability(task: envs.Task, belief: Array, grid: Array, truth: Array) -> dict[str, float]:
+    """How well the exact posterior of expert trials [N, K] knows theta: R^2 of its mean, or accuracy if categorical."""
+    found = {}
+    for i, latent in enumerate(task.latents):
+        if latent.distribution == "categorical":
+            found[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
+        else:
+            residual = belief @ grid[:, i] - truth[:, i]
+            found[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
+    return found
+
+
+def picture(result: dict[str, Any], file: Path) -> None:
+    """Stakes, exact policies and evidence on one page."""
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 3.9), layout="constrained")
+    score = np.array(result["stakes"]["score"])
+    image = left.imshow(score, vmin=0, vmax=1, cmap="viridis")
+    for (i, j), value in np.ndenumerate(score):
+        left.text(j, i, f"{value:.2f}", ha="center", va="center", color="white" if value < 0.6 else "black", fontsize=8)
+    ticks = ["\n".join(f"{x:.3g}" for x in level) for level in result["stakes"]["levels"]]
+    left.set(xlabel="theta told", ylabel="true theta", title="score of an expert told another theta")
+    left.set_xticks(range(len(ticks)), ticks)
+    left.set_yticks(range(len(ticks)), ticks)
+    figure.colorbar(image, ax=left)
+    for name, colour in (("interventional", "tab:green"), ("conditional", "tab:red")):
+        middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=colour, label=f"exact {name}")
+    middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
+    middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title="exact policies")
+    middle.legend(frameon=False)
+    evidence = result["evidence_nats_per_step"]
+    right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
+    right.set(yscale="log", ylabel="nats a step", title=f"evidence of theta, ratio {evidence['delusion_ratio']:.3g}")
+    figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--out", type=Path, help="output folder; default: results/certificates")
+    args = parser.parse_args()
+    task = envs.get(args.task)
+    expert = policy.load(task)
+    folder = args.out or Path("results") / "certificates"
+    check_folder(folder)
+    start = time.time()
+    result = certify(task, expert)
+    write_json(folder / f"{task.name}.json", result)
+    picture(result, folder / f"{task.name}.png")
+    for name, check in result["checks"].items():
+        print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {check['measured']:.3f} (required {check['required']})")
+    evidence = result["evidence_nats_per_step"]
+    print(
+        f"evidence a step: dynamics {evidence['dynamics']:.3g} nats, actions {evidence['actions']:.3g} nats;"
+        f" theta from expert trials: {result['inferability'][-1]}"
+    )
+    print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
+    if result["verdict"] == "failed":
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,198 @@
+"""The benchmark: expert demonstrations, exploration, imitation, deployment over resets, scores, a report.
+
+    python benchmarks/run.py --task slippery_cartpole
+
+Every (method, seed) is a job in a process of its own; its file is written when it is done, and --resume goes on from
+the files that are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import multiprocessing
+import os
+import platform
+import signal
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import envs
+from benchmarks import report, score
+from benchmarks.jobs import CLIPPED, TICKS, Job, load_job, run_job
+from benchmarks.methods import METHODS, REFERENCES
+from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
+from envs.console import Progress, check_folder, run_command, write_atomically, write_json
+from envs.task import Array
+from experts import policy
+
+LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", help="which task; see --list")
+    parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
+    parser.add_argument("--preset", default="default", help=f"how much: {', '.join(PRESETS)} (default: default)")
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="default: all but deconfounded_gru")
+    parser.add_argument("--seeds", type=int, metavar="N", help="how many seeds; default: the preset's")
+    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    parser.add_argument("--out", type=Path, help="output folder; default: results/<task>-<preset>")
+    parser.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    return parser.parse_args()
+
+
+def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
+    """The task and methods asked for. Raises InputError for anything that cannot be run."""
+    if args.task is None:
+        raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
+    task = envs.get(args.task)
+    if args.preset not in PRESETS:
+        raise envs.closest("preset", args.preset, list(PRESETS))
+    methods = args.methods or list(DEFAULT_METHODS)
+    for name in methods:
+        if name not in METHODS:
+            raise envs.closest("method", name, list(METHODS))
+    if args.seeds is not None and args.seeds < 1:
+        raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
+    try:
+        torch.zeros(1, device=args.device)
+    except (RuntimeError, AssertionError):
+        raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
+    policy.load(task)
+    return task, [name for name in METHODS if name in {*methods, *REFERENCES}]
+
+
+def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
+    """Make the output folder, or see that what it holds can be gone on with."""
+    check_folder(folder / "jobs")
+    file = folder / "settings.json"
+    if not file.exists():
+        write_json(file, settings)
+    elif not resume:
+        raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
+    elif json.loads(file.read_text()) != json.loads(json.dumps(settings)):
+        raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
+
+
+def run_jobs(jobs: list[Job], label: str) -> None:
+    """Run jobs side by side, one core each, longest first."""
+    if not jobs:
+        return
+    context = multiprocessing.get_context("spawn")
+    cores = len(os.sched_getaffinity(0))
+    os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
+    progress = Progress(len(jobs) * TICKS, label)
+    ticks = context.Manager().Queue()
+    with ProcessPoolExecutor(min(cores, len(jobs)), context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+        futures = {pool.submit(run_job, job, ticks): job for job in jobs}
+        try:
+            waiting = set(futures)
+            while waiting:
+                while not ticks.empty():
+                    progress.update(ticks.get())
+                for future in [f for f in waiting if f.done()]:
+                    waiting.remove(future)
+                    progress.line(f"{futures[future].method}, seed {futures[future].seed}: {future.result()}")
+                time.sleep(0.1)
+        except BaseException:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    progress.close()
+
+
+def pictures(
+    task: envs.Task, results: dict[str, Any], finished: list[tuple[Job, dict[str, Any]]], folder: Path
+) -> None:
+    """Curves, and a video where a GL works."""
+    report.adaptation(results, folder / "adaptation.png")
+    curves: dict[str, list[dict[str, Any]]] = {}
+    clips: dict[str, dict[str, Any]] = {}
+    for job, data in finished:
+        if data["meta"]["curve"]:
+            curves.setdefault(job.method, []).append(data["meta"]["curve"])
+        for name in CLIPPED:
+            if f"{name}/state" in data:
+                theta = data["theta"][int(data[f"{name}/trial"])]
+                clips[name] = {"state": data[f"{name}/state"], "action": data[f"{name}/action"], "theta": theta}
+    report.learning(curves, task.name, folder / "learning.png")
+    try:
+        report.video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
+    except envs.InputError as error:
+        print(f"no video: {error}")
+
+
+def rows(task: envs.Task, results: dict[str, Any], finished: list[tuple[Job, dict[str, Any]]]) -> str:
+    """rows.csv: one row per method, seed, latent (trial) and episode."""
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(["method", "seed", "trial", *(lat.name for lat in task.latents), "episode", "return", "score"])
+    zero, one = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
+    for job, data in finished:
+        for name in data["meta"]["agents"]:
+            for trial, (theta, returns) in enumerate(zip(data["theta"], data[f"{name}/returns"], strict=True)):
+                latents = [f"{value:.6g}" for value in theta]
+                for episode, value in enumerate(returns):
+                    scored = round(float(score.normalise(value, zero, one)), 4)
+                    out.writerow([name, job.seed, trial, *latents, episode + 1, round(float(value), 4), scored])
+    return text.getvalue()
+
+
+def main() -> None:
+    """The experiment on one page."""
+    args = parse()
+    if args.list:
+        for name in envs.names():
+            task = envs.get(name)
+            latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
+            print(f"{name}: {', '.join(latents)}")
+        print(f"methods: {', '.join(METHODS)}")
+        return
+    task, methods = check(args)
+    settings = preset(args.preset, task, args.device)
+    seeds = args.seeds or settings.seeds
+    folder = args.out or Path("results") / f"{task.name}-{args.preset}"
+    about = {"task": task.name, "task_version": task.version, "preset": args.preset, "settings": asdict(settings)}
+    prepare(folder, about, args.resume)
+    start = time.time()
+    jobs = [Job(task.name, settings, method, seed, folder / "jobs") for method in methods for seed in range(seeds)]
+    run_jobs([job for job in jobs if not job.file.exists()], f"{task.name}, {args.preset}")
+    finished = [(job, load_job(job)) for job in jobs]
+    returns: dict[str, dict[int, Array]] = {}
+    for job, data in finished:
+        for name in data["meta"]["agents"]:
+            returns.setdefault(name, {})[job.seed] = data[f"{name}/returns"]
+    results = {
+        "task": task.name,
+        "task_version": task.version,
+        "preset": args.preset,
+        "seeds": list(range(seeds)),
+        "eval_trials": settings.eval_trials,
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, trained on {args.device}",
+        "wall_s": round(time.time() - start, 1),
+        "job_s": {f"{job.method}-{job.seed}": round(data["meta"]["wall_s"], 1) for job, data in finished},
+        "methods": score.summarise(returns, task.episodes),
+    }
+    write_atomically(folder / "rows.csv", rows(task, results, finished))
+    pictures(task, results, finished, folder)
+    write_json(folder / "results.json", results)
+    write_atomically(folder / "report.html", report.page(results, folder))
+    print(f"\n{task.name}: 0 = random actions, 1 = the expert that sees theta\n\n{score.table(results)}\n")
+    print(f"{results['wall_s']:.0f} s -> {folder / 'report.html'}")
+
+
+if __name__ == "__main__":
+    run_command(main)
