@@ -25,7 +25,7 @@ _CONTROL = Preset(
     explore_trials=64,
     eval_trials=128,
     grid=21,
-    deconfounded=DeconfoundedConfig(),
+    deconfounded=DeconfoundedConfig(inference_updates=800),
     naive=NaiveConfig(),
     cloning=CloningConfig(),
 )

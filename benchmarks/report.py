@@ -86,11 +86,12 @@ def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], fil
         paint = task.painter(clip["theta"])
         frames = zip(clip["state"], clip["action"], strict=True)
         columns.append([_labelled(paint(state, action), name) for state, action in frames])
+    columns = [column for column in columns if column]
     settings = {"quality": 6, "macro_block_size": 8} if file.suffix == ".mp4" else {}
     rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
     with imageio.get_writer(file, fps=rate, **settings) as writer:
-        for row in zip(*columns, strict=True):
-            writer.append_data(np.concatenate(row, 1))
+        for t in range(max(len(frames) for frames in columns)):  # who failed early stands still
+            writer.append_data(np.concatenate([frames[min(t, len(frames) - 1)] for frames in columns], 1))
 
 
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ results.task }}</title>

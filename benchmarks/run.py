@@ -168,7 +168,8 @@ def main() -> None:
     prepare(folder, about, args.resume)
     start = time.time()
     jobs = [Job(task.name, settings, method, seed, folder / "jobs") for method in methods for seed in range(seeds)]
-    run_jobs([job for job in jobs if not job.file.exists()], f"{task.name}, {args.preset}")
+    left = [job for job in jobs if not job.file.exists()]
+    run_jobs(left, f"{task.name}, {args.preset}")
     finished = [(job, load_job(job)) for job in jobs]
     returns: dict[str, dict[int, Array]] = {}
     for job, data in finished:
@@ -183,6 +184,7 @@ def main() -> None:
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
         "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, trained on {args.device}",
         "wall_s": round(time.time() - start, 1),
+        "jobs_resumed": len(jobs) - len(left),
         "job_s": {f"{job.method}-{job.seed}": round(data["meta"]["wall_s"], 1) for job, data in finished},
         "methods": score.summarise(returns, task.episodes),
     }

@@ -1,0 +1,334 @@
+"""What every registered task must hold, and no task escapes: these tests run over the registry."""
+
+from __future__ import annotations
+
+import warnings
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+from dm_env import test_utils
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import envs
+from envs.physics import ModelEdit, SpecEdit
+from experts import policy
+from tests.tools import actions, far_thetas, gl_works
+
+TASKS = envs.names()
+PHYSICS = [name for name in TASKS if isinstance(envs.get(name), envs.MujocoTask)]
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestProtocols:
+    def test_gymnasium(self, name: str) -> None:
+        env = gymnasium.make(envs.get(name).gym_id)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            check_env(env.unwrapped, skip_render_check=not gl_works())
+
+    def test_stable_baselines(self, name: str) -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            check_env_sb3(envs.make(name, privileged=True), skip_render_check=True)
+
+    def test_adapters_agree(self, name: str) -> None:
+        """The vector env, gymnasium's SyncVectorEnv, single envs and dm_env: same seeds, same bits, resets included."""
+        n, task = 3, envs.get(name)
+        ours, theirs = envs.make_vec(name, n), SyncVectorEnv([lambda: envs.make(name) for _ in range(n)])
+        dm = envs.make_dm(name, seed=7)
+        first, _ = ours.reset(seed=7)
+        np.testing.assert_array_equal(first, theirs.reset(seed=7)[0])
+        np.testing.assert_array_equal(first[0], dm.reset().observation)
+        for action in actions(task, n, steps=2 * task.horizon + 5):
+            flat = action[:, 0].astype(int) if task.action_space.shape == () else action
+            mine, other = ours.step(flat), theirs.step(flat)
+            for x, y in zip(mine[:4], other[:4], strict=True):
+                np.testing.assert_array_equal(x, y)
+            step = dm.step(flat[0])
+            np.testing.assert_array_equal(mine[0][0], step.observation)
+            assert step.last() == (mine[2][0] or mine[3][0])
+
+    def test_time_limit(self, name: str) -> None:
+        """Truncation comes at exactly the time limit, if the episode has not ended before."""
+        task = envs.get(name)
+        batch = envs.BatchEnv(task, 64)
+        batch.reset(0)
+        for step, action in enumerate(actions(task, 64, task.horizon), start=1):
+            was_alive = batch.alive
+            _, _, terminated, truncated = batch.step(action)
+            assert (truncated == (was_alive & ~terminated & (step == task.horizon))).all()
+        assert not batch.alive.any()
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestHiddenTheta:
+    def test_no_leak(self, name: str) -> None:
+        """Same seed, many thetas: the first observations and infos are identical."""
+        env = envs.make(name)
+        first = [env.reset(seed=3, options={"theta": theta}) for theta in far_thetas(env.task)]
+        for obs, info in first:
+            np.testing.assert_array_equal(obs, first[0][0])
+            assert info == {}
+        assert env.step(env.action_space.sample())[4] == {}
+
+    def test_effect(self, name: str) -> None:
+        """Same seed and actions, another theta: another trajectory, beyond what the time limit cuts off."""
+        task = envs.get(name)
+        thetas = far_thetas(task)
+        runs = []
+        for theta in thetas:
+            batch = envs.BatchEnv(task, 1)
+            batch.reset(3, {"theta": theta})
+            runs.append(np.array([batch.step(action)[0] for action in actions(task, 1, task.horizon)]))
+        assert all((runs[0] != run).any() for run in runs[1:])
+
+    def test_privileged_view(self, name: str) -> None:
+        """It appends the encoded theta, and is the same otherwise."""
+        plain, privileged = envs.make(name), envs.make(name, privileged=True)
+        obs, seen = plain.reset(seed=5)[0], privileged.reset(seed=5)[0]
+        np.testing.assert_array_equal(seen[: len(obs)], obs)
+        encoded = plain.task.encode_theta(plain.batch.theta)[0]
+        np.testing.assert_allclose(seen[len(obs) :], encoded, rtol=1e-6)
+
+    def test_keep_theta(self, name: str) -> None:
+        """A trial keeps its theta and gets a new start or noise; the next trial gets a new theta."""
+        task = envs.get(name)
+        batch = envs.BatchEnv(task, 16)
+        batch.reset(1)
+        theta = batch.theta.copy()
+        first = [batch.step(action)[0] for action in actions(task, 16, 3)]
+        batch.reset(options={"keep_theta": True})
+        np.testing.assert_array_equal(batch.theta, theta)
+        assert (np.array(first) != np.array([batch.step(action)[0] for action in actions(task, 16, 3)])).any()
+        batch.reset()
+        assert (batch.theta != theta).any()
+
+    def test_theta_follows_its_distribution(self, name: str) -> None:
+        """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003)."""
+        task = envs.get(name)
+        rng = np.random.default_rng(0)
+        draws = np.array([task.sample_theta(rng) for _ in range(2000)])
+        for i, latent in enumerate(task.latents):
+            if latent.distribution == "categorical":
+                counts = (draws[:, i, None] == latent.grid(0)).mean(0)
+                np.testing.assert_allclose(counts, 1 / latent.features, atol=0.04)
+            else:
+                sorted_cdf = np.sort(latent.cdf(draws[:, i]))
+                assert np.abs(sorted_cdf - (np.arange(2000) + 0.5) / 2000).max() < 0.04
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestSeeds:
+    def test_any_batch_size(self, name: str) -> None:
+        """An environment's run depends on its own seed alone, to the bit."""
+        task = envs.get(name)
+        acts = actions(task, 5, task.horizon)
+        large = envs.BatchEnv(task, 5)
+        seen = [large.reset(11)] + [large.step(action)[0] for action in acts]
+        for i in (0, 4):
+            small = envs.BatchEnv(task, 1)
+            again = [small.reset(11 + i)] + [small.step(action[i : i + 1])[0] for action in acts]
+            np.testing.assert_array_equal(np.array(seen)[:, i], np.array(again)[:, 0])
+
+    def test_forced_theta_moves_nothing_else(self, name: str) -> None:
+        """Start and noise belong to the seed: forcing the theta that would have been drawn changes no bit."""
+        task = envs.get(name)
+        acts = actions(task, 4, 10)
+        free, forced = envs.BatchEnv(task, 4), envs.BatchEnv(task, 4)
+        seen = [free.reset(2)] + [free.step(action)[0] for action in acts]
+        again = [forced.reset(2, {"theta": free.theta.copy()})] + [forced.step(action)[0] for action in acts]
+        np.testing.assert_array_equal(np.array(seen), np.array(again))
+
+    def test_starts_vary_and_nothing_is_constant(self, name: str) -> None:
+        task = envs.get(name)
+        batch = envs.BatchEnv(task, 8)
+        seen = np.array([batch.reset(0)] + [batch.step(action)[0] for action in actions(task, 8, task.horizon)])
+        assert (seen.std((0, 1)) > 0).all()
+        if name in PHYSICS:
+            assert (seen[0].std(0) > 0).any()
+
+    def test_observations_share_no_memory(self, name: str) -> None:
+        env = envs.make(name)
+        first, _ = env.reset(seed=0)
+        copy = first.copy()
+        for _ in range(3):
+            env.step(env.action_space.sample())
+        np.testing.assert_array_equal(first, copy)
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestBadInput:
+    def test_theta_out_of_bounds(self, name: str) -> None:
+        env = envs.make(name)
+        latent = env.task.latents[0]
+        for wrong in (latent.high + 1, latent.low - 1, float("nan")):
+            theta = [wrong] + [lat.low for lat in env.task.latents[1:]]
+            with pytest.raises(envs.InputError, match=rf"^{latent.name} of {name} was .*must be .*{latent.high:g}"):
+                env.reset(options={"theta": theta})
+        with pytest.raises(envs.InputError, match="must be"):
+            env.reset(options={"theta": [0.0] * 7})
+
+    def test_actions(self, name: str) -> None:
+        env = envs.make_vec(name, 2)
+        env.reset(seed=0)
+        good = actions(env.task, 2, 1)[0]
+        for wrong, what in ((good[:1], "shape"), (np.full_like(good, np.nan), "NaN"), ("left", "must be numbers")):
+            with pytest.raises(envs.InputError, match=what):
+                env.step(wrong)
+
+    def test_reset_options(self, name: str) -> None:
+        env = envs.make(name)
+        with pytest.raises(envs.InputError, match="before the first reset"):
+            env.reset(options={"keep_theta": True})
+        with pytest.raises(envs.InputError, match="unknown"):
+            env.reset(options={"thetas": [0]})
+        with pytest.raises(envs.InputError, match="before the first reset"):
+            envs.make(name).step(env.action_space.sample())
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestTransitions:
+    def test_log_prob_is_the_density_of_the_noise(self, name: str) -> None:
+        """Importance sampling: under outcome p, E[q(s') / p(s')] = 1 for another theta's outcome q; 4,000 draws.
+
+        It fails if log_prob is not normalised, or not that of the noise that apply_noise adds.
+        """
+        task = envs.get(name)
+        rng, m = np.random.default_rng(0), 4000
+        low, high = (lat.grid(9)[[0, -1]] for lat in task.latents[:1]).__next__()
+        near = high if task.latents[0].distribution == "categorical" else low + 0.03 * (high - low)
+        rest = [lat.low for lat in task.latents[1:]]
+        batch = envs.BatchEnv(task, 1)
+        batch.reset(0, {"theta": [low, *rest]})
+        action = actions(task, 1, 1)[0]
+        p = batch.simulator.outcome(batch.state, action)
+        batch.reset(0, {"theta": [near, *rest]})
+        q = batch.simulator.outcome(batch.state, action)
+        noise = np.concatenate([task.sample_noise(rng) for _ in range(m // task.horizon + 1)])[:m]
+        drawn = task.apply_noise(np.repeat(p, m, 0), noise)
+        ratio = np.exp(task.log_prob(drawn, q) - task.log_prob(drawn, p))
+        assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(m) + 1e-9
+        assert ratio.std() > 0
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+class TestPhysics:
+    def test_set_in_place_equals_recompiled(self, name: str) -> None:
+        """Every number of the model, and a trajectory, after several thetas were set one after the other."""
+        task = envs.get(name)
+        assert isinstance(task, envs.MujocoTask)
+        simulator = task.simulator(1)
+        for theta in far_thetas(task):
+            simulator.set_theta(0, theta)
+            spec = task.spec()
+            task.apply_latent(SpecEdit(spec), theta)
+            assert_same_model(simulator.models[0], spec.compile())
+
+    def test_nominal_model_is_not_touched(self, name: str) -> None:
+        task = envs.get(name)
+        assert isinstance(task, envs.MujocoTask)
+        before = task.spec().compile()
+        batch = envs.BatchEnv(task, 2)
+        batch.reset(0)
+        assert_same_model(task.model, before)
+
+    def test_rollout_equals_single_steps(self, name: str) -> None:
+        """The thread pool is mj_step, one environment at a time, without a warm start at a control step."""
+        task = envs.get(name)
+        assert isinstance(task, envs.MujocoTask)
+        batch = envs.BatchEnv(task, 3)
+        batch.reset(4)
+        action = actions(task, 3, 1)[0]
+        outcome = batch.simulator.outcome(batch.state, action)
+        for i, model in enumerate(batch.simulator.models):
+            data = mujoco.MjData(model)
+            mujoco.mj_setState(model, data, batch.state[i], mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+            data.ctrl[:] = task.control(action)[i]
+            for _ in range(task.substeps):
+                mujoco.mj_step(model, data)
+            state = np.empty(batch.state.shape[1])
+            mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+            np.testing.assert_array_equal(outcome[i], state)
+
+    def test_every_element_is_named(self, name: str) -> None:
+        task = envs.get(name)
+        assert isinstance(task, envs.MujocoTask)
+        spec = task.spec()
+        for kind in ("bodies", "geoms", "joints", "actuators", "tendons", "cameras", "lights", "textures", "sensors"):
+            assert all(element.name for element in getattr(spec, kind)), kind
+        assert "view" in [camera.name for camera in spec.cameras]
+
+    def test_noise_covers_every_coordinate(self, name: str) -> None:
+        """Else one step could give theta away, and the grid posterior would not be exact."""
+        task = envs.get(name)
+        assert isinstance(task, envs.MujocoTask)
+        assert set(task.process_noise) == {joint.name for joint in task.spec().joints}
+        assert all(std > 0 for pair in task.process_noise.values() for std in pair)
+
+    def test_picture_shows_theta_or_state(self, name: str) -> None:
+        if not gl_works():
+            pytest.skip("no GL here")
+        env = envs.make(name, render_mode="rgb_array")
+        env.reset(seed=0)
+        first = env.render()
+        for _ in range(5):
+            env.step(env.action_space.high)
+        assert first.shape == (240, 320, 3)
+        assert (env.render() != first).any()
+
+
+def assert_same_model(model: mujoco.MjModel, other: mujoco.MjModel) -> None:
+    """Equal, bit for bit, in every array."""
+    compared = 0
+    for field in dir(model):
+        value = getattr(model, field, None) if not field.startswith("_") else None
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(other, field), err_msg=field)
+            compared += 1
+    assert compared > 100
+
+
+def test_mass_edit_equals_recompiled() -> None:
+    """Mass with inertia and what MuJoCo derives from them; scales do not compound."""
+    task = envs.get("slippery_cartpole")
+    assert isinstance(task, envs.MujocoTask)
+    model = task.spec().compile()
+    edit = ModelEdit(model)
+    for scale in (3.0, 0.5, 2.0):
+        edit.body_mass("pole", scale)
+        edit.finish()
+    spec = task.spec()
+    SpecEdit(spec).body_mass("pole", 2.0)
+    assert_same_model(model, spec.compile())
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestDmEnv(test_utils.EnvironmentTestMixin):
+    """dm_env's own test mixin, over the registry."""
+
+    @pytest.fixture(autouse=True)
+    def _named(self, name: str) -> None:
+        self.object_under_test = envs.make_dm(name, seed=0)
+
+    def make_action_sequence(self):
+        rng, spec = np.random.default_rng(0), self.environment.action_spec()
+        for _ in range(200):
+            yield spec.generate_value() if hasattr(spec, "num_values") else rng.uniform(-1, 1, spec.shape).astype("f4")
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_expert_loads_and_acts(name: str) -> None:
+    """Batched, in bounds, and its log-probability prefers its own actions to those of another theta's expert."""
+    task = envs.get(name)
+    expert, batch = policy.load(task), envs.BatchEnv(task, 32)
+    obs = batch.reset(0)
+    other = np.repeat(far_thetas(task)[:1], 32, 0)
+    action = expert.act(obs, batch.theta, np.random.default_rng(0))
+    assert task.check_action(action, 32).shape == action.shape
+    own, foreign = expert.log_prob(obs, action, batch.theta), expert.log_prob(obs, action, other)
+    assert own.shape == (32,)
+    assert own.mean() > foreign.mean()
