@@ -89,7 +89,7 @@ def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Arr
     matrix = returns.reshape(j, j, trials).mean(-1)
     zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
     one = np.diag(matrix)[:, None]
-    return levels, normalise(matrix, zero, one), matrix
+    return levels, (matrix - zero) / (one - zero), matrix
 
 
 def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ matplotlib.use("Agg")
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 import envs
@@ -47,7 +48,7 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
         axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
         axes.text(trained + 0.6, 0.02, "longer than trained on", color="0.45", fontsize=8)
     axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     figure.savefig(file, dpi=110)
     plt.close(figure)
@@ -87,8 +88,9 @@ def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], fil
         frames = zip(clip["state"], clip["action"], strict=True)
         columns.append([_labelled(paint(state, action), name) for state, action in frames])
     columns = [column for column in columns if column]
-    settings = {"quality": 6, "macro_block_size": 8} if file.suffix == ".mp4" else {}
+    settings: dict[str, Any] = {"quality": 6, "macro_block_size": 8} if file.suffix == ".mp4" else {"loop": 0}
     rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
+    writer: Any
     with imageio.get_writer(file, fps=rate, **settings) as writer:
         for t in range(max(len(frames) for frames in columns)):  # who failed early stands still
             writer.append_data(np.concatenate([frames[min(t, len(frames) - 1)] for frames in columns], 1))

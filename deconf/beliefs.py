@@ -107,7 +107,7 @@ class GruMemory(nn.Module):
 
     def start(self, n: int) -> Tensor:
         """The memory [N, W] of empty histories."""
-        return self.gru.bias_hh_l0.new_zeros(n, self.width)
+        return self.embed_action.weight.new_zeros(n, self.width)
 
     def forward(self, batch: Batch, memory: Tensor) -> Tensor:
         """Transitions [B, T, ...] after a memory [B, W] -> memories [B, T + 1, W]."""

@@ -41,7 +41,7 @@ class GymEnv(gym.Env[NDArray[np.float32], Any]):
         self.task, self.render_mode = task, render_mode
         self.batch = BatchEnv(task, 1, privileged)
         self.observation_space = _observation_space(task, privileged)
-        self.action_space = task.action_space
+        self.action_space: spaces.Space[Any] = task.action_space
         self.metadata = {**self.metadata, "render_fps": round(1 / task.control_dt)}
         self._action = np.zeros(self.action_space.shape or (1,))
         self._painter: Painter | None = None

@@ -66,7 +66,7 @@ class BatchEnv:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
-        for i in np.flatnonzero(np.ones(self.n, bool) if where is None else where):
+        for i in range(self.n) if where is None else np.flatnonzero(where).tolist():
             theta_rng, start_rng, noise_rng = self._streams[i]
             if not keep:
                 self.simulator.set_theta(i, self.task.sample_theta(theta_rng) if forced is None else forced[i])

@@ -172,7 +172,7 @@ class Task(ABC):
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         """theta [L] ~ p(theta)."""
-        return np.array([lat.ppf(rng.random()) for lat in self.latents])
+        return np.array([lat.ppf(np.asarray(rng.random())) for lat in self.latents])
 
     def theta_grid(self, k: int) -> Array:
         """[K, L] equally likely thetas: the product of the latents' grids, k a latent."""

@@ -8,6 +8,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import pytest
+from absl.testing import absltest
 from dm_env import test_utils
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
@@ -306,18 +307,24 @@ def test_mass_edit_equals_recompiled() -> None:
     assert_same_model(model, spec.compile())
 
 
-@pytest.mark.parametrize("name", TASKS)
-class TestDmEnv(test_utils.EnvironmentTestMixin):
-    """dm_env's own test mixin, over the registry."""
+class DmEnvMixin(test_utils.EnvironmentTestMixin):
+    """dm_env's own test mixin; a subclass for each task is made below."""
 
-    @pytest.fixture(autouse=True)
-    def _named(self, name: str) -> None:
-        self.object_under_test = envs.make_dm(name, seed=0)
+    task_name: str
+
+    def make_object_under_test(self):
+        return envs.make_dm(self.task_name, seed=0)
 
     def make_action_sequence(self):
         rng, spec = np.random.default_rng(0), self.environment.action_spec()
         for _ in range(200):
             yield spec.generate_value() if hasattr(spec, "num_values") else rng.uniform(-1, 1, spec.shape).astype("f4")
+
+
+for _name in TASKS:
+    globals()[f"TestDmEnv_{_name}"] = type(
+        f"TestDmEnv_{_name}", (DmEnvMixin, absltest.TestCase), {"task_name": _name}
+    )
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -1,0 +1,23 @@
+# Everything from nothing but Python >= 3.11: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+
+.PHONY: demo test lint
+
+demo: $(VENV)/installed
+	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
+
+test: lint
+	$(VENV)/bin/python -m pytest
+
+lint: $(VENV)/installed
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python >= 3.11 is needed')"
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install -q -c constraints.txt torch
+	$(VENV)/bin/pip install -q -c constraints.txt -e .[dev]
+	touch $@
