@@ -26,7 +26,7 @@ def _observation_space(task: Task, privileged: bool) -> spaces.Box:
     return spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
-class GymEnv(gym.Env[NDArray[np.float32], Any]):
+class GymEnv(gym.Env[Any, Any]):
     """One environment with gymnasium's interface: the batch of one.
 
     `reset(options={"keep_theta": True})` starts the next episode of a trial; `options={"theta": [...]}` forces theta.
@@ -41,7 +41,7 @@ class GymEnv(gym.Env[NDArray[np.float32], Any]):
         self.task, self.render_mode = task, render_mode
         self.batch = BatchEnv(task, 1, privileged)
         self.observation_space = _observation_space(task, privileged)
-        self.action_space: spaces.Space[Any] = task.action_space
+        self.action_space = task.action_space
         self.metadata = {**self.metadata, "render_fps": round(1 / task.control_dt)}
         self._action = np.zeros(self.action_space.shape or (1,))
         self._painter: Painter | None = None
@@ -67,7 +67,7 @@ class GymEnv(gym.Env[NDArray[np.float32], Any]):
         return self._painter(self.batch.state[0], self._action.reshape(-1))
 
 
-class GymVectorEnv(VectorEnv[NDArray[np.float32], Any, NDArray[Any]]):
+class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
 
     A finished environment is reset by the next step (AutoresetMode.NEXT_STEP), with a theta of its own.

@@ -1,0 +1,221 @@
+"""The core: equations by hand, beliefs, data types, and each method on data small enough for a test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+import envs
+from deconf import cloning, deconfounded, naive_rnn
+from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.equations import gaussian_kl, imitation_loss, inference_loss, reparametrise
+from deconf.exact import ExactAgent
+from deconf.nets import Batch, Scaler, Signature
+from experts import policy
+from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+
+
+def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.BatchEnv]:
+    env = envs.BatchEnv(envs.get(name), n)
+    return run_trials(env, ExpertAgent(env, policy.load(env.task)), episodes, seed=1)[0], env
+
+
+def explorer(name: str, n: int, episodes: int = 2) -> deconfounded.Explore:
+    def explore(agent: Agent | None, rng: np.random.Generator) -> Trials:
+        env = envs.BatchEnv(envs.get(name), n)
+        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, int(rng.integers(2**31)))[0]
+
+    return explore
+
+
+class TestEquations:
+    def test_kl(self) -> None:
+        """KL(N(1, 2^2) || N(0, 1)) = (1 + 4 - 1 - 2 log 2) / 2 = 2 - log 2; of equal Gaussians it is 0."""
+        ones = torch.ones(1)
+        assert gaussian_kl(ones, 2 * ones, 0 * ones, ones).item() == pytest.approx(2 - np.log(2))
+        assert gaussian_kl(3 * ones, 2 * ones, 3 * ones, 2 * ones).item() == pytest.approx(0)
+
+    def test_losses(self) -> None:
+        """Eq. (6) of log p = -1, -3 and KL = 10, 20 with beta .1: -((-1 - 1) + (-3 - 2)) / 2 = 3.5."""
+        loss = inference_loss(torch.tensor([-1.0, -3.0]), torch.tensor([10.0, 20.0]), 0.1)
+        assert loss.item() == pytest.approx(3.5)
+        assert imitation_loss(torch.tensor([-1.0, -3.0])).item() == pytest.approx(2)
+
+    def test_reparametrise(self) -> None:
+        """Mean and std within 4 standard errors of 40,000 draws, and gradients flow to both."""
+        mean, std = torch.full((40_000,), 2.0, requires_grad=True), torch.full((40_000,), 3.0, requires_grad=True)
+        drawn = reparametrise(mean, std, torch.Generator().manual_seed(0))
+        assert abs(drawn.mean().item() - 2) < 4 * 3 / 200
+        assert abs(drawn.std().item() - 3) < 4 * 3 / 200 / np.sqrt(2)
+        drawn.sum().backward()
+        assert mean.grad is not None
+        assert std.grad is not None
+
+
+@pytest.mark.parametrize("kind", [EvidenceBelief, GruBelief])
+@pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
+class TestBeliefs:
+    def make(self, kind: type[Belief], name: str) -> tuple[Belief, Batch, Trials]:
+        trials, _ = demonstrations(name, 6)
+        data, signature = Batch.of(trials), Signature.of(trials)
+        real = data.mask.bool()
+        change = Scaler((data.next_obs - data.obs)[real])
+        torch.manual_seed(0)
+        return kind(3, 32, signature, Scaler(data.obs[real]), change), data, trials  # type: ignore[call-arg]
+
+    def test_one_step_at_a_time_equals_all_at_once(self, kind: type[Belief], name: str) -> None:
+        belief, data, _ = self.make(kind, name)
+        memory = belief.start(len(data))
+        memories = [memory]
+        for t in range(data.mask.shape[1]):
+            memory = belief.update(memory, data[:, t])
+            memories.append(memory)
+        ours, real = torch.stack(memories, 1), data.mask.bool()
+        theirs = belief(data)
+        torch.testing.assert_close(ours[:, 0], theirs[:, 0])
+        torch.testing.assert_close(ours[:, 1:][real], theirs[:, 1:][real], rtol=1e-4, atol=1e-4)
+
+    def test_dead_steps_tell_nothing(self, kind: type[Belief], name: str) -> None:
+        belief, data, _ = self.make(kind, name)
+        step = data[:, 0]
+        step.mask = torch.zeros_like(step.mask)
+        memory = belief(data)[:, 3]
+        torch.testing.assert_close(belief.update(memory, step), memory)
+
+    def test_order(self, kind: type[Belief], name: str) -> None:
+        """The evidence belief does not care for the order of transitions; the GRU's does (so the check can fail)."""
+        belief, data, _ = self.make(kind, name)
+        shortest = int(data.mask.sum(1).min())
+        turned = data[:, torch.arange(shortest - 1, -1, -1)]
+        mean, _ = belief.posterior(belief(data[:, :shortest])[:, -1])
+        mean_turned, _ = belief.posterior(belief(turned)[:, -1])
+        same = torch.allclose(mean, mean_turned, atol=1e-4)
+        assert same == (kind is EvidenceBelief)
+
+
+class TestTrials:
+    def test_shapes_and_values_are_enforced(self) -> None:
+        trials, _ = demonstrations("slippery_cartpole", 3)
+        with pytest.raises(envs.InputError, match="must be"):
+            Trials(trials.obs[:, :, :-1], trials.action, trials.mask)
+        broken = trials.obs.copy()
+        broken[0, 0, 0, 0] = np.nan
+        with pytest.raises(envs.InputError, match="NaN"):
+            Trials(broken, trials.action, trials.mask)
+        with pytest.raises(ValueError, match="read-only"):
+            trials.obs[0] = 0
+
+    def test_save_and_load(self, tmp_path: Path) -> None:
+        trials, _ = demonstrations("bandit", 3)
+        trials.save(tmp_path / "trials.npz")
+        again = Trials.load(tmp_path / "trials.npz")
+        np.testing.assert_array_equal(again.obs, trials.obs)
+        assert again.actions == trials.actions == 5
+        (tmp_path / "trials.npz").write_bytes(b"no zip")
+        with pytest.raises(envs.InputError, match="no trials"):
+            Trials.load(tmp_path / "trials.npz")
+
+    def test_ended_episodes_are_left_out(self) -> None:
+        """Batch holds just the steps that took place, in order, each with its own successor."""
+        env = envs.BatchEnv(envs.get("slippery_cartpole"), 8)
+        trials, returns = run_trials(env, RandomAgent(env.task.action_space), 3, seed=0)
+        data = Batch.of(trials)
+        assert 0 < trials.mask.mean() < 0.5
+        assert data.mask.sum() == trials.mask.sum()
+        np.testing.assert_array_equal(data.obs[0][data.mask[0].bool()], trials.obs[0, :, :-1][trials.mask[0]])
+        np.testing.assert_array_equal(data.next_obs[0][data.mask[0].bool()], trials.obs[0, :, 1:][trials.mask[0]])
+        assert (returns <= trials.mask.sum(-1)).all()  # at most one a step, none after the end
+
+
+class TestExact:
+    @pytest.mark.parametrize("name", ["tilted_cartpole", "slippery_cartpole"])
+    def test_posterior_finds_theta(self, name: str) -> None:
+        """After one episode the interventional posterior of 16 trials holds theta: 90% of its mass within a tenth."""
+        env = envs.BatchEnv(envs.get(name), 16)
+        agent = ExactAgent(env, policy.load(env.task), conditional=False, k=21)
+        run_trials(env, agent, 2, seed=0)
+        latent = env.task.latents[0]
+        near = np.abs(latent.cdf(agent.grid.theta[:, 0])[None] - latent.cdf(env.theta)) < 0.1
+        assert (np.exp(agent.log_belief) * near).sum(-1).mean() > 0.9
+
+    def test_conditional_believes_its_first_guess(self) -> None:
+        """The delusion: the conditional posterior is sure after ten steps, and far from theta more often than not."""
+        env = envs.BatchEnv(envs.get("tilted_cartpole"), 32)
+        agent = ExactAgent(env, policy.load(env.task), conditional=True, k=21)
+        run_trials(env, agent, 1, seed=0)
+        belief = np.exp(agent.log_belief)
+        latent = env.task.latents[0]
+        near = np.abs(latent.cdf(agent.grid.theta[:, 0])[None] - latent.cdf(env.theta)) < 0.1
+        assert belief.max(-1).mean() > 0.8
+        assert (belief * near).sum(-1).mean() < 0.6
+
+
+class TestMethods:
+    """Each method learns what it can from a little data; margins are wide, seeds fixed."""
+
+    def test_bandit_oracle_and_blind(self) -> None:
+        trials, env = demonstrations("bandit", 500, 1)
+        encode, config = env.task.encode_theta, cloning.CloningConfig(updates=300)
+        score = envs.BatchEnv(env.task, 500)
+        rng = np.random.default_rng
+        oracle = cloning.fit(trials, config, rng(0), encode(env.theta), lambda: encode(score.theta))
+        blind = cloning.fit(trials, config, rng(0))
+        assert run_trials(score, oracle, 1, 3)[1].mean() == pytest.approx(60, abs=2)
+        assert run_trials(score, blind, 1, 3)[1].mean() == pytest.approx(20, abs=2)
+
+    def test_naive_rnn_is_deluded(self) -> None:
+        """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
+        trials, env = demonstrations("bandit", 1000, 1)
+        config = naive_rnn.NaiveConfig(updates=250, batch=100, chunk=100, learning_rate=3e-3)
+        agent = naive_rnn.fit(trials, config, np.random.default_rng(0))
+        assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3)[1].mean() < 42
+
+    @pytest.mark.parametrize("kind", ["evidence", "gru"])
+    def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
+        """The same seed gives the same agent, and neither training nor acting touches torch's global generator."""
+        trials, env = demonstrations("slippery_cartpole", 8)
+        config = deconfounded.DeconfoundedConfig(
+            belief=kind,  # type: ignore[arg-type]
+            rounds=2,
+            inference_updates=3,
+            inference_batch=4,
+            imitation_updates=3,
+        )
+        state = torch.get_rng_state()
+        agents = [
+            deconfounded.fit(trials, explorer("slippery_cartpole", 4), config, np.random.default_rng(0))
+            for _ in range(2)
+        ]
+        first, second = (run_trials(env, agent, 2, 5)[0].action for agent in agents)
+        np.testing.assert_array_equal(first, second)
+        assert torch.equal(torch.get_rng_state(), state)
+
+    def test_deconfounded_learns_from_physics(self) -> None:
+        """A minute's budget cut to seconds: after training, the belief tells thetas apart on expert trials."""
+        trials, env = demonstrations("tilted_cartpole", 48)
+        theta = env.theta[:, 0].copy()
+        config = deconfounded.DeconfoundedConfig(
+            rounds=2, inference_updates=150, inference_batch=8, imitation_updates=100, latent=2
+        )
+        agent = deconfounded.fit(trials, explorer("tilted_cartpole", 32), config, np.random.default_rng(0))
+        mean, _ = deconfounded.final_belief(agent.belief, Batch.of(trials))
+        inputs = np.c_[mean.numpy(), np.ones(len(mean))]
+        residual = theta - inputs @ np.linalg.lstsq(inputs, theta, rcond=None)[0]
+        assert 1 - (residual**2).mean() / theta.var() > 0.5
+
+
+class TestWeights:
+    def test_missing_damaged_and_wrong(self, tmp_path: Path) -> None:
+        task = envs.get("slippery_cartpole")
+        with pytest.raises(envs.InputError, match="no expert weights"):
+            policy.load(task, tmp_path / "none.safetensors")
+        (tmp_path / "bad.safetensors").write_bytes(b"\x80\x04not safetensors")
+        with pytest.raises(envs.InputError, match="damaged"):
+            policy.load(task, tmp_path / "bad.safetensors")
+        save_file({"0.weight": np.zeros((4, 2), np.float32)}, tmp_path / "small.safetensors")
+        with pytest.raises(envs.InputError, match="take 2 inputs"):
+            policy.load(task, tmp_path / "small.safetensors")
