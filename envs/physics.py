@@ -38,10 +38,13 @@ def _tilt(angle: float) -> list[float]:
 
 
 class ModelEdit:
-    """Edits a compiled model in place. Nominal values are kept, so that scales never compound."""
+    """Edits a compiled model in place. Scales are of the nominal model's values, so that they never compound.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        self.model, self._nominal, self._data = model, copy.copy(model), mujoco.MjData(model)
+    data: scratch space, which many edits may share (an MjData takes megabytes).
+    """
+
+    def __init__(self, model: mujoco.MjModel, nominal: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self.model, self._nominal, self._data = model, nominal, data
 
     def body_tilt(self, name: str, angle: float) -> None:
         self.model.body(name).quat[:] = _tilt(angle)
@@ -81,12 +84,12 @@ class Physics(Simulator):
     def __init__(self, task: MujocoTask, n: int) -> None:
         super().__init__(task, n)
         self._mujoco_task = task
-        self._edits = [ModelEdit(copy.copy(task.model)) for _ in range(n)]
-        self.models = [edit.model for edit in self._edits]
+        self.models = [copy.copy(task.model) for _ in range(n)]
         threads = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
         self._threads = threads if threads > 1 else 0
         self._pools: dict[int, rollout.Rollout] = {}
         self._datas = [mujoco.MjData(task.model) for _ in range(max(threads, 1))]
+        self._edits = [ModelEdit(model, task.model, self._datas[0]) for model in self.models]
         for i in range(n):
             self.set_theta(i, self.theta[i])
 

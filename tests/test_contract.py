@@ -298,7 +298,7 @@ def test_mass_edit_equals_recompiled() -> None:
     task = envs.get("slippery_cartpole")
     assert isinstance(task, envs.MujocoTask)
     model = task.spec().compile()
-    edit = ModelEdit(model)
+    edit = ModelEdit(model, task.model, mujoco.MjData(model))
     for scale in (3.0, 0.5, 2.0):
         edit.body_mass("pole", scale)
         edit.finish()
