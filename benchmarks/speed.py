@@ -83,7 +83,9 @@ def main() -> None:
         raise envs.InputError(f"--n was {args.n}; it must be at least 1")
     rates = measure(task, args.n)
     ours = rates["vector env, closed loop"]
-    print(f"{task.name}, {args.n} environments, {task.substeps} physics steps a control step, mujoco {mujoco.__version__}")
+    print(
+        f"{task.name}, {args.n} environments, {task.substeps} physics steps a control step, mujoco {mujoco.__version__}"
+    )
     for name, value in rates.items():
         print(f"{name:36} {value:10,.0f} control steps/s   vector env / this: {ours / value:6.2f}")
 

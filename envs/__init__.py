@@ -18,7 +18,20 @@ from envs.slippery_cartpole import SlipperyCartpole
 from envs.task import InputError, Latent, Task
 from envs.tilted_cartpole import TiltedCartpole
 
-__all__ = ["BatchEnv", "InputError", "Latent", "MujocoTask", "Task", "get", "make", "make_dm", "make_vec", "names"]
+__all__ = [
+    "BatchEnv",
+    "GymEnv",
+    "GymVectorEnv",
+    "InputError",
+    "Latent",
+    "MujocoTask",
+    "Task",
+    "get",
+    "make",
+    "make_dm",
+    "make_vec",
+    "names",
+]
 
 TASKS: dict[str, type[Task]] = {cls.name: cls for cls in (Bandit, TiltedCartpole, SlipperyCartpole)}
 

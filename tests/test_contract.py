@@ -322,9 +322,7 @@ class DmEnvMixin(test_utils.EnvironmentTestMixin):
 
 
 for _name in TASKS:
-    globals()[f"TestDmEnv_{_name}"] = type(
-        f"TestDmEnv_{_name}", (DmEnvMixin, absltest.TestCase), {"task_name": _name}
-    )
+    globals()[f"TestDmEnv_{_name}"] = type(f"TestDmEnv_{_name}", (DmEnvMixin, absltest.TestCase), {"task_name": _name})
 
 
 @pytest.mark.parametrize("name", TASKS)

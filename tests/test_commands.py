@@ -1,0 +1,187 @@
+"""Commands as a user runs them: bad input, resuming, and the examples in the documents."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import envs
+import envs.physics
+from benchmarks import certify, score
+from envs.cartpole import Cartpole
+from envs.physics import SpecEdit
+from envs.task import Array
+from experts.policy import Expert
+from tests.test_contract import assert_same_model
+from tests.tools import far_thetas
+
+ROOT = Path(__file__).parents[1]
+
+
+def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    import os
+
+    return subprocess.run(
+        [sys.executable, *args], cwd=ROOT, capture_output=True, text=True, env={**os.environ, **environ}, timeout=300
+    )
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("benchmarks/run.py", "--task", "slipery_cartpole"), "did you mean 'slippery_cartpole'?"),
+        (("benchmarks/run.py", "--task", "bandit", "--methods", "naive"), "did you mean 'naive_rnn'?"),
+        (("benchmarks/run.py", "--task", "bandit", "--preset", "smok"), "did you mean 'smoke'?"),
+        (("benchmarks/run.py", "--task", "bandit", "--seeds", "0"), "must be at least 1"),
+        (("benchmarks/run.py", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
+        (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
+        (("benchmarks/run.py",), "--task is missing"),
+        (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
+        (("-m", "experts.train", "--task", "bandit"), "nothing to train"),
+        (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
+    ],
+)
+def test_bad_input_is_one_line(args: tuple[str, ...], says: str) -> None:
+    done = command(*args)
+    assert done.returncode == 2
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in done.stderr
+
+
+def test_smoke_run_resumes(tmp_path: Path) -> None:
+    """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
+    out, args = tmp_path / "out", ("benchmarks/run.py", "--task", "bandit", "--preset", "smoke", "--out")
+    first = command(*args, str(out), "--methods", "blind_bc", "conditional", "interventional", MUJOCO_GL="off")
+    assert first.returncode == 0, first.stderr
+    results = json.loads((out / "results.json").read_text())
+    for file in ("rows.csv", "adaptation.png", "learning.png", "report.html"):
+        assert (out / file).stat().st_size > 0
+    assert {"task", "task_version", "preset", "seeds", "versions", "wall_s", "methods"} <= set(results)
+    assert set(results["methods"]) == {"random", "expert", "blind_bc", "conditional", "interventional"}
+    for entry in results["methods"].values():
+        assert {"return", "score", "score_last", "ci95"} <= set(entry)
+    assert results["methods"]["interventional"]["score_last"] == pytest.approx((54.1 - 20) / 40, abs=0.05)
+    assert results["methods"]["conditional"]["score_last"] == pytest.approx((32.3 - 20) / 40, abs=0.05)
+    header, *lines = (out / "rows.csv").read_text().splitlines()
+    assert header == "method,seed,trial,best_arm,episode,return,score"
+    assert len(lines) == results["eval_trials"] * 5
+
+    again = command(*args, str(out))
+    assert again.returncode == 2
+    assert "--resume" in again.stderr
+    other = command(*args[:-2], "default", "--out", str(out), "--resume")
+    assert other.returncode == 2
+    assert "other settings" in other.stderr
+
+    (out / "jobs" / "blind_bc-0.npz").unlink()
+    resumed = command(*args, str(out), "--resume", "--methods", "blind_bc", "conditional", "interventional")
+    assert resumed.returncode == 0, resumed.stderr
+    repeated = json.loads((out / "results.json").read_text())
+    assert repeated["methods"] == results["methods"]
+    assert repeated["jobs_resumed"] == 4
+
+
+def test_no_gl_is_only_a_note() -> None:
+    """Without a GL, pictures raise InputError, which run.py turns into a note."""
+    code = "import envs; e = envs.make('slippery_cartpole', render_mode='rgb_array'); e.reset(seed=0); e.render()"
+    done = command("-c", code, MUJOCO_GL="off")
+    assert "InputError: no GL for pictures" in done.stderr
+
+
+class TestScore:
+    def test_by_hand(self) -> None:
+        """Random 10, expert 30: a return of 25 scores .75, and the interval of two seeds .7 and .8 holds both."""
+        returns = {
+            "random": {0: np.full((4, 2), 10.0), 1: np.full((4, 2), 10.0)},
+            "expert": {0: np.full((4, 2), 30.0), 1: np.full((4, 2), 30.0)},
+            "other": {0: np.full((4, 2), 24.0), 1: np.full((4, 2), 26.0)},
+        }
+        methods = score.summarise(returns, 2)
+        assert methods["other"]["score"] == [0.75, 0.75]
+        assert methods["other"]["return"] == [[24.0, 24.0], [26.0, 26.0]]
+        assert methods["other"]["ci95"] == pytest.approx([0.7, 0.8])
+        assert methods["expert"]["score_last"] == 1
+
+    def test_bootstrap_covers(self) -> None:
+        """The 95% interval of 30 normal values holds the mean about as often as it says: 200 tries, 85% at least."""
+        rng = np.random.default_rng(0)
+        held = [low <= 0 <= high for low, high in (score.bootstrap(rng.standard_normal(30)) for _ in range(200))]
+        assert 0.85 < np.mean(held) < 0.99
+        assert score.bootstrap(np.array([1.0])) is None
+
+
+class NoStakes(Cartpole):
+    """Hold a point against Coulomb friction of the rail: feedback alone is enough, so nothing is confounded."""
+
+    name = "no_stakes"
+    latents = (envs.Latent("friction", "N", 0.0, 3.0),)
+
+    def spec(self):
+        spec = envs.get("slippery_cartpole").spec()
+        for tendon in spec.tendons:
+            spec.delete(tendon)
+        tendon = spec.add_tendon(name="rail")
+        tendon.wrap_joint("slider", 1.0)
+        spec.actuator("spin").ctrlrange = [0, 0]
+        return spec
+
+    process_noise = envs.get("slippery_cartpole").process_noise
+    observation = envs.get("tilted_cartpole").observation
+
+    def control(self, action: Array) -> Array:
+        return np.concatenate([action, np.zeros_like(action)], -1)
+
+    def apply_latent(self, edit, theta: Array) -> None:
+        edit.tendon_friction("rail", float(theta[0]))
+
+
+class Feedback(Expert):
+    """A linear controller that adds what friction it is told of, in the direction of motion."""
+
+    def mean(self, obs: Array, theta: Array) -> Array:
+        x, _, sin, velocity, pole_velocity = obs.T
+        force = 1.0 * x + 12 * sin + 1.5 * velocity + 3.0 * pole_velocity
+        return np.clip(force[:, None] / 3 + 0.1 * theta * np.tanh(20 * velocity)[:, None], -1, 1)
+
+    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+        mean = self.mean(obs, theta)
+        return np.clip(mean + 0.02 * rng.standard_normal(mean.shape), -1, 1)
+
+    def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
+        return -0.5 * (((action - self.mean(obs, theta)) / 0.02) ** 2).sum(-1)
+
+
+def test_certificate_fails_what_deserves_it() -> None:
+    """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
+    result = certify.certify(NoStakes(), Feedback(), trials=12, grid=7)
+    assert result["return_expert"] > 4 * result["return_random"]
+    assert result["verdict"] == "failed"
+    assert not result["checks"]["told_wrong_theta"]["passed"]
+    assert not result["checks"]["blind_bc"]["passed"]
+
+
+def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The task in CONTRIBUTING.md is whole: it is a gymnasium environment, and its latent does what it says."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    code, xml = (re.search(rf"```{kind}\n(.*?)```", text, re.S).group(1) for kind in ("python", "xml"))
+    assert len(code.splitlines()) <= 60
+    (tmp_path / "bent_cartpole.xml").write_text(xml)
+    monkeypatch.setattr(envs.physics, "ASSETS", tmp_path)
+    space: dict = {}
+    exec(code, space)
+    task = space["BentCartpole"]()
+    check_env(envs.GymEnv(task), skip_render_check=True)
+    simulator = task.simulator(1)
+    for theta in far_thetas(task):
+        simulator.set_theta(0, theta)
+        spec = task.spec()
+        task.apply_latent(SpecEdit(spec), theta)
+        assert_same_model(simulator.models[0], spec.compile())
