@@ -41,27 +41,31 @@ class Job:
 
 
 class Recorder(Agent):
-    """Passes everything on to an agent, and keeps one trial's states and actions of the present episode."""
+    """Passes everything on to an agent, and keeps states and actions of one trial's episode number task.episodes.
+
+    The trial is the one whose first latent is nearest the quantile: the same for every method, as seeds are shared.
+    """
 
     def __init__(self, agent: Agent, env: envs.BatchEnv, quantile: float = 0.85) -> None:
         self.agent, self.env, self.quantile = agent, env, quantile
 
     def begin(self, n: int, rng: np.random.Generator) -> None:
         self.agent.begin(n, rng)
+        theta = self.env.theta[:, 0]
+        self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
+        self.episode = 1
         self.states: list[Array] = []
         self.actions: list[Array] = []
 
     def reset(self) -> None:
         self.agent.reset()
-        self.states, self.actions = [], []
+        self.episode += 1
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         action = self.agent.act(obs)
-        # The trial whose first latent is nearest the quantile: the same for every method, as seeds are shared.
-        theta = self.env.theta[:, 0]
-        self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
-        self.states.append(self.env.state[self.trial].copy())
-        self.actions.append(action[self.trial])
+        if self.episode == self.env.task.episodes and self.env.alive[self.trial]:
+            self.states.append(self.env.state[self.trial].copy())
+            self.actions.append(action[self.trial])
         return action
 
     def observe(

@@ -133,10 +133,10 @@ def run_trials(
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
     action: NDArray[np.float32] | None = None
-    agent.begin(n, np.random.default_rng([seed, 1]))
     for e in range(episodes):
         if e == 0:
             now = env.reset(seed, None if theta is None else {"theta": theta})
+            agent.begin(n, np.random.default_rng([seed, 1]))
         else:
             now = env.reset(options={"keep_theta": True})
             agent.reset()

@@ -185,3 +185,12 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
         spec = task.spec()
         task.apply_latent(SpecEdit(spec), theta)
         assert_same_model(simulator.models[0], spec.compile())
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_readme_snippets_run(number: int) -> None:
+    """What README shows is what runs."""
+    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+    assert len(snippets) == 2
+    done = command("-c", snippets[number])
+    assert done.returncode == 0, done.stderr
