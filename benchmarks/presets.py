@@ -37,14 +37,16 @@ _BANDIT = Preset(
     grid=0,
     deconfounded=DeconfoundedConfig(
         latent=5,
+        beta=5e-3,
         rounds=4,
-        inference_updates=1500,
+        inference_updates=1600,
         inference_batch=64,
         inference_steps=6400,
         imitation_updates=400,
+        learning_rate=2e-3,
         random_share=1.0,
     ),
-    naive=NaiveConfig(updates=1500, batch=100, chunk=100, learning_rate=2e-3),
+    naive=NaiveConfig(updates=1000, batch=100, chunk=100, learning_rate=5e-3),
     cloning=CloningConfig(updates=1000),
 )
 _SMOKE_CONTROL = replace(
@@ -64,7 +66,9 @@ _SMOKE_BANDIT = replace(
     expert_trials=2000,
     explore_trials=1000,
     eval_trials=1000,
-    deconfounded=replace(_BANDIT.deconfounded, rounds=2, inference_updates=700, imitation_updates=200),
+    deconfounded=replace(
+        _BANDIT.deconfounded, rounds=1, inference_updates=1000, inference_steps=3200, imitation_updates=200
+    ),
     naive=replace(_BANDIT.naive, updates=250),
     cloning=replace(_BANDIT.cloning, updates=400),
 )

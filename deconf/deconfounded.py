@@ -44,6 +44,7 @@ class DeconfoundedConfig:
     width: int = 64
     latent: int = 4
     beta: float = 1e-3
+    warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
     inference_updates: int = 300  # a round
     inference_batch: int = 16  # trials, whose every step is evidence
@@ -153,8 +154,8 @@ def fit(
     cooling = torch.optim.lr_scheduler.CosineAnnealingLR(inference, config.rounds * config.inference_updates)
     imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
 
-    def infer(data: Batch) -> None:
-        """One update of phi and psi."""
+    def infer(data: Batch, inferred: int) -> None:
+        """One update of phi and psi; `inferred` have gone before."""
         batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator, device=device)]
         keep = batch.mask.bool()
         picked = torch.randint(int(keep.sum()), (config.inference_steps,), generator=generator, device=device)
@@ -163,7 +164,8 @@ def fit(
         theta_hat = reparametrise(mean, std, generator)
         log_next = dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)
         kl = gaussian_kl(mean, std, belief.prior_mean, belief.prior_std)
-        loss = inference_loss(log_next, kl, config.beta)
+        warm = min(1.0, inferred / (config.warm_up * config.rounds * config.inference_updates + 1))
+        loss = inference_loss(log_next, kl, config.beta * warm)
         _descend(inference, loss)
         cooling.step()
         progress(done, total, {"inference": loss.item()})
@@ -182,13 +184,13 @@ def fit(
     where, obs, action = steps.nonzero(), expert.obs[steps], expert.action[steps]
     data = [first]
     latents: Tensor | None = None
-    for _ in range(config.rounds):
+    for i in range(config.rounds):
         if latents is not None:
             data.append(explore(Explorer(belief, policy, scaler, latents, config.random_share), rng))
         joined = Batch.of(Trials.concatenate(data), device)
-        for _ in range(config.inference_updates):
+        for j in range(config.inference_updates):
             done += 1
-            infer(joined)
+            infer(joined, i * config.inference_updates + j)
         mean, std = final_belief(belief, expert)
         latents = reparametrise(mean, std, generator)
         belief.set_prior(latents)
