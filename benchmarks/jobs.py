@@ -15,12 +15,11 @@ import torch
 from numpy.typing import NDArray
 
 import envs
-from benchmarks.methods import EVALUATION, LEARNED, METHODS, Context, Preset, stream
+from benchmarks.methods import COST, EVALUATION, LEARNED, METHODS, Context, Preset, stream
 from envs.console import write_atomically
 from envs.task import Array
 from experts.demos import Agent, run_trials
 
-TICKS = 1000  # of progress, a job
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
 
@@ -38,6 +37,11 @@ class Job:
     def file(self) -> Path:
         """An .npz file."""
         return self.folder / f"{self.method}-{self.seed}.npz"
+
+    @property
+    def ticks(self) -> int:
+        """Of progress: in proportion to how long a job takes."""
+        return 100 * COST.get(self.method, 1)
 
 
 class Recorder(Agent):
@@ -82,7 +86,7 @@ def run_job(job: Job, ticks: Queue[int]) -> str:
 
     def progress(done: int, total: int, losses: dict[str, float]) -> None:
         nonlocal told
-        if (now := int(0.8 * TICKS * done / total)) > told:
+        if (now := int(0.8 * job.ticks * done / total)) > told:
             ticks.put(now - told)
             told = now
         if done % max(total // 400, 1) == 0:
@@ -107,7 +111,7 @@ def run_job(job: Job, ticks: Queue[int]) -> str:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, theta=context.env.theta, meta=np.array(json.dumps(meta)), **arrays)
     write_atomically(job.file, buffer.getvalue())
-    ticks.put(TICKS - told)
+    ticks.put(job.ticks - told)
     return f"trained in {trained:.0f} s, all in {meta['wall_s']:.0f} s"
 
 

@@ -119,5 +119,8 @@ METHODS: dict[str, Callable[[Context], dict[str, Agent]]] = {
 }
 """Longest first, so that the last ones to run are short. A method may score several ways of deploying one agent."""
 
+COST = {"deconfounded": 7, "deconfounded_gru": 14, "naive_rnn": 4, "conditional": 4, "interventional": 3}
+"""Of a method, about, where blind BC is 1: for the ETA alone."""
+
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
 LEARNED = ("deconfounded", "deconfounded_gru", "naive_rnn", "oracle_bc", "blind_bc")

@@ -28,10 +28,11 @@ import torch
 
 import envs
 from benchmarks import report, score
-from benchmarks.jobs import CLIPPED, TICKS, Job, load_job, run_job
+from benchmarks.jobs import CLIPPED, Job, load_job, run_job
 from benchmarks.methods import METHODS, REFERENCES
 from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
 from envs.console import Progress, check_folder, run_command, write_atomically, write_json
+from envs.physics import cores
 from envs.task import Array
 from experts import policy
 
@@ -90,11 +91,11 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     if not jobs:
         return
     context = multiprocessing.get_context("spawn")
-    cores = len(os.sched_getaffinity(0))
+    workers = min(cores(), len(jobs))
     os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
-    progress = Progress(len(jobs) * TICKS, label)
+    progress = Progress(sum(job.ticks for job in jobs), label)
     ticks = context.Manager().Queue()
-    with ProcessPoolExecutor(min(cores, len(jobs)), context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
+    with ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
         futures = {pool.submit(run_job, job, ticks): job for job in jobs}
         try:
             waiting = set(futures)
@@ -182,7 +183,7 @@ def main() -> None:
         "seeds": list(range(seeds)),
         "eval_trials": settings.eval_trials,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-        "machine": f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, trained on {args.device}",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
         "wall_s": round(time.time() - start, 1),
         "jobs_resumed": len(jobs) - len(left),
         "job_s": {f"{job.method}-{job.seed}": round(data["meta"]["wall_s"], 1) for job, data in finished},

@@ -33,6 +33,14 @@ class Edit(Protocol):
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
 
 
+def cores() -> int:
+    """How many threads to use: OMP_NUM_THREADS if it is a number, else the cores this process may run on."""
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _tilt(angle: float) -> list[float]:
     return [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
 
@@ -85,7 +93,7 @@ class Physics(Simulator):
         super().__init__(task, n)
         self._mujoco_task = task
         self.models = [copy.copy(task.model) for _ in range(n)]
-        threads = int(os.environ.get("OMP_NUM_THREADS") or len(os.sched_getaffinity(0)))
+        threads = cores()
         self._threads = threads if threads > 1 else 0
         self._pools: dict[int, rollout.Rollout] = {}
         self._datas = [mujoco.MjData(task.model) for _ in range(max(threads, 1))]
