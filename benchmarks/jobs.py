@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import signal
 import time
 from dataclasses import dataclass
+from multiprocessing.queues import Queue
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 import numpy as np
@@ -78,16 +79,26 @@ class Recorder(Agent):
         self.agent.observe(obs, action, next_obs, alive)
 
 
-def run_job(job: Job, ticks: Queue[int]) -> str:
-    """Train and evaluate one method with one seed, and write its file; returns a line that says how it went."""
+_ticks: Queue[int]  # of this worker process, to the main one
+
+
+def start_worker(ticks: Queue[int]) -> None:
+    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process."""
+    global _ticks
+    _ticks = ticks
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def run_job(job: Job) -> str:
+    """Train and evaluate one method with one seed, and write its file; returns a line that says how it went."""
     start, told = time.time(), 0
     curve: dict[str, list[tuple[int, float]]] = {}
 
     def progress(done: int, total: int, losses: dict[str, float]) -> None:
         nonlocal told
         if (now := int(0.8 * job.ticks * done / total)) > told:
-            ticks.put(now - told)
+            _ticks.put(now - told)
             told = now
         if done % max(total // 400, 1) == 0:
             for kind, loss in losses.items():
@@ -111,7 +122,7 @@ def run_job(job: Job, ticks: Queue[int]) -> str:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, theta=context.env.theta, meta=np.array(json.dumps(meta)), **arrays)
     write_atomically(job.file, buffer.getvalue())
-    ticks.put(job.ticks - told)
+    _ticks.put(job.ticks - told)
     return f"trained in {trained:.0f} s, all in {meta['wall_s']:.0f} s"
 
 

@@ -15,9 +15,9 @@ import json
 import multiprocessing
 import os
 import platform
-import signal
 import time
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +28,7 @@ import torch
 
 import envs
 from benchmarks import report, score
-from benchmarks.jobs import CLIPPED, Job, load_job, run_job
+from benchmarks.jobs import CLIPPED, Job, load_job, run_job, start_worker
 from benchmarks.methods import METHODS, REFERENCES
 from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
 from envs.console import Progress, check_folder, run_command, write_atomically, write_json
@@ -94,9 +94,9 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     workers = min(cores(), len(jobs))
     os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
     progress = Progress(sum(job.ticks for job in jobs), label)
-    ticks = context.Manager().Queue()
-    with ProcessPoolExecutor(workers, context, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool:
-        futures = {pool.submit(run_job, job, ticks): job for job in jobs}
+    ticks = context.Queue()
+    with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
+        futures = {pool.submit(run_job, job): job for job in jobs}
         try:
             waiting = set(futures)
             while waiting:
@@ -106,6 +106,8 @@ def run_jobs(jobs: list[Job], label: str) -> None:
                     waiting.remove(future)
                     progress.line(f"{futures[future].method}, seed {futures[future].seed}: {future.result()}")
                 time.sleep(0.1)
+        except BrokenProcessPool:
+            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
         except BaseException:
             for process in multiprocessing.active_children():
                 process.terminate()

@@ -135,6 +135,16 @@ class TestSeeds:
             again = [small.reset(11 + i)] + [small.step(action[i : i + 1])[0] for action in acts]
             np.testing.assert_array_equal(np.array(seen)[:, i], np.array(again)[:, 0])
 
+    def test_streams(self, name: str) -> None:
+        """Environment i of seed s draws theta, start and noise from SeedSequence(s + i).spawn(3), in that order."""
+        task = envs.get(name)
+        batch = envs.BatchEnv(task, 2)
+        batch.reset(20)
+        for i in range(2):
+            theta, start, _ = map(np.random.default_rng, np.random.SeedSequence(20 + i).spawn(3))
+            np.testing.assert_array_equal(batch.theta[i], task.sample_theta(theta))
+            np.testing.assert_array_equal(batch.state[i], task.init_state(start))
+
     def test_forced_theta_moves_nothing_else(self, name: str) -> None:
         """Start and noise belong to the seed: forcing the theta that would have been drawn changes no bit."""
         task = envs.get(name)
