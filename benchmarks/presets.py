@@ -42,11 +42,11 @@ _BANDIT = Preset(
         inference_updates=1600,
         inference_batch=64,
         inference_steps=6400,
-        imitation_updates=400,
-        learning_rate=2e-3,
+        imitation_updates=200,
+        learning_rate=3e-3,
         random_share=1.0,
     ),
-    naive=NaiveConfig(updates=1000, batch=100, chunk=100, learning_rate=5e-3),
+    naive=NaiveConfig(updates=2000, batch=100, chunk=50, learning_rate=1e-2),
     cloning=CloningConfig(updates=1000),
 )
 _SMOKE_CONTROL = replace(
