@@ -42,7 +42,7 @@ _BANDIT = Preset(
         inference_updates=1600,
         inference_batch=64,
         inference_steps=6400,
-        imitation_updates=200,
+        imitation_updates=300,
         learning_rate=3e-3,
         random_share=1.0,
     ),
@@ -66,10 +66,8 @@ _SMOKE_BANDIT = replace(
     expert_trials=2000,
     explore_trials=1000,
     eval_trials=1000,
-    deconfounded=replace(
-        _BANDIT.deconfounded, rounds=1, inference_updates=1000, inference_steps=3200, imitation_updates=200
-    ),
-    naive=replace(_BANDIT.naive, updates=250),
+    deconfounded=replace(_BANDIT.deconfounded, rounds=1, inference_updates=1600, imitation_updates=200),
+    naive=replace(_BANDIT.naive, updates=500),
     cloning=replace(_BANDIT.cloning, updates=400),
 )
 
