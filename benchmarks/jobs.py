@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import json
+import multiprocessing
+import os
 import signal
+import threading
 import time
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
@@ -82,9 +85,17 @@ class Recorder(Agent):
 _ticks: Queue[int]  # of this worker process, to the main one
 
 
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
 def start_worker(ticks: Queue[int]) -> None:
-    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process."""
+    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
     global _ticks
+    threading.Thread(target=_die_with_parent, daemon=True).start()
     _ticks = ticks
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -18,7 +18,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 import envs
-from benchmarks import score
 
 COLOURS = {
     "expert": "black",
@@ -131,6 +130,3 @@ def page(results: dict[str, Any], folder: Path) -> str:
     template = jinja2.Environment(autoescape=True).from_string(_PAGE)
     episodes = len(methods[0][1]["score"])
     return template.render(results=results, methods=methods, pictures=pictures, movie=movie, how=how, episodes=episodes)
-
-
-__all__ = ["adaptation", "learning", "page", "score", "video"]

@@ -67,8 +67,8 @@ def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
     if args.seeds is not None and args.seeds < 1:
         raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
     try:
-        torch.zeros(1, device=args.device)
-    except (RuntimeError, AssertionError):
+        torch.zeros(1, device=args.device).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
         raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
     policy.load(task)
     return task, [name for name in METHODS if name in {*methods, *REFERENCES}]
@@ -76,14 +76,20 @@ def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
 
 def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     """Make the output folder, or see that what it holds can be gone on with."""
+    check_folder(folder)
     check_folder(folder / "jobs")
     file = folder / "settings.json"
     if not file.exists():
         write_json(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
-    elif json.loads(file.read_text()) != json.loads(json.dumps(settings)):
-        raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
+    else:
+        try:
+            before = json.loads(file.read_text())
+        except ValueError:
+            raise envs.InputError(f"{file} is damaged; give another --out") from None
+        if before != json.loads(json.dumps(settings)):
+            raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
 
 
 def run_jobs(jobs: list[Job], label: str) -> None:
@@ -133,7 +139,7 @@ def pictures(
     report.learning(curves, task.name, folder / "learning.png")
     try:
         report.video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
-    except envs.InputError as error:
+    except (envs.InputError, OSError, RuntimeError) as error:  # no GL, or no encoder: the run is good all the same
         print(f"no video: {error}")
 
 
@@ -167,7 +173,14 @@ def main() -> None:
     settings = preset(args.preset, task, args.device)
     seeds = args.seeds or settings.seeds
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
-    about = {"task": task.name, "task_version": task.version, "preset": args.preset, "settings": asdict(settings)}
+    about = {
+        "task": task.name,
+        "task_version": task.version,
+        "preset": args.preset,
+        "settings": asdict(settings),
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "expert": policy.fingerprint(task),
+    }
     prepare(folder, about, args.resume)
     start = time.time()
     jobs = [Job(task.name, settings, method, seed, folder / "jobs") for method in methods for seed in range(seeds)]
@@ -184,16 +197,16 @@ def main() -> None:
         "preset": args.preset,
         "seeds": list(range(seeds)),
         "eval_trials": settings.eval_trials,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "versions": about["versions"],
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
         "wall_s": round(time.time() - start, 1),
         "jobs_resumed": len(jobs) - len(left),
         "job_s": {f"{job.method}-{job.seed}": round(data["meta"]["wall_s"], 1) for job, data in finished},
         "methods": score.summarise(returns, task.episodes),
     }
+    write_json(folder / "results.json", results)
     write_atomically(folder / "rows.csv", rows(task, results, finished))
     pictures(task, results, finished, folder)
-    write_json(folder / "results.json", results)
     write_atomically(folder / "report.html", report.page(results, folder))
     print(f"\n{task.name}: 0 = random actions, 1 = the expert that sees theta\n\n{score.table(results)}\n")
     print(f"{results['wall_s']:.0f} s -> {folder / 'report.html'}")

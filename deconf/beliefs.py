@@ -32,7 +32,7 @@ class Belief(nn.Module, ABC):
         Without it, early samples are spread over more of the latent space than there is data for.
         """
         self.prior_mean.copy_(theta_hat.mean(0))
-        self.prior_std.copy_(theta_hat.std(0).clamp(min=0.05))
+        self.prior_std.copy_(theta_hat.std(0, correction=0).clamp(min=0.05))
 
     @abstractmethod
     def forward(self, batch: Batch) -> Tensor:

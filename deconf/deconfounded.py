@@ -29,7 +29,7 @@ from deconf.nets import (
     seeded,
     torch_generator,
 )
-from envs.task import Array
+from envs.task import Array, InputError
 from experts.demos import Agent, Trials
 
 Explore = Callable[[Agent | None, np.random.Generator], Trials]
@@ -134,10 +134,14 @@ def fit(
     progress: Progress = no_progress,
 ) -> DeconfoundedAgent:
     """Algorithm 1. trials: of the expert, without theta. explore: see `Explore`; it is called once a round."""
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     device = config.device
     expert, signature = Batch.of(trials, device), Signature.of(trials)
     steps = expert.mask.bool()
     first = explore(None, rng)
+    if Signature.of(first) != signature:
+        raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
     seen = Batch.of(first, device)
     real = seen.mask.bool()
     scaler = Scaler(torch.cat([seen.obs[real], expert.obs[steps]]))

@@ -68,7 +68,7 @@ def fit(trials: Trials, config: NaiveConfig, rng: np.random.Generator, progress:
     while update < config.updates:
         batch = data[torch.randint(len(data), (config.batch,), generator=generator, device=config.device)]
         state: Tensor = memory.start(config.batch)
-        for begin in range(0, batch.mask.shape[1], config.chunk):
+        for begin in range(0, int(batch.mask.sum(1).max()), config.chunk):
             chunk = batch[:, begin : begin + config.chunk]
             states = memory(chunk, state)
             features = torch.cat([states[:, :-1], memory.obs(chunk.obs)], -1)

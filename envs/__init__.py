@@ -7,6 +7,13 @@ gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v0")` works.
 from __future__ import annotations
 
 import difflib
+import os
+
+_gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` dies of a backend that is not there; pictures can wait
+import mujoco  # noqa: F401
+
+if _gl is not None:
+    os.environ["MUJOCO_GL"] = _gl
 
 import gymnasium
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import dm_env
@@ -41,7 +42,7 @@ class GymEnv(gym.Env[Any, Any]):
         self.task, self.render_mode = task, render_mode
         self.batch = BatchEnv(task, 1, privileged)
         self.observation_space = _observation_space(task, privileged)
-        self.action_space = task.action_space
+        self.action_space = copy.deepcopy(task.action_space)
         self.metadata = {**self.metadata, "render_fps": round(1 / task.control_dt)}
         self._action = np.zeros(self.action_space.shape or (1,))
         self._painter: Painter | None = None
@@ -62,6 +63,8 @@ class GymEnv(gym.Env[Any, Any]):
     def render(self) -> Any:
         if self.render_mode is None:
             return None
+        if not self.batch.state.size:
+            raise InputError("render was called before the first reset; reset once")
         if self._painter is None:
             self._painter = self.task.painter(self.batch.theta[0])
         return self._painter(self.batch.state[0], self._action.reshape(-1))
@@ -81,7 +84,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.task, self.num_envs = task, n
         self.batch = BatchEnv(task, n, privileged)
         self.single_observation_space = _observation_space(task, privileged)
-        self.single_action_space = task.action_space
+        self.single_action_space = copy.deepcopy(task.action_space)
         self.observation_space = batch_space(self.single_observation_space, n)
         self.action_space = batch_space(task.action_space, n)
 

@@ -40,8 +40,14 @@ class Trials:
             )
         if not (np.isfinite(self.obs).all() and np.isfinite(self.action).all()):
             raise InputError("Trials held NaN or infinity; every observation and action must be finite")
-        for array in (self.obs, self.action, self.mask):
+        if not self.mask.any():
+            raise InputError("Trials held no step that took place; their mask must be True somewhere")
+        if self.actions and not np.isin(self.action, np.arange(self.actions)).all():
+            raise InputError(f"Trials held an action that is not one of 0..{self.actions - 1}")
+        for name, dtype in (("obs", np.float32), ("action", np.float32), ("mask", bool)):
+            array = np.array(getattr(self, name), dtype)
             array.setflags(write=False)
+            object.__setattr__(self, name, array)
 
     def __len__(self) -> int:
         return len(self.mask)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from pathlib import Path
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
@@ -80,7 +82,7 @@ def path(task: Task) -> Path:
 
 def load(task: Task, file: Path | None = None) -> Expert:
     """The task's expert. Raises InputError if its weights are missing, damaged or of the wrong shape."""
-    if isinstance(task.action_space.sample(), np.integer):
+    if isinstance(task.action_space, spaces.Discrete):
         return DiscreteExpert(task)
     file = file or path(task)
     remedy = f"run `python -m experts.train --task {task.name}`"
@@ -90,8 +92,19 @@ def load(task: Task, file: Path | None = None) -> Expert:
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
-    inputs = len(task.observation) + sum(lat.features for lat in task.latents)
-    found = weights["0.weight"].shape[1] if "0.weight" in weights else None
-    if found != inputs or not all(np.isfinite(array).all() for array in weights.values()):
-        raise InputError(f"expert weights at {file} take {found} inputs, {task.name} gives {inputs}; {remedy}")
+    width = len(task.observation) + sum(lat.features for lat in task.latents)
+    for i in range(max(len(weights) // 2, 1)):
+        weight, bias = weights.get(f"{i}.weight"), weights.get(f"{i}.bias")
+        if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:
+            raise InputError(f"expert weights at {file} lack a whole layer {i}; {remedy}")
+        if weight.shape[1] != width or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            raise InputError(f"layer {i} of {file} takes {weight.shape[1]} finite inputs, not {width}; {remedy}")
+        width = len(bias)
+    if width != task.action_space.shape[0]:
+        raise InputError(f"expert weights at {file} give {width} actions, not {task.action_space.shape[0]}; {remedy}")
     return NetworkExpert(task, weights)
+
+
+def fingerprint(task: Task) -> str:
+    """SHA-256 of the weights, or `closed form`."""
+    return hashlib.sha256(path(task).read_bytes()).hexdigest() if path(task).is_file() else "closed form"

@@ -80,7 +80,11 @@ def main() -> None:
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
+    if args.steps < 1 or args.seed < 0:
+        raise envs.InputError(f"--steps was {args.steps} and --seed {args.seed}; they must be at least 1 and 0")
     file = args.out or policy.path(task)
+    if file.suffix != ".safetensors":
+        raise envs.InputError(f"--out was {file}; it must end in .safetensors")
     check_folder(file.parent)
     start = time.time()
     weights = train(task, args.steps, args.seed)

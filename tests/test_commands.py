@@ -89,10 +89,11 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert repeated["jobs_resumed"] == 4
 
 
-def test_no_gl_is_only_a_note() -> None:
+@pytest.mark.parametrize("backend", ["off", "nonsense"])
+def test_no_gl_is_only_a_note(backend: str) -> None:
     """Without a GL, pictures raise InputError, which run.py turns into a note."""
     code = "import envs; e = envs.make('slippery_cartpole', render_mode='rgb_array'); e.reset(seed=0); e.render()"
-    done = command("-c", code, MUJOCO_GL="off")
+    done = command("-c", code, MUJOCO_GL=backend)
     assert "InputError: no GL for pictures" in done.stderr
 
 

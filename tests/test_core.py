@@ -216,6 +216,14 @@ class TestWeights:
         (tmp_path / "bad.safetensors").write_bytes(b"\x80\x04not safetensors")
         with pytest.raises(envs.InputError, match="damaged"):
             policy.load(task, tmp_path / "bad.safetensors")
+        layer = {"0.weight": np.zeros((4, 2), np.float32), "0.bias": np.zeros(4, np.float32)}
+        save_file(layer, tmp_path / "narrow.safetensors")
+        with pytest.raises(envs.InputError, match="takes 2 finite inputs, not 7"):
+            policy.load(task, tmp_path / "narrow.safetensors")
+        layer["0.weight"] = np.zeros((4, 7), np.float32)
+        save_file(layer, tmp_path / "wide.safetensors")
+        with pytest.raises(envs.InputError, match="give 4 actions, not 1"):
+            policy.load(task, tmp_path / "wide.safetensors")
         save_file({"0.weight": np.zeros((4, 2), np.float32)}, tmp_path / "small.safetensors")
-        with pytest.raises(envs.InputError, match="take 2 inputs"):
+        with pytest.raises(envs.InputError, match="lack a whole layer 0"):
             policy.load(task, tmp_path / "small.safetensors")
