@@ -35,11 +35,14 @@ class BatchEnv:
 
     def seed(self, seed: int | Sequence[int | None] | None) -> None:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
-        seeds = (
-            [seed] * self.n if seed is None else [seed + i for i in range(self.n)] if isinstance(seed, int) else seed
-        )
+        if seed is None:
+            seed = [None] * self.n
+        elif isinstance(seed, int | np.integer):
+            seed = [int(seed) + i for i in range(self.n)]
+        if len(seed) != self.n or any(one is not None and one < 0 for one in seed):
+            raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [
-            [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seeds
+            [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seed
         ]
 
     def reset(

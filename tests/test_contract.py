@@ -145,6 +145,15 @@ class TestSeeds:
             np.testing.assert_array_equal(batch.theta[i], task.sample_theta(theta))
             np.testing.assert_array_equal(batch.state[i], task.init_state(start))
 
+    def test_seed_kinds(self, name: str) -> None:
+        batch = envs.BatchEnv(envs.get(name), 2)
+        first = batch.reset(3)
+        np.testing.assert_array_equal(batch.reset(np.int64(3)), first)
+        np.testing.assert_array_equal(batch.reset([3, 4]), first)
+        for wrong in ([1], -1):
+            with pytest.raises(envs.InputError, match="seed was"):
+                batch.reset(wrong)
+
     def test_forced_theta_moves_nothing_else(self, name: str) -> None:
         """Start and noise belong to the seed: forcing the theta that would have been drawn changes no bit."""
         task = envs.get(name)
