@@ -13,7 +13,7 @@ from deconf.equations import belief_update
 from envs import BatchEnv
 from envs.task import Array
 from experts.demos import Agent
-from experts.policy import Expert
+from experts.policy import Expert, sample_rows
 
 
 class Grid:
@@ -59,8 +59,7 @@ class ExactAgent(Agent):
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
-        cumulative = np.exp(self.log_belief).cumsum(-1)
-        index = (self._rng.random((len(obs), 1)) * cumulative[:, -1:] > cumulative).sum(-1)
+        index = sample_rows(np.exp(self.log_belief), self._rng)
         return self.expert.act(obs, self.grid.theta[index], self._rng)
 
     def observe(

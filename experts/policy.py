@@ -29,6 +29,12 @@ class Expert(ABC):
         """log pi_exp(a | s, theta) [N]."""
 
 
+def sample_rows(probs: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+    """One index [N] from each row of probabilities [N, K], which need not be normalised."""
+    cumulative = probs.cumsum(-1)
+    return (rng.random((len(probs), 1)) * cumulative[:, -1:] > cumulative).sum(-1)
+
+
 class DiscreteExpert(Expert):
     """The closed form that a task states as `expert_probs`."""
 
@@ -36,8 +42,7 @@ class DiscreteExpert(Expert):
         self.task = task
 
     def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
-        cumulative = np.cumsum(self._probs(obs, theta), -1)
-        return (rng.random((len(obs), 1)) * cumulative[:, -1:] > cumulative).sum(-1, keepdims=True).astype(float)
+        return sample_rows(self._probs(obs, theta), rng)[:, None].astype(float)
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
         return np.log(np.take_along_axis(self._probs(obs, theta), action.astype(int), -1)[:, 0])

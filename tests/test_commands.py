@@ -16,11 +16,9 @@ import envs
 import envs.physics
 from benchmarks import certify, score
 from envs.cartpole import Cartpole
-from envs.physics import SpecEdit
 from envs.task import Array
 from experts.policy import Expert
-from tests.test_contract import assert_same_model
-from tests.tools import far_thetas
+from tests.test_contract import assert_set_in_place_equals_recompiled
 
 ROOT = Path(__file__).parents[1]
 
@@ -181,12 +179,7 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     exec(code, space)
     task = space["BentCartpole"]()
     check_env(envs.GymEnv(task), skip_render_check=True)
-    simulator = task.simulator(1)
-    for theta in far_thetas(task):
-        simulator.set_theta(0, theta)
-        spec = task.spec()
-        task.apply_latent(SpecEdit(spec), theta)
-        assert_same_model(simulator.models[0], spec.compile())
+    assert_set_in_place_equals_recompiled(task)
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -238,15 +238,9 @@ class TestTransitions:
 @pytest.mark.parametrize("name", PHYSICS)
 class TestPhysics:
     def test_set_in_place_equals_recompiled(self, name: str) -> None:
-        """Every number of the model, and a trajectory, after several thetas were set one after the other."""
         task = envs.get(name)
         assert isinstance(task, envs.MujocoTask)
-        simulator = task.simulator(1)
-        for theta in far_thetas(task):
-            simulator.set_theta(0, theta)
-            spec = task.spec()
-            task.apply_latent(SpecEdit(spec), theta)
-            assert_same_model(simulator.models[0], spec.compile())
+        assert_set_in_place_equals_recompiled(task)
 
     def test_nominal_model_is_not_touched(self, name: str) -> None:
         task = envs.get(name)
@@ -310,6 +304,16 @@ def assert_same_model(model: mujoco.MjModel, other: mujoco.MjModel) -> None:
             np.testing.assert_array_equal(value, getattr(other, field), err_msg=field)
             compared += 1
     assert compared > 100
+
+
+def assert_set_in_place_equals_recompiled(task: envs.MujocoTask) -> None:
+    """Every number of the model, after several thetas were set one after the other."""
+    simulator = task.simulator(1)
+    for theta in far_thetas(task):
+        simulator.set_theta(0, theta)
+        spec = task.spec()
+        task.apply_latent(SpecEdit(spec), theta)
+        assert_same_model(simulator.models[0], spec.compile())
 
 
 def test_mass_edit_equals_recompiled() -> None:
