@@ -31,18 +31,18 @@ _CONTROL = Preset(
 )
 _BANDIT = Preset(
     seeds=5,
-    expert_trials=8000,
-    explore_trials=2000,
+    expert_trials=24000,
+    explore_trials=8000,
     eval_trials=4000,
     grid=0,
     deconfounded=DeconfoundedConfig(
         latent=5,
         beta=5e-3,
-        rounds=4,
-        inference_updates=1600,
+        rounds=2,
+        inference_updates=800,
         inference_batch=64,
         inference_steps=6400,
-        imitation_updates=300,
+        imitation_updates=800,
         learning_rate=3e-3,
         random_share=1.0,
     ),
@@ -66,7 +66,7 @@ _SMOKE_BANDIT = replace(
     expert_trials=2000,
     explore_trials=1000,
     eval_trials=1000,
-    deconfounded=replace(_BANDIT.deconfounded, rounds=1, inference_updates=1600, imitation_updates=200),
+    deconfounded=replace(_BANDIT.deconfounded, rounds=1, imitation_updates=400),
     naive=replace(_BANDIT.naive, updates=500),
     cloning=replace(_BANDIT.cloning, updates=400),
 )

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.nets import Batch, Scaler, Signature, mlp
+from deconf.nets import Batch, Scaler, Signature, Whitener, mlp
 
 
 class Belief(nn.Module, ABC):
@@ -58,12 +58,17 @@ class EvidenceBelief(Belief):
     tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
     sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
     size however long the trial. Without a transition, q is the prior.
+
+    The evidence is whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its common
+    part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the latent
+    is ignored.
     """
 
     def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
         super().__init__(latent)
         self.signature, self.obs, self.change, self.width = signature, obs, change, width // 4
         self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width)
+        self.whiten = Whitener(self.width)
         self.out = mlp(2 * self.width + 1, width, 2 * latent)
 
     def _terms(self, batch: Batch) -> Tensor:
@@ -72,7 +77,7 @@ class EvidenceBelief(Belief):
         real = batch[keep]
         change = self.change(real.next_obs - real.obs)
         inputs = [self.obs(real.obs), self.signature.encode_action(real.action), change]
-        evidence = self.evidence(torch.cat(inputs, -1))
+        evidence = self.whiten(self.evidence(torch.cat(inputs, -1)))
         terms = torch.cat([evidence, torch.ones_like(evidence[:, :1])], -1)
         return terms.new_zeros(*keep.shape, self.width + 1).masked_scatter(keep[..., None], terms)
 

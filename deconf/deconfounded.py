@@ -192,9 +192,11 @@ def fit(
         if latents is not None:
             data.append(explore(Explorer(belief, policy, scaler, latents, config.random_share), rng))
         joined = Batch.of(Trials.concatenate(data), device)
+        belief.train()
         for j in range(config.inference_updates):
             done += 1
             infer(joined, i * config.inference_updates + j)
+        belief.eval()
         mean, std = final_belief(belief, expert)
         latents = reparametrise(mean, std, generator)
         belief.set_prior(latents)

@@ -87,6 +87,31 @@ class Scaler(nn.Module):
         return (torch.as_tensor(x, device=self.mean.device) - self.mean) / self.std
 
 
+class Whitener(nn.Module):
+    """Features to mean 0 and standard deviation 1 over the data: a batch's own while training, their running means after.
+
+    Batch normalisation (Ioffe and Szegedy, 2015) without learned scales.
+    """
+
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, features: int, momentum: float = 0.05) -> None:
+        super().__init__()
+        self.momentum = momentum
+        self.register_buffer("mean", torch.zeros(features))
+        self.register_buffer("variance", torch.ones(features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[M, F] -> [M, F]."""
+        mean, variance = self.mean, self.variance
+        if self.training:
+            mean, variance = x.mean(0), x.var(0, correction=0)
+            self.mean.lerp_(mean.detach(), self.momentum)
+            self.variance.lerp_(variance.detach(), self.momentum)
+        return (x - mean) * torch.rsqrt(variance + 1e-5)
+
+
 class ActionHead(nn.Module):
     """Features -> a distribution over actions: categorical, or Gaussian with a learned std for each input."""
 
