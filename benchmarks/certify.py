@@ -6,7 +6,6 @@ loudly actions and dynamics speak of theta, what the exact policies make of it, 
 
 from __future__ import annotations
 
-import argparse
 import platform
 import time
 from importlib.metadata import version
@@ -21,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import envs
+from benchmarks.methods import DEMOS, stream
 from benchmarks.score import normalise
 from deconf import cloning
 from deconf.equations import belief_update
 from deconf.exact import ExactAgent, Grid
-from envs.console import check_folder, run_command, write_json
+from envs.console import Parser, check_folder, run_command, write_json
 from envs.task import Array
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
@@ -113,6 +113,8 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
 
     witness = Witness(env, expert, Grid(env, expert, grid))
     one, zero = returns(witness).mean(), returns(RandomAgent(task.action_space)).mean()
+    if one <= zero:
+        raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
     truth = env.theta.copy()  # the same in every run: seeds are shared
     beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
     interventional = returns(ExactAgent(env, expert, False, grid))
@@ -120,7 +122,7 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
     levels, matrix, raw = stakes(task, expert, max(trials // 2, 8), seed)
 
     demo_env = envs.BatchEnv(task, 2 * trials)
-    demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, seed + 1)
+    demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed))
     blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
 
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
@@ -193,7 +195,7 @@ def picture(result: dict[str, Any], file: Path) -> None:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(__doc__)
     parser.add_argument("--task", required=True)
     parser.add_argument("--out", type=Path, help="output folder; default: results/certificates")
     args = parser.parse_args()

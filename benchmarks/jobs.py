@@ -9,6 +9,8 @@ import os
 import signal
 import threading
 import time
+import zipfile
+import zlib
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
@@ -129,16 +131,19 @@ def run_job(job: Job) -> str:
         if job.seed == 0 and name in CLIPPED:
             arrays[f"{name}/state"], arrays[f"{name}/action"] = np.array(recorder.states), np.array(recorder.actions)
             arrays[f"{name}/trial"] = np.array(recorder.trial)
-    meta = {"agents": list(agents), "curve": curve, "train_s": trained, "wall_s": time.time() - start}
+    meta = {"agents": list(agents), "curve": curve, "train_s": trained, "span": (start, time.time())}
     buffer = io.BytesIO()
     np.savez_compressed(buffer, theta=context.env.theta, meta=np.array(json.dumps(meta)), **arrays)
     write_atomically(job.file, buffer.getvalue())
     _ticks.put(job.ticks - told)
-    return f"trained in {trained:.0f} s, all in {meta['wall_s']:.0f} s"
+    return f"trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
 
 
-def load_job(job: Job) -> dict[str, Any]:
-    """What a finished job wrote: arrays, and `meta` decoded."""
-    with np.load(job.file, allow_pickle=False) as data:
-        arrays = {key: data[key] for key in data.files}
-    return {**arrays, "meta": json.loads(str(arrays["meta"]))}
+def load_job(job: Job) -> dict[str, Any] | None:
+    """What a finished job wrote: arrays, and `meta` decoded. None if its file is missing or damaged."""
+    try:
+        with np.load(job.file, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        return {**arrays, "meta": json.loads(str(arrays["meta"]))}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None

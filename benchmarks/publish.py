@@ -5,7 +5,6 @@ Copies results.json and the adaptation picture, makes a small GIF of the video, 
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 import envs
-from envs.console import check_folder, run_command
+from envs.console import Parser, check_folder, run_command
 
 
 def markdown(results: dict[str, Any]) -> str:
@@ -40,13 +39,16 @@ def gif(video: Path, file: Path) -> None:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(__doc__)
     parser.add_argument("run", type=Path, help="output folder of a finished run")
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     args = parser.parse_args()
     if not (args.run / "results.json").is_file():
         raise envs.InputError(f"{args.run} holds no results.json; give the output folder of a finished run")
-    results = json.loads((args.run / "results.json").read_text())
+    try:
+        results = json.loads((args.run / "results.json").read_text())
+    except ValueError:
+        raise envs.InputError(f"{args.run / 'results.json'} is damaged; run the benchmark again") from None
     check_folder(args.docs)
     shutil.copy(args.run / "results.json", args.docs / f"{results['task']}.json")
     shutil.copy(args.run / "adaptation.png", args.docs / f"{results['task']}.png")

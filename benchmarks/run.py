@@ -15,6 +15,7 @@ import json
 import multiprocessing
 import os
 import platform
+import signal
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -31,7 +32,7 @@ from benchmarks import report, score
 from benchmarks.jobs import CLIPPED, Job, load_job, run_job, start_worker
 from benchmarks.methods import METHODS, REFERENCES
 from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
-from envs.console import Progress, check_folder, run_command, write_atomically, write_json
+from envs.console import Parser, Progress, check_folder, run_command, write_atomically, write_json
 from envs.physics import cores
 from envs.task import Array
 from experts import policy
@@ -41,7 +42,7 @@ LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
 
 def parse() -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(__doc__)
     parser.add_argument("--task", help="which task; see --list")
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
     parser.add_argument("--preset", default="default", help=f"how much: {', '.join(PRESETS)} (default: default)")
@@ -80,6 +81,8 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     check_folder(folder / "jobs")
     file = folder / "settings.json"
     if not file.exists():
+        if any((folder / "jobs").iterdir()):
+            raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
         write_json(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
@@ -102,7 +105,9 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     progress = Progress(sum(job.ticks for job in jobs), label)
     ticks = context.Queue()
     with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
+        heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for workers, which are made now, to inherit
         futures = {pool.submit(run_job, job): job for job in jobs}
+        signal.signal(signal.SIGINT, heard)
         try:
             waiting = set(futures)
             while waiting:
@@ -141,6 +146,15 @@ def pictures(
         report.video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except (envs.InputError, OSError, RuntimeError) as error:  # no GL, or no encoder: the run is good all the same
         print(f"no video: {error}")
+
+
+def worked(spans: list[tuple[float, float]]) -> float:
+    """Seconds covered by spans of time: those of this command, and of the jobs that an earlier one finished."""
+    total, until = 0.0, -np.inf
+    for start, end in sorted(spans):
+        total += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return total
 
 
 def rows(task: envs.Task, results: dict[str, Any], finished: list[tuple[Job, dict[str, Any]]]) -> str:
@@ -184,9 +198,9 @@ def main() -> None:
     prepare(folder, about, args.resume)
     start = time.time()
     jobs = [Job(task.name, settings, method, seed, folder / "jobs") for method in methods for seed in range(seeds)]
-    left = [job for job in jobs if not job.file.exists()]
+    left = [job for job in jobs if load_job(job) is None]
     run_jobs(left, f"{task.name}, {args.preset}")
-    finished = [(job, load_job(job)) for job in jobs]
+    finished = [(job, data) for job in jobs if (data := load_job(job)) is not None]
     returns: dict[str, dict[int, Array]] = {}
     for job, data in finished:
         for name in data["meta"]["agents"]:
@@ -199,9 +213,12 @@ def main() -> None:
         "eval_trials": settings.eval_trials,
         "versions": about["versions"],
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
-        "wall_s": round(time.time() - start, 1),
+        "wall_s": round(worked([(start, time.time()), *(tuple(data["meta"]["span"]) for _, data in finished)]), 1),
         "jobs_resumed": len(jobs) - len(left),
-        "job_s": {f"{job.method}-{job.seed}": round(data["meta"]["wall_s"], 1) for job, data in finished},
+        "job_s": {
+            f"{job.method}-{job.seed}": round(data["meta"]["span"][1] - data["meta"]["span"][0], 1)
+            for job, data in finished
+        },
         "methods": score.summarise(returns, task.episodes),
     }
     write_json(folder / "results.json", results)
@@ -213,4 +230,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main)
+    run_command(main, "what was finished is kept, and --resume goes on")

@@ -6,7 +6,6 @@ over our single env, the open-loop rate of mujoco.rollout, and raw mj_step. In c
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 
@@ -15,7 +14,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import envs
-from envs.console import run_command
+from envs.console import Parser, run_command
 
 
 def rate(steps: int, run: Callable[[], None], repeats: int = 5) -> float:
@@ -72,7 +71,7 @@ def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser(__doc__)
     parser.add_argument("--task", default="slippery_cartpole")
     parser.add_argument("--n", type=int, default=64, help="environments")
     args = parser.parse_args()

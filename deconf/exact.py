@@ -46,8 +46,7 @@ class ExactAgent(Agent):
     """Samples theta from the grid posterior every step, and acts as the expert of that theta.
 
     conditional: count the expert's own probability of the actions taken as evidence too, Eq. (3): the causal delusion.
-    Reads the environment's state, never its theta. The state may hold a little more than observations do: the axle's
-    angle in slippery_cartpole, whose evidence is about 4% of the whole.
+    Reads the environment's state, never its theta.
     """
 
     def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, k: int = 21) -> None:

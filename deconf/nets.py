@@ -30,7 +30,7 @@ def no_progress(done: int, total: int, losses: dict[str, float]) -> None:
 def seeded(rng: np.random.Generator) -> Iterator[None]:
     """Initialise networks from rng and leave torch's global generator as it was."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(rng.integers(2**31)))
+        torch.default_generator.manual_seed(int(rng.integers(2**31)))  # of the CPU, where networks are made
         yield
 
 
@@ -88,7 +88,7 @@ class Scaler(nn.Module):
 
 
 class Whitener(nn.Module):
-    """Features to mean 0 and standard deviation 1 over the data: a batch's own while training, their running means after.
+    """Features to mean 0 and standard deviation 1: by a batch's own while training, by their running means after.
 
     Batch normalisation (Ioffe and Szegedy, 2015) without learned scales.
     """

@@ -51,7 +51,8 @@ class GymEnv(gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
-        self._painter = None
+        if not (options or {}).get("keep_theta"):
+            self._painter = None
         return self.batch.reset(seed, options)[0], {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:

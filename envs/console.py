@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
@@ -9,22 +10,35 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from tqdm import tqdm
 
 from envs.task import InputError
 
 
-def run_command(main: Callable[[], None]) -> None:
-    """Run a command; bad input ends it with one line and exit code 2, Ctrl-C with 130."""
+class Parser(argparse.ArgumentParser):
+    """A command line, described by its module's docstring, whose errors are one line."""
+
+    def __init__(self, description: str | None) -> None:
+        super().__init__(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message}; see --help")
+
+
+def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
+    """Run a command. Bad input, or a disk that is full, ends it with one line and exit code 2, Ctrl-C with 130."""
     try:
         main()
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
+    except OSError as error:
+        print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
     except KeyboardInterrupt:
-        print("interrupted; what was finished is kept", file=sys.stderr)
+        print(f"interrupted; {interrupted}", file=sys.stderr)
         sys.exit(130)
 
 

@@ -141,6 +141,7 @@ class MujocoTask(Task):
 
     substeps: ClassVar[int] = 8
     process_noise: ClassVar[dict[str, tuple[float, float]]]  # joint -> std of (position, velocity) a control step
+    # A coordinate without noise counts as no evidence: it must be one that is neither observed nor matters.
 
     @abstractmethod
     def apply_latent(self, edit: Edit, theta: Array) -> None:
@@ -196,8 +197,10 @@ class MujocoTask(Task):
         index, sigma = [], []
         for joint, stds in self.process_noise.items():
             q, v = self._address(joint)
-            index += [1 + q, 1 + self.model.nq + v]
-            sigma += list(stds)
+            for i, std in zip((1 + q, 1 + self.model.nq + v), stds, strict=True):
+                if std > 0:
+                    index.append(i)
+                    sigma.append(std)
         return np.array(index), np.array(sigma)
 
     def simulator(self, n: int) -> Physics:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import atexit
 import importlib
 import os
 import subprocess
 import sys
+import weakref
 from functools import cache
 
 import mujoco
@@ -39,7 +39,7 @@ class Painter:
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, height, width)
-        atexit.register(self._renderer.close)  # before the GL library is gone
+        weakref.finalize(self, self._renderer.close)  # with this painter, and before the GL library is gone
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
         """Full physics state [S] -> picture [H, W, 3]."""

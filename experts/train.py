@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import time
@@ -19,7 +18,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 import envs
-from envs.console import Progress, check_folder, run_command, write_json
+from envs.console import Parser, Progress, check_folder, run_command, write_json
 from experts import policy
 from experts.demos import ExpertAgent, RandomAgent, run_trials
 from experts.sb3 import Sb3VecEnv
@@ -71,7 +70,7 @@ def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.n
 
 def main() -> None:
     """The command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = Parser(__doc__)
     parser.add_argument("--task", required=True)
     parser.add_argument("--steps", type=int, default=3_000_000, help="control steps of PPO")
     parser.add_argument("--seed", type=int, default=0)

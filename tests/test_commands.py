@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import certify, score
+from benchmarks import certify, run, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -41,6 +41,8 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
         (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
         (("benchmarks/run.py",), "--task is missing"),
+        (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
+        (("benchmarks/publish.py", "nowhere"), "holds no results.json"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "experts.train", "--task", "bandit"), "nothing to train"),
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
@@ -80,11 +82,19 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert "other settings" in other.stderr
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
+    (out / "jobs" / "random-0.npz").write_bytes(b"half a file")
     resumed = command(*args, str(out), "--resume", "--methods", "blind_bc", "conditional", "interventional")
     assert resumed.returncode == 0, resumed.stderr
     repeated = json.loads((out / "results.json").read_text())
     assert repeated["methods"] == results["methods"]
-    assert repeated["jobs_resumed"] == 4
+    assert repeated["jobs_resumed"] == 3
+
+    (out / "settings.json").unlink()
+    assert "not their settings.json" in command(*args, str(out), "--resume").stderr
+
+
+def test_time_worked_counts_overlaps_once() -> None:
+    assert run.worked([(5, 6), (0, 2), (1, 3)]) == 4
 
 
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
