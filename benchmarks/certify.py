@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -48,15 +49,17 @@ class Witness(ExpertAgent):
         super().__init__(env, expert)
         self.grid = grid
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        super().begin(n, rng)
+    def begin(self, n: int) -> None:
+        super().begin(n)
         self.log_belief = self.grid.prior(n)
         self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
         self.actions: list[Array] = []
         self.beliefs: list[Array] = []  # [N, K], after each episode
 
-    def reset(self) -> None:
-        self.beliefs.append(np.exp(self.log_belief))
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        if self.dynamics:
+            self.beliefs.append(np.exp(self.log_belief))
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state

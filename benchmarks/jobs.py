@@ -11,6 +11,7 @@ import threading
 import time
 import zipfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.queues import Queue
 from pathlib import Path
@@ -21,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 
 import envs
+from benchmarks import score
 from benchmarks.methods import COST, EVALUATION, LEARNED, METHODS, Context, Preset, stream
 from envs.console import write_atomically
 from envs.task import Array
@@ -31,44 +33,53 @@ CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in 
 
 @dataclass(frozen=True)
 class Job:
-    """What to run, and the folder that its file belongs in."""
+    """What to run, and the folder that its files belong in, one a seed; seeds run side by side in one program."""
 
     task: str
     preset: Preset
     method: str
-    seed: int
+    seeds: tuple[int, ...]
     folder: Path
 
-    @property
-    def file(self) -> Path:
+    def file(self, seed: int) -> Path:
         """An .npz file."""
-        return self.folder / f"{self.method}-{self.seed}.npz"
+        return self.folder / f"{self.method}-{seed}.npz"
 
     @property
     def ticks(self) -> int:
         """Of progress: in proportion to how long a job takes."""
-        return 100 * COST.get(self.method, 1)
+        return 100 * COST.get(self.method, 1) * len(self.seeds)
 
 
 class Recorder(Agent):
-    """Passes everything on to an agent, and keeps states and actions of one trial's episode number task.episodes.
+    """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
-    The trial is the one whose first latent is nearest the quantile: the same for every method, as seeds are shared.
+    The clip is of episode number task.episodes of that trial of the first seed whose first latent is nearest the
+    quantile: the same trial for every method, as seeds are shared.
     """
 
     def __init__(self, agent: Agent, env: envs.BatchEnv, quantile: float = 0.85) -> None:
         self.agent, self.env, self.quantile = agent, env, quantile
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self.agent.begin(n, rng)
-        theta = self.env.theta[:, 0]
-        self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
-        self.episode = 1
+    def begin(self, n: int) -> None:
+        self.agent.begin(n)
+        self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
+        self.episode = 0
         self.states: list[Array] = []
         self.actions: list[Array] = []
 
-    def reset(self) -> None:
-        self.agent.reset()
+    def note(self) -> None:
+        """An episode is over."""
+        if (known := self.agent.features()) is not None:
+            self.known.append(known.copy())
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        if self.episode == 0:
+            theta = self.env.theta[: self.env.n // len(rngs), 0]
+            self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
+        else:
+            self.note()
+        self.agent.reset(rngs)
         self.episode += 1
 
     def act(self, obs: NDArray[np.float32]) -> Array:
@@ -104,7 +115,7 @@ def start_worker(ticks: Queue[int]) -> None:
 
 
 def run_job(job: Job) -> str:
-    """Train and evaluate one method with one seed, and write its file; returns a line that says how it went."""
+    """Train and evaluate one method with some seeds, and write their files; returns a line that says how it went."""
     start, told = time.time(), 0
     curve: dict[str, list[tuple[int, float]]] = {}
 
@@ -118,31 +129,47 @@ def run_job(job: Job) -> str:
                 curve.setdefault(kind, []).append((done, loss))
 
     task = envs.get(job.task)
-    context = Context(task, job.preset, job.seed, progress)
+    context = Context(task, job.preset, job.seeds, progress)
     agents = METHODS[job.method](context)
     trained = time.time() - start
-    arrays: dict[str, Any] = {}
-    for name, agent in agents.items():
-        # Learned agents go on for twice the episodes they were trained on.
-        episodes = task.episodes * (2 if job.method in LEARNED and task.episodes > 1 else 1)
-        recorder = Recorder(agent, context.env)
-        _, returns = run_trials(context.env, recorder, episodes, stream(EVALUATION, job.seed))
-        arrays[f"{name}/returns"] = returns
-        if job.seed == 0 and name in CLIPPED:
-            arrays[f"{name}/state"], arrays[f"{name}/action"] = np.array(recorder.states), np.array(recorder.actions)
-            arrays[f"{name}/trial"] = np.array(recorder.trial)
-    meta = {"agents": list(agents), "curve": curve, "train_s": trained, "span": (start, time.time())}
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, theta=context.env.theta, meta=np.array(json.dumps(meta)), **arrays)
-    write_atomically(job.file, buffer.getvalue())
+    found = {name: evaluate(context, agent, job.method in LEARNED) for name, agent in agents.items()}
+    meta = {"agents": list(agents), "curve": curve, "budget": context.budget, "span": (start, time.time())}
+    for i, seed in enumerate(job.seeds):
+        rows = slice(i * job.preset.eval_trials, (i + 1) * job.preset.eval_trials)
+        arrays: dict[str, Any] = {}
+        for name, (per_trial, probes, clip) in found.items():
+            arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
+            arrays[f"{name}/probe"] = probes[i]
+            if seed == 0 and name in CLIPPED:
+                arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, theta=context.env.theta[rows], meta=np.array(json.dumps(meta)), **arrays)
+        write_atomically(job.file(seed), buffer.getvalue())
     _ticks.put(job.ticks - told)
     return f"trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
 
 
-def load_job(job: Job) -> dict[str, Any] | None:
-    """What a finished job wrote: arrays, and `meta` decoded. None if its file is missing or damaged."""
+def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, Array], Array, dict[str, Array]]:
+    """Deploy in all seeds' trials: returns and Eq. (1) [N, E], probes [S, E or 0], and a clip of the first seed."""
+    task, seeds = context.task, context.seeds
+    # Learned agents go on for twice the episodes they were trained on.
+    episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
+    recorder = Recorder(agent, context.env)
+    trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed) for seed in seeds])
+    recorder.note()
+    objective = score.objective(context.expert, trials, context.env.theta)
+    features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)
+    n = len(theta) // len(seeds)
+    groups = [slice(i * n, (i + 1) * n) for i in range(len(seeds))]
+    probes = np.array([[score.probe(known[rows], theta[rows]) for known in features] for rows in groups])
+    clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
+    return {"returns": returns, "objective": objective}, probes, clip
+
+
+def load_job(job: Job, seed: int) -> dict[str, Any] | None:
+    """What a finished job wrote of a seed: arrays, and `meta` decoded. None if its file is missing or damaged."""
     try:
-        with np.load(job.file, allow_pickle=False) as data:
+        with np.load(job.file(seed), allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
         return {**arrays, "meta": json.loads(str(arrays["meta"]))}
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):

@@ -5,20 +5,25 @@ Learned methods get trials without theta; only the oracle gets theta, and only r
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import envs
-from deconf import cloning, deconfounded, naive_rnn
+from deconf import cloning, dagger, deconfounded, naive_rnn, offline
+from deconf.cloning import CloningConfig
+from deconf.dagger import DaggerConfig
+from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent
 from deconf.nets import Progress
+from deconf.offline import OfflineConfig
+from deconf.recurrent import RecurrentConfig
 from envs.task import Array
 from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from experts.demos import Agent, ExpertAgent, RandomAgent, Streams, Trials, run_trials
 
 DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
 
@@ -36,50 +41,87 @@ class Preset:
     expert_trials: int
     explore_trials: int  # a round
     eval_trials: int
+    query_trials: int  # a round
     grid: int
-    deconfounded: deconfounded.DeconfoundedConfig
-    naive: naive_rnn.NaiveConfig
-    cloning: cloning.CloningConfig
+    deconfounded: DeconfoundedConfig
+    discrete: DeconfoundedConfig
+    offline: OfflineConfig
+    naive: RecurrentConfig
+    dagger: DaggerConfig
+    cloning: CloningConfig
 
 
 class Context:
-    """One task, preset and seed: the data, made when first asked for, and the environments agents are scored in."""
+    """One task, preset and some seeds: data, made when first asked for, and the environments agents are scored in.
 
-    def __init__(self, task: envs.Task, preset: Preset, seed: int, progress: Progress) -> None:
-        self.task, self.preset, self.seed, self.progress = task, preset, seed, progress
+    Seeds lie side by side: trials are in as many equal groups as there are seeds. `budget` counts what a seed used.
+    """
+
+    def __init__(self, task: envs.Task, preset: Preset, seeds: Sequence[int], progress: Progress) -> None:
+        self.task, self.preset, self.seeds, self.progress = task, preset, list(seeds), progress
         self.expert = policy.load(task)
-        self.env = envs.BatchEnv(task, preset.eval_trials)
+        self.env = envs.BatchEnv(task, preset.eval_trials * len(self.seeds))
+        self.budget = {"expert_trials": 0, "exploration_trials": 0, "queries": 0}
 
     @cached_property
     def demonstrations(self) -> tuple[Trials, Array]:
         """Expert trials, and beside them theta [B, L] for the oracle."""
-        env = envs.BatchEnv(self.task, self.preset.expert_trials)
-        trials, _ = run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, stream(DEMOS, self.seed))
+        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(self.seeds))
+        self.budget["expert_trials"] += self.preset.expert_trials
+        seeds = [stream(DEMOS, seed) for seed in self.seeds]
+        trials, _ = run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)
         return trials, env.theta.copy()
 
     @property
-    def rng(self) -> np.random.Generator:
-        """For initial weights and batches; the same for every method of this seed."""
-        return np.random.default_rng([self.seed, 0])
+    def rngs(self) -> list[np.random.Generator]:
+        """For initial weights and batches; the same for every method of a seed."""
+        return [np.random.default_rng([seed, 0]) for seed in self.seeds]
 
-    def explore(self, agent: Agent | None, rng: np.random.Generator) -> Trials:
-        """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
-        env = envs.BatchEnv(self.task, self.preset.explore_trials)
+    def _blind(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, envs.BatchEnv]:
+        env = envs.BatchEnv(self.task, n * len(rngs))
+        seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
         behaviour = agent or RandomAgent(self.task.action_space)
-        return run_trials(env, behaviour, self.task.episodes, stream(EXPLORATION, int(rng.integers(2**31))))[0]
+        return run_trials(env, behaviour, self.task.episodes, seeds)[0], env
+
+    def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
+        """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
+        self.budget["exploration_trials"] += self.preset.explore_trials
+        return self._blind(self.preset.explore_trials, agent, rngs)[0]
+
+    def query(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, NDArray[np.float32]]:
+        """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
+        trials, env = self._blind(self.preset.query_trials, agent, rngs)
+        self.budget["queries"] += int(trials.mask.sum()) // len(rngs)
+        shape = trials.action.shape
+        obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
+        theta, random = env.theta, Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
+        labels = [self.expert.act(obs[:, t], theta, random) for t in range(obs.shape[1])]
+        return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
 
 
-def _deconfounded(context: Context, **changes: Any) -> dict[str, Agent]:
-    config = replace(context.preset.deconfounded, **changes)
-    agent = deconfounded.fit(context.demonstrations[0], context.explore, config, context.rng, context.progress)
-    suffix = "" if config.belief == "evidence" else f"_{config.belief}"
-    once = deconfounded.DeconfoundedAgent(agent.belief, agent.policy, agent.scaler, "episode")
-    return {f"deconfounded{suffix}": agent, f"deconfounded{suffix}_episode": once}
+def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent]:
+    once = deconfounded.DeconfoundedAgent(agent.model, agent.policy, "episode")
+    return {name: agent, f"{name}_episode": once}
+
+
+def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
+    trials, _ = context.demonstrations
+    return _deploy(name, deconfounded.fit(trials, context.explore, config, context.rngs, context.progress))
+
+
+def _offline(context: Context) -> dict[str, Agent]:
+    trials, _ = context.demonstrations
+    agent = offline.fit(trials, context.preset.offline, context.rngs, context.progress)
+    return {"deconfounded_offline": agent}
 
 
 def _naive_rnn(context: Context) -> dict[str, Agent]:
-    agent = naive_rnn.fit(context.demonstrations[0], context.preset.naive, context.rng, context.progress)
+    agent = naive_rnn.fit(context.demonstrations[0], context.preset.naive, context.rngs, context.progress)
     return {"naive_rnn": agent}
+
+
+def _dagger(context: Context) -> dict[str, Agent]:
+    return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.progress)}
 
 
 def _oracle(context: Context) -> dict[str, Agent]:
@@ -88,7 +130,7 @@ def _oracle(context: Context) -> dict[str, Agent]:
     agent = cloning.fit(
         trials,
         context.preset.cloning,
-        context.rng,
+        context.rngs,
         encode(theta),
         lambda: encode(context.env.theta),
         context.progress,
@@ -98,7 +140,7 @@ def _oracle(context: Context) -> dict[str, Agent]:
 
 def _blind(context: Context) -> dict[str, Agent]:
     trials, _ = context.demonstrations
-    return {"blind_bc": cloning.fit(trials, context.preset.cloning, context.rng, progress=context.progress)}
+    return {"blind_bc": cloning.fit(trials, context.preset.cloning, context.rngs, progress=context.progress)}
 
 
 def _exact(context: Context, conditional: bool) -> dict[str, Agent]:
@@ -107,8 +149,13 @@ def _exact(context: Context, conditional: bool) -> dict[str, Agent]:
 
 
 METHODS: dict[str, Callable[[Context], dict[str, Agent]]] = {
-    "deconfounded": _deconfounded,
-    "deconfounded_gru": lambda context: _deconfounded(context, belief="gru"),
+    "deconfounded": lambda context: _deconfounded(context, "deconfounded", context.preset.deconfounded),
+    "deconfounded_gru": lambda context: _deconfounded(
+        context, "deconfounded_gru", replace(context.preset.deconfounded, model="gru")
+    ),
+    "deconfounded_discrete": lambda context: _deconfounded(context, "deconfounded_discrete", context.preset.discrete),
+    "deconfounded_offline": _offline,
+    "dagger": _dagger,
     "naive_rnn": _naive_rnn,
     "oracle_bc": _oracle,
     "blind_bc": _blind,
@@ -119,8 +166,17 @@ METHODS: dict[str, Callable[[Context], dict[str, Agent]]] = {
 }
 """Longest first, so that the last ones to run are short. A method may score several ways of deploying one agent."""
 
-COST = {"deconfounded": 7, "deconfounded_gru": 14, "naive_rnn": 4, "conditional": 4, "interventional": 3}
+COST = {
+    "deconfounded": 7,
+    "deconfounded_gru": 14,
+    "deconfounded_discrete": 7,
+    "deconfounded_offline": 7,
+    "dagger": 4,
+    "naive_rnn": 4,
+    "conditional": 4,
+    "interventional": 3,
+}
 """Of a method, about, where blind BC is 1: for the ETA alone."""
 
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
-LEARNED = ("deconfounded", "deconfounded_gru", "naive_rnn", "oracle_bc", "blind_bc")
+LEARNED = tuple(name for name in METHODS if name not in ("conditional", "interventional", *REFERENCES))

@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from gymnasium import spaces
 
 import envs
 from benchmarks.methods import METHODS, Preset
 from deconf.cloning import CloningConfig
+from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
-from deconf.naive_rnn import NaiveConfig
+from deconf.offline import OfflineConfig
+from deconf.recurrent import RecurrentConfig
 
 PRESETS = {
     "smoke": "a minute: does everything work?",
     "default": "minutes on two cores: the figures in README",
     "paper": "ten seeds",
 }
-DEFAULT_METHODS = tuple(name for name in METHODS if name != "deconfounded_gru")
+EXTRA = ("deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
+DEFAULT_METHODS = tuple(name for name in METHODS if name not in EXTRA)
 
 _CONTROL = Preset(
     seeds=3,
     expert_trials=256,
     explore_trials=64,
     eval_trials=128,
+    query_trials=32,
     grid=21,
     deconfounded=DeconfoundedConfig(inference_updates=800),
-    naive=NaiveConfig(),
+    discrete=DeconfoundedConfig(model="discrete", latent=16, inference_updates=400),
+    offline=OfflineConfig(),
+    naive=RecurrentConfig(),
+    dagger=DaggerConfig(),
     cloning=CloningConfig(),
 )
 _BANDIT = Preset(
@@ -34,6 +42,7 @@ _BANDIT = Preset(
     expert_trials=24000,
     explore_trials=8000,
     eval_trials=4000,
+    query_trials=2000,
     grid=0,
     deconfounded=DeconfoundedConfig(
         latent=5,
@@ -42,46 +51,69 @@ _BANDIT = Preset(
         inference_updates=800,
         inference_batch=64,
         inference_steps=6400,
+        inference_rate=3e-3,
         imitation_updates=800,
-        learning_rate=3e-3,
+        final_updates=3200,
+        imitation_rate=3e-3,
         random_share=1.0,
     ),
-    naive=NaiveConfig(updates=2000, batch=100, chunk=50, learning_rate=1e-2),
+    discrete=DeconfoundedConfig(
+        model="discrete",
+        latent=10,
+        rounds=2,
+        inference_updates=800,
+        inference_batch=64,
+        inference_rate=3e-3,
+        imitation_updates=800,
+        final_updates=3200,
+        imitation_rate=3e-3,
+        random_share=1.0,
+    ),
+    offline=OfflineConfig(
+        latent=5,
+        offline_batch=64,
+        beta=5e-3,
+        online_batch=64,
+        online_steps=6400,
+        synthetic=2000,
+        refresh=200,
+        random_share=1.0,
+        learning_rate=3e-3,
+    ),
+    naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    dagger=DaggerConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
     cloning=CloningConfig(updates=1000),
 )
-_SMOKE_CONTROL = replace(
-    _CONTROL,
-    seeds=1,
-    expert_trials=32,
-    explore_trials=16,
-    eval_trials=16,
-    grid=9,
-    deconfounded=replace(_CONTROL.deconfounded, rounds=2, inference_updates=100, imitation_updates=100),
-    naive=replace(_CONTROL.naive, updates=60),
-    cloning=replace(_CONTROL.cloning, updates=400),
-)
-_SMOKE_BANDIT = replace(
-    _BANDIT,
-    seeds=1,
-    expert_trials=2000,
-    explore_trials=1000,
-    eval_trials=1000,
-    deconfounded=replace(_BANDIT.deconfounded, rounds=1, imitation_updates=400),
-    naive=replace(_BANDIT.naive, updates=500),
-    cloning=replace(_BANDIT.cloning, updates=400),
-)
+
+
+def _smoke(full: Preset) -> Preset:
+    """One seed, and little of everything; the bandit's belief gets enough to be ahead of naive cloning."""
+    bandit = full is _BANDIT
+    amounts: dict[str, Any] = {"rounds": 1 if bandit else 2, "imitation_updates": 400 if bandit else 100}
+    few: dict[str, Any] = {} if bandit else {"inference_updates": 100, "final_updates": 400}
+    return replace(
+        full,
+        seeds=1,
+        expert_trials=2000 if bandit else 32,
+        explore_trials=1000 if bandit else 16,
+        eval_trials=1000 if bandit else 16,
+        query_trials=500 if bandit else 8,
+        grid=9,
+        deconfounded=replace(full.deconfounded, **amounts, **few),
+        discrete=replace(full.discrete, **amounts, **few),
+        offline=replace(full.offline, offline_updates=300, online_updates=300),
+        naive=replace(full.naive, updates=500 if bandit else 60),
+        dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
+        cloning=replace(full.cloning, updates=400),
+    )
 
 
 def preset(name: str, task: envs.Task, device: str) -> Preset:
     """The amounts for a task: discrete ones take the bandit's, all others those of control."""
     amounts = _BANDIT if isinstance(task.action_space, spaces.Discrete) else _CONTROL
     if name == "smoke":
-        amounts = _SMOKE_BANDIT if amounts is _BANDIT else _SMOKE_CONTROL
+        amounts = _smoke(amounts)
     if name == "paper":
         amounts = replace(amounts, seeds=10)
-    return replace(
-        amounts,
-        deconfounded=replace(amounts.deconfounded, device=device),
-        naive=replace(amounts.naive, device=device),
-        cloning=replace(amounts.cloning, device=device),
-    )
+    configs = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")
+    return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in configs})

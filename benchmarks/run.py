@@ -2,8 +2,8 @@
 
     python benchmarks/run.py --task slippery_cartpole
 
-Every (method, seed) is a job in a process of its own; its file is written when it is done, and --resume goes on from
-the files that are there.
+Seeds of a method run side by side in one program, in as many groups as there are cores (one group on a GPU). Every
+(method, seed) has a file, written when it is done, and --resume goes on from the files that are there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import signal
 import time
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,10 @@ import torch
 import envs
 from benchmarks import report, score
 from benchmarks.jobs import CLIPPED, Job, load_job, run_job, start_worker
-from benchmarks.methods import METHODS, REFERENCES
+from benchmarks.methods import LEARNED, METHODS, REFERENCES, Preset
 from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
 from envs.console import Parser, Progress, check_folder, run_command, write_atomically, write_json
 from envs.physics import cores
-from envs.task import Array
 from experts import policy
 
 LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
@@ -46,7 +45,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--task", help="which task; see --list")
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
     parser.add_argument("--preset", default="default", help=f"how much: {', '.join(PRESETS)} (default: default)")
-    parser.add_argument("--methods", nargs="+", metavar="NAME", help="default: all but deconfounded_gru")
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="`all`, or some of those that --list names")
     parser.add_argument("--seeds", type=int, metavar="N", help="how many seeds; default: the preset's")
     parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     parser.add_argument("--out", type=Path, help="output folder; default: results/<task>-<preset>")
@@ -61,7 +60,7 @@ def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
     task = envs.get(args.task)
     if args.preset not in PRESETS:
         raise envs.closest("preset", args.preset, list(PRESETS))
-    methods = args.methods or list(DEFAULT_METHODS)
+    methods = list(METHODS) if args.methods == ["all"] else args.methods or list(DEFAULT_METHODS)
     for name in methods:
         if name not in METHODS:
             raise envs.closest("method", name, list(METHODS))
@@ -95,6 +94,27 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
 
 
+Finished = list[tuple[str, int, dict[str, Any]]]
+"""Method, seed, and what its job wrote."""
+
+
+def _listed(seeds: tuple[int, ...]) -> str:
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(map(str, seeds))}"
+
+
+def make_jobs(
+    task: envs.Task, settings: Preset, methods: list[str], seeds: int, device: str, folder: Path
+) -> list[Job]:
+    """What is left to do: of each method the seeds without a file, in groups; references have nothing to share."""
+    jobs = []
+    for method in methods:
+        every = Job(task.name, settings, method, tuple(range(seeds)), folder)
+        left = [seed for seed in every.seeds if load_job(every, seed) is None]
+        groups = len(left) if method not in LEARNED else min(cores(), len(left)) if device == "cpu" else 1
+        jobs += [replace(every, seeds=tuple(map(int, part))) for part in np.array_split(left, groups) if len(part)]
+    return jobs
+
+
 def run_jobs(jobs: list[Job], label: str) -> None:
     """Run jobs side by side, one core each, longest first."""
     if not jobs:
@@ -115,7 +135,8 @@ def run_jobs(jobs: list[Job], label: str) -> None:
                     progress.update(ticks.get())
                 for future in [f for f in waiting if f.done()]:
                     waiting.remove(future)
-                    progress.line(f"{futures[future].method}, seed {futures[future].seed}: {future.result()}")
+                    job = futures[future]
+                    progress.line(f"{job.method}, {_listed(job.seeds)}: {future.result()}")
                 time.sleep(0.1)
         except BrokenProcessPool:
             raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
@@ -127,16 +148,15 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     progress.close()
 
 
-def pictures(
-    task: envs.Task, results: dict[str, Any], finished: list[tuple[Job, dict[str, Any]]], folder: Path
-) -> None:
+def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
     """Curves, and a video where a GL works."""
     report.adaptation(results, folder / "adaptation.png")
     curves: dict[str, list[dict[str, Any]]] = {}
     clips: dict[str, dict[str, Any]] = {}
-    for job, data in finished:
-        if data["meta"]["curve"]:
-            curves.setdefault(job.method, []).append(data["meta"]["curve"])
+    for method, _, data in finished:
+        curve = data["meta"]["curve"]  # of all seeds of a group
+        if curve and curve not in curves.setdefault(method, []):
+            curves[method].append(curve)
         for name in CLIPPED:
             if f"{name}/state" in data:
                 theta = data["theta"][int(data[f"{name}/trial"])]
@@ -157,19 +177,19 @@ def worked(spans: list[tuple[float, float]]) -> float:
     return total
 
 
-def rows(task: envs.Task, results: dict[str, Any], finished: list[tuple[Job, dict[str, Any]]]) -> str:
+def rows(task: envs.Task, results: dict[str, Any], finished: Finished) -> str:
     """rows.csv: one row per method, seed, latent (trial) and episode."""
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(["method", "seed", "trial", *(lat.name for lat in task.latents), "episode", "return", "score"])
     zero, one = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
-    for job, data in finished:
+    for _, seed, data in finished:
         for name in data["meta"]["agents"]:
             for trial, (theta, returns) in enumerate(zip(data["theta"], data[f"{name}/returns"], strict=True)):
                 latents = [f"{value:.6g}" for value in theta]
                 for episode, value in enumerate(returns):
                     scored = round(float(score.normalise(value, zero, one)), 4)
-                    out.writerow([name, job.seed, trial, *latents, episode + 1, round(float(value), 4), scored])
+                    out.writerow([name, seed, trial, *latents, episode + 1, round(float(value), 4), scored])
     return text.getvalue()
 
 
@@ -181,7 +201,7 @@ def main() -> None:
             task = envs.get(name)
             latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
             print(f"{name}: {', '.join(latents)}")
-        print(f"methods: {', '.join(METHODS)}")
+        print(f"methods: {', '.join(METHODS)}\nby default: {', '.join(DEFAULT_METHODS)}")
         return
     task, methods = check(args)
     settings = preset(args.preset, task, args.device)
@@ -197,14 +217,12 @@ def main() -> None:
     }
     prepare(folder, about, args.resume)
     start = time.time()
-    jobs = [Job(task.name, settings, method, seed, folder / "jobs") for method in methods for seed in range(seeds)]
-    left = [job for job in jobs if load_job(job) is None]
+    left = make_jobs(task, settings, methods, seeds, args.device, folder / "jobs")
     run_jobs(left, f"{task.name}, {args.preset}")
-    finished = [(job, data) for job in jobs if (data := load_job(job)) is not None]
-    returns: dict[str, dict[int, Array]] = {}
-    for job, data in finished:
-        for name in data["meta"]["agents"]:
-            returns.setdefault(name, {})[job.seed] = data[f"{name}/returns"]
+    finished = []
+    for method in methods:
+        every = Job(task.name, settings, method, tuple(range(seeds)), folder / "jobs")
+        finished += [(method, seed, data) for seed in every.seeds if (data := load_job(every, seed)) is not None]
     results = {
         "task": task.name,
         "task_version": task.version,
@@ -213,13 +231,9 @@ def main() -> None:
         "eval_trials": settings.eval_trials,
         "versions": about["versions"],
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
-        "wall_s": round(worked([(start, time.time()), *(tuple(data["meta"]["span"]) for _, data in finished)]), 1),
-        "jobs_resumed": len(jobs) - len(left),
-        "job_s": {
-            f"{job.method}-{job.seed}": round(data["meta"]["span"][1] - data["meta"]["span"][0], 1)
-            for job, data in finished
-        },
-        "methods": score.summarise(returns, task.episodes),
+        "wall_s": round(worked([(start, time.time()), *(tuple(data["meta"]["span"]) for *_, data in finished)]), 1),
+        "resumed": len(finished) - sum(len(job.seeds) for job in left),
+        "methods": score.summarise(finished, task.episodes),
     }
     write_json(folder / "results.json", results)
     write_atomically(folder / "rows.csv", rows(task, results, finished))

@@ -2,17 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+from deconf.equations import imitation_objective
 from envs.task import Array
+from experts.demos import Trials
+from experts.policy import Expert
 
 
 def normalise(returns: Array, random: float, expert: float) -> Array:
     """Returns of any shape -> scores; 0 = random actions, 1 = the expert."""
     return (returns - random) / (expert - random)
+
+
+def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
+    """Eq. (1) [B, E]: how likely the expert that sees theta [B, L] finds the imitator's own actions, by episode."""
+    b, e, t = trials.mask.shape
+    obs, action = (x.reshape(b * e * t, -1) for x in (trials.obs[:, :, :-1], trials.action))
+    log_expert = expert.log_prob(obs, action, np.repeat(theta, e * t, 0)).reshape(b, e, t)
+    return imitation_objective(log_expert, trials.mask)
+
+
+def probe(features: Array, theta: Array, ridge: float = 1e-3) -> float:
+    """Held-out R^2 of a linear (ridge) probe for encoded theta [N, F'] in features [N, F], fitted to the first half.
+
+    1: theta can be read off; 0 or less: no better than its mean.
+    """
+    scaled = (features - features.mean(0)) / (features.std(0) + 1e-6)
+    inputs = np.c_[scaled, np.ones(len(scaled))].astype(float)
+    half = len(inputs) // 2
+    fitted = inputs[:half]
+    penalty = ridge * half * np.eye(inputs.shape[1])
+    weights = np.linalg.solve(fitted.T @ fitted + penalty, fitted.T @ theta[:half])
+    held = theta[half:]
+    residual = held - inputs[half:] @ weights
+    return float(1 - (residual**2).sum() / ((held - held.mean(0)) ** 2).sum())
 
 
 def bootstrap(values: Array) -> list[float] | None:
@@ -25,26 +53,35 @@ def bootstrap(values: Array) -> list[float] | None:
     return [float(interval.low), float(interval.high)]
 
 
-def summarise(returns: dict[str, dict[int, Array]], episodes: int) -> dict[str, Any]:
-    """Returns by method and seed, [trials, E] each -> the `methods` entry of results.json.
+def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int) -> dict[str, Any]:
+    """What jobs wrote (method, seed, arrays and meta) -> the `methods` entry of results.json.
 
     `episodes` is the length of the trials trained on; what agents did in later ones, if any, is told apart.
     """
-    random, expert = (
-        float(np.mean([r[:, :episodes] for r in returns[name].values()])) for name in ("random", "expert")
-    )
+    by_agent: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    for _, seed, data in finished:
+        for name in data["meta"]["agents"]:
+            by_agent.setdefault(name, []).append((seed, data))
+
+    def means(name: str, key: str) -> Array:
+        return np.array([data[f"{name}/{key}"].mean(0) for _, data in by_agent[name]])
+
+    random, expert = (float(means(name, "returns")[:, :episodes].mean()) for name in ("random", "expert"))
     methods = {}
-    for name, by_seed in returns.items():
-        means = np.array([by_seed[seed].mean(0) for seed in sorted(by_seed)])
-        scores = normalise(means, random, expert)
+    for name, jobs in by_agent.items():
+        returns = means(name, "returns")
+        scores, probes = normalise(returns, random, expert), np.array([data[f"{name}/probe"] for _, data in jobs])
         methods[name] = {
-            "seeds": sorted(by_seed),
-            "return": means[:, :episodes].round(4).tolist(),
+            "seeds": [seed for seed, _ in jobs],
+            "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
             "score_last": round(float(scores[:, episodes - 1].mean()), 4),
             "ci95": bootstrap(scores[:, episodes - 1]),
+            "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
+            "theta_r2": probes[:, :episodes].mean(0).round(4).tolist(),
+            "budget": jobs[0][1]["meta"]["budget"],
         }
-        if means.shape[1] > episodes:
+        if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
     return methods
 

@@ -12,35 +12,40 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.nets import Batch, Scaler, Signature, Whitener, mlp
+from deconf.nets import Batch, Draws, Embedding, Inputs, Linear, Scaler, Signature, Whitener, mlp, per_seed
 
 
 class Belief(nn.Module, ABC):
     """q_phi and the prior p(theta_hat), a Gaussian in each of D dimensions: N(0, 1) until `set_prior`."""
 
+    inputs: Inputs
     prior_mean: Tensor
     prior_std: Tensor
 
-    def __init__(self, latent: int) -> None:
+    def __init__(self, latent: int, draws: Draws) -> None:
         super().__init__()
-        self.register_buffer("prior_mean", torch.zeros(latent))
-        self.register_buffer("prior_std", torch.ones(latent))
+        self.register_buffer("prior_mean", torch.zeros(len(draws), latent, device=draws.device))
+        self.register_buffer("prior_std", torch.ones(len(draws), latent, device=draws.device))
 
     def set_prior(self, theta_hat: Tensor) -> None:
-        """Fit the prior to latents [B, D] inferred on whole trials (empirical Bayes).
+        """Fit the prior to latents [S, B, D] inferred on whole trials (empirical Bayes).
 
         Without it, early samples are spread over more of the latent space than there is data for.
         """
-        self.prior_mean.copy_(theta_hat.mean(0))
-        self.prior_std.copy_(theta_hat.std(0, correction=0).clamp(min=0.05))
+        self.prior_mean.copy_(theta_hat.mean(1))
+        self.prior_std.copy_(theta_hat.std(1, correction=0).clamp(min=0.05))
+
+    def prior(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std, shaped to go with [S, ..., D]."""
+        return per_seed(self.prior_mean, like), per_seed(self.prior_std, like)
 
     @abstractmethod
     def forward(self, batch: Batch) -> Tensor:
-        """Memories [B, T + 1, M] after 0, 1, ..., T transitions, episodes joined end to end."""
+        """Memories [S, B, T + 1, M] after 0, 1, ..., T transitions, episodes joined end to end."""
 
     @abstractmethod
     def start(self, n: int) -> Tensor:
-        """The memory [N, M] of n histories without a transition."""
+        """The memory [S, N, M] of n histories without a transition, for each seed."""
 
     @abstractmethod
     def update(self, memory: Tensor, step: Batch) -> Tensor:
@@ -64,29 +69,29 @@ class EvidenceBelief(Belief):
     is ignored.
     """
 
-    def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
-        super().__init__(latent)
-        self.signature, self.obs, self.change, self.width = signature, obs, change, width // 4
-        self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width)
-        self.whiten = Whitener(self.width)
-        self.out = mlp(2 * self.width + 1, width, 2 * latent)
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(latent, draws)
+        self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
+        self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width, draws)
+        self.whiten = Whitener(self.width, draws)
+        self.out = mlp(2 * self.width + 1, width, 2 * latent, draws)
 
     def _terms(self, batch: Batch) -> Tensor:
         """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
-        keep = batch.mask.bool()
-        real = batch[keep]
-        change = self.change(real.next_obs - real.obs)
-        inputs = [self.obs(real.obs), self.signature.encode_action(real.action), change]
-        evidence = self.whiten(self.evidence(torch.cat(inputs, -1)))
-        terms = torch.cat([evidence, torch.ones_like(evidence[:, :1])], -1)
-        return terms.new_zeros(*keep.shape, self.width + 1).masked_scatter(keep[..., None], terms)
+        change = self.change(batch.next_obs - batch.obs)
+        inputs = [self.inputs.obs(batch.obs), self.inputs.action(batch.action), change]
+        evidence = self.whiten(self.evidence(torch.cat(inputs, -1)), batch.mask)
+        mask = batch.mask[..., None]
+        return torch.cat([evidence * mask, mask], -1)
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
-        return torch.cat([torch.zeros_like(terms[:, :1]), terms], 1).cumsum(1)
+        return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 
     def start(self, n: int) -> Tensor:
-        return self.prior_mean.new_zeros(n, self.width + 1)
+        return self.prior_mean.new_zeros(len(self.prior_mean), n, self.width + 1)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)
@@ -96,44 +101,58 @@ class EvidenceBelief(Belief):
         n = 1 + count
         mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()
-        none = count == 0
-        return torch.where(none, self.prior_mean, mean), torch.where(none, self.prior_std, std)
+        none, (prior_mean, prior_std) = count == 0, self.prior(mean)
+        return torch.where(none, prior_mean, mean), torch.where(none, prior_std, std)
 
 
 class GruMemory(nn.Module):
-    """A GRU over embedded transitions (s, a, s'): the history encoder of appendix D."""
+    """A GRU (Cho et al., 2014) over embedded transitions (s, a, s'): the history encoder of appendix D."""
 
-    def __init__(self, width: int, signature: Signature, obs: Scaler) -> None:
+    def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
         super().__init__()
-        self.width, self.signature, self.obs = width, signature, obs
-        self.embed_obs = mlp(signature.obs, width, 32)
-        self.embed_action = nn.Linear(signature.action_features, 32)
-        self.gru = nn.GRU(3 * 32, width, batch_first=True)
+        self.width, self.seeds = width, len(draws)
+        self.inputs = Embedding(width, signature, obs, draws)
+        self.input, self.recurrent = Linear(3 * 32, 3 * width, draws), Linear(width, 3 * width, draws)
 
     def start(self, n: int) -> Tensor:
-        """The memory [N, W] of empty histories."""
-        return self.embed_action.weight.new_zeros(n, self.width)
+        """The memory [S, N, W] of empty histories."""
+        return self.recurrent.weight.new_zeros(self.seeds, n, self.width)
+
+    def _embed(self, batch: Batch) -> Tensor:
+        inputs = self.inputs
+        embedded = [inputs.obs(batch.obs), inputs.action(batch.action), inputs.obs(batch.next_obs)]
+        return self.input(torch.cat(embedded, -1))
+
+    def _cell(self, inputs: Tensor, memory: Tensor, mask: Tensor) -> Tensor:
+        """One step: inputs [S, N, 3 W], memory [S, N, W], mask [S, N]."""
+        recurrent = self.recurrent(memory)
+        w = self.width
+        reset, keep = torch.sigmoid(inputs[..., : 2 * w] + recurrent[..., : 2 * w]).chunk(2, -1)
+        new = torch.tanh(inputs[..., 2 * w :] + reset * recurrent[..., 2 * w :])
+        return torch.lerp(memory, new, (1 - keep) * mask[..., None])
 
     def forward(self, batch: Batch, memory: Tensor) -> Tensor:
-        """Transitions [B, T, ...] after a memory [B, W] -> memories [B, T + 1, W]."""
-        before, after = self.embed_obs(self.obs(batch.obs)), self.embed_obs(self.obs(batch.next_obs))
-        action = self.embed_action(self.signature.encode_action(batch.action))
-        hidden, _ = self.gru(torch.cat([before, action, after], -1), memory[None].contiguous())
-        return torch.cat([memory[:, None], hidden], 1)
+        """Transitions [S, B, T, ...] after a memory [S, B, W] -> memories [S, B, T + 1, W]."""
+        memories = [memory]
+        for inputs, mask in zip(self._embed(batch).unbind(2), batch.mask.unbind(2), strict=True):
+            memories.append(self._cell(inputs, memories[-1], mask))
+        return torch.stack(memories, 2)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory [N, W] after one more transition each; kept where its mask is 0."""
-        after = self(step[:, None], memory)[:, 1]
-        return torch.where(step.mask[:, None] > 0, after, memory)
+        """Memory [S, N, W] after one more transition each; kept where its mask is 0."""
+        return self._cell(self._embed(step), memory, step.mask)
 
 
 class GruBelief(Belief):
     """The paper's belief: GruMemory, then linear to a mean and a softplus variance."""
 
-    def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
-        super().__init__(latent)
-        self.memory = GruMemory(width, signature, obs)
-        self.out = nn.Linear(width, 2 * latent)
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(latent, draws)
+        self.memory = GruMemory(width, signature, obs, draws)
+        self.inputs = self.memory.inputs
+        self.out = Linear(width, 2 * latent, draws)
 
     def forward(self, batch: Batch) -> Tensor:
         return self.memory(batch, self.start(len(batch)))

@@ -5,19 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
+from torch import Tensor
 
 from deconf.equations import imitation_loss
-from deconf.nets import ActionHead, Batch, Progress, Scaler, Signature, no_progress, seeded, torch_generator
+from deconf.nets import (
+    ActionHead,
+    Adam,
+    Batch,
+    Draws,
+    LearnedAgent,
+    Progress,
+    Rngs,
+    Scaler,
+    Signature,
+    listed,
+    no_progress,
+    take_steps,
+)
 from envs.task import Array
-from experts.demos import Agent, Trials
+from experts.demos import Trials
 
 
 @dataclass(frozen=True)
 class CloningConfig:
-    """Widths and amounts; batch counts steps."""
+    """Widths and amounts, for each seed; batch counts steps."""
 
     width: int = 64
     updates: int = 4000
@@ -26,56 +38,51 @@ class CloningConfig:
     device: str = "cpu"
 
 
-class MemorylessAgent(Agent):
+class MemorylessAgent(LearnedAgent):
     """Acts on the observation, and on the features of theta that `side` returns, if it is an oracle."""
 
     def __init__(self, policy: ActionHead, scaler: Scaler, side: Callable[[], Array] | None) -> None:
+        super().__init__(policy)
         self.policy, self.scaler, self.side = policy, scaler, side
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng = torch_generator(rng, self.scaler.mean.device)
-
-    @torch.no_grad()
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def choose(self, obs: Tensor) -> Tensor:
         features = self.scaler(obs)
         if self.side is not None:
-            features = torch.cat([features, torch.as_tensor(self.side()).to(features)], -1)
-        return self.policy.sample(features, self._rng).double().cpu().numpy()
+            theta = torch.as_tensor(self.side()).to(features).reshape(*features.shape[:2], -1)
+            features = torch.cat([features, theta], -1)
+        return self.policy.sample(features, self._draws)
 
 
 def fit(
     trials: Trials,
     config: CloningConfig,
-    rng: np.random.Generator,
+    rng: Rngs,
     theta: Array | None = None,
     side: Callable[[], Array] | None = None,
     progress: Progress = no_progress,
 ) -> MemorylessAgent:
-    """Clone the expert step by step.
+    """Clone the expert step by step; trials are in as many equal groups as there are generators in rng.
 
     theta [B, F]: features of each trial's theta, for the oracle, whose agent then asks `side` for those [N, F] of the
     environments it acts in. Without both: blind BC.
     """
-    data = Batch.of(trials, config.device)
-    keep = data.mask.bool()
-    obs, action = data.obs[keep], data.action[keep]
-    scaler = Scaler(obs)
-    features = scaler(obs)
+    rngs = listed(rng)
+    data, signature, draws = (
+        Batch.of(trials, len(rngs), config.device),
+        Signature.of(trials),
+        Draws(rngs, config.device),
+    )
+    scaler = Scaler(data.obs, data.mask)
+    features = scaler(data.obs)
     if theta is not None:
-        per_step = torch.as_tensor(theta).to(features)[:, None].expand(-1, keep.shape[1], -1)
-        features = torch.cat([features, per_step[keep]], -1)
-    with seeded(rng):
-        policy = ActionHead(features.shape[-1], config.width, Signature.of(trials)).to(config.device)
-    optimizer = torch.optim.Adam(policy.parameters(), config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, config.updates)
-    generator = torch_generator(rng, config.device)
+        each = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], 1, -1)
+        features = torch.cat([features, each.expand(-1, -1, features.shape[2], -1)], -1)
+    policy = ActionHead(features.shape[-1], config.width, signature, draws)
+    optimizer = Adam([policy], config.learning_rate, config.updates)
     for update in range(config.updates):
-        index = torch.randint(len(obs), (config.batch,), generator=generator, device=config.device)
-        log_policy = policy.log_prob(features[index], action[index])
-        loss = imitation_loss(log_policy)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
-        progress(update + 1, config.updates, {"imitation": loss.item()})
+        index = data.draw_steps(config.batch, draws)
+        log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
+        loss = imitation_loss(log_policy, torch.ones_like(log_policy))
+        optimizer.step(loss)
+        progress(update + 1, config.updates, {"imitation": loss.mean().item()})
     return MemorylessAgent(policy, scaler, side)

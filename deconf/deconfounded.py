@@ -1,13 +1,13 @@
 """Deconfounded imitation learning, Tier 2: Algorithm 1 (training) and Algorithm 2 (deployment) of the paper.
 
-q_phi and p_psi learn from exploration that is blind to theta, by Eq. (6). Latents theta_hat_H are inferred on whole
+A latent-variable model learns from exploration that is blind to theta. Latents theta_hat_H are inferred on whole
 expert trials, and a latent-conditional policy pi_eta(a | s, theta_hat) is cloned. At test time the agent samples
 theta_hat from its belief, acts, and updates the belief on what follows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,77 +16,92 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.beliefs import Belief, EvidenceBelief, GruBelief
-from deconf.equations import gaussian_kl, imitation_loss, inference_loss, reparametrise
+from deconf.equations import imitation_loss
+from deconf.models import DiscreteModel, LatentModel, VariationalModel
 from deconf.nets import (
     ActionHead,
+    Adam,
     Batch,
-    DynamicsHead,
+    Draws,
+    LearnedAgent,
     Progress,
+    Rngs,
     Scaler,
     Signature,
+    Source,
+    Watch,
+    drawn,
+    listed,
     no_progress,
-    seeded,
-    torch_generator,
+    no_watch,
+    ramp,
 )
-from envs.task import Array, InputError
+from envs.task import InputError
 from experts.demos import Agent, Trials
 
-Explore = Callable[[Agent | None, np.random.Generator], Trials]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments: trials of exploration."""
+Explore = Callable[[Agent | None, Sequence[np.random.Generator]], Trials]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each generator."""
 
 
 @dataclass(frozen=True)
 class DeconfoundedConfig:
-    """Widths and amounts. Each round explores, then updates belief and dynamics, then the policy."""
+    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy."""
 
-    belief: Literal["evidence", "gru"] = "evidence"
+    model: Literal["evidence", "gru", "discrete"] = "evidence"
     width: int = 64
-    latent: int = 4
+    latent: int = 4  # dimensions of theta_hat, or its number of values if discrete
     beta: float = 1e-3
     warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
     inference_updates: int = 300  # a round
     inference_batch: int = 16  # trials, whose every step is evidence
-    inference_steps: int = 2048  # of them, whose next observation is predicted
-    imitation_updates: int = 500  # a round, and four times as many at the end
-    imitation_batch: int = 1024  # steps
-    learning_rate: float = 1e-3
+    inference_steps: int | None = 2048  # of them, whose next observation is predicted; None: all
+    inference_rate: float = 1e-3
+    imitation_updates: int = 500  # a round
+    final_updates: int = 2000  # of the policy, after the last round
+    imitation_batch: int | None = 1024  # steps; None: all there are
+    imitation_rate: float = 1e-3
+    cooled: bool = True  # learning rates fall to 0 along a cosine
+    accumulate: bool = (
+        True  # explorations of all rounds; else each round's is used alone, and demonstrations drawn anew
+    )
+    fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
     device: str = "cpu"
-    random_share: float = 0.1  # of exploring actions that are uniformly random
+    random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
     resample: Literal["step", "episode"] = "step"
 
 
-class DeconfoundedAgent(Agent):
+class DeconfoundedAgent(LearnedAgent):
     """Algorithm 2. resample: draw theta_hat anew every step, or once an episode."""
 
-    def __init__(self, belief: Belief, policy: ActionHead, scaler: Scaler, resample: str) -> None:
-        self.belief, self.policy, self.scaler, self.resample = belief, policy, scaler, resample
+    def __init__(self, model: LatentModel, policy: ActionHead, resample: str = "step") -> None:
+        super().__init__(policy)
+        self.model, self.policy, self.resample = model, policy, resample
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._memory = self.belief.start(n)
-        self._rng = torch_generator(rng, self._memory.device)
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self._memory = self.model.start(self._n)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
         self._latent: Tensor | None = None
 
-    def reset(self) -> None:
-        self._latent = None
-
     def latent(self) -> Tensor:
-        """The theta_hat [N, D] to act under now."""
+        """The theta_hat [S, N, D] to act under now."""
         if self._latent is None or self.resample == "step":
-            self._latent = reparametrise(*self.belief.posterior(self._memory), self._rng)
+            self._latent = self.model.sample(self.model.belief(self._memory), self._draws)
         return self._latent
 
-    @torch.no_grad()
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        features = torch.cat([self.scaler(obs), self.latent()], -1)
-        return self.policy.sample(features, self._rng).double().cpu().numpy()
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(torch.cat([self.model.inputs.obs(obs), self.latent()], -1), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        self._memory = self.model.update(self._memory, step)
 
     @torch.no_grad()
-    def observe(
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
-        self._memory = self.belief.update(self._memory, Batch.step(obs, action, next_obs, alive, self._rng.device))
+    def features(self) -> NDArray[np.float32]:
+        point = self.model.point(self.model.belief(self._memory))
+        return point.flatten(0, 1).cpu().numpy()
 
 
 class Explorer(DeconfoundedAgent):
@@ -96,134 +111,116 @@ class Explorer(DeconfoundedAgent):
     prior stands for) instead of from the belief, so that each expert's behaviour is tried under each theta.
     """
 
-    def __init__(
-        self, belief: Belief, policy: ActionHead, scaler: Scaler, latents: Tensor, random_share: float
-    ) -> None:
-        super().__init__(belief, policy, scaler, "step")
+    def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
+        super().__init__(agent.model, agent.policy)
         self.latents, self.random_share = latents, random_share
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        super().begin(n, rng)
-        self._numpy, self._blind = rng, torch.arange(n, device=self._rng.device)[:, None] % 2 == 0
-        self._drawn = self._draw()
-
-    def _draw(self) -> Tensor:
-        n, device = len(self._blind), self._rng.device
-        return self.latents[torch.randint(len(self.latents), (n,), generator=self._rng, device=device)]
-
-    def reset(self) -> None:
-        self._drawn = self._draw()
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
+        index = self._draws.below(self.latents.shape[1], self._n)
+        self._drawn = self.latents[torch.arange(self.seeds, device=self.device)[:, None], index]
 
     def latent(self) -> Tensor:
         return torch.where(self._blind, self._drawn, super().latent())
 
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        action, actions = super().act(obs), self.policy.signature.actions
-        if actions:
-            other = self._numpy.integers(actions, size=action.shape).astype(float)
-        else:
-            other = self._numpy.uniform(-1, 1, action.shape)
-        return np.where(self._numpy.random((len(action), 1)) < self.random_share, other, action)
+    def choose(self, obs: Tensor) -> Tensor:
+        action, actions = super().choose(obs), self.policy.signature.actions
+        uniform = self._draws.uniform(*action.shape[1:])
+        other = (uniform * actions).floor() if actions else 2 * uniform - 1
+        return torch.where(self._draws.uniform(self._n, 1) < self.random_share, other, action)
 
 
 def fit(
-    trials: Trials,
+    trials: Source,
     explore: Explore,
     config: DeconfoundedConfig,
-    rng: np.random.Generator,
+    rng: Rngs,
     progress: Progress = no_progress,
+    watch: Watch = no_watch,
 ) -> DeconfoundedAgent:
-    """Algorithm 1. trials: of the expert, without theta. explore: see `Explore`; it is called once a round."""
+    """Algorithm 1.
+
+    trials: of the expert, without theta; in as many equal groups as there are generators in rng, one after another. Or
+    what draws them, for fresh ones every round. explore: called once a round. Raises InputError if the two disagree.
+    """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    device = config.device
-    expert, signature = Batch.of(trials, device), Signature.of(trials)
-    steps = expert.mask.bool()
-    first = explore(None, rng)
+    rngs = listed(rng)
+    seeds, device = len(rngs), config.device
+    shown, first = drawn(trials, rngs), explore(None, rngs)
+    signature = Signature.of(shown)
     if Signature.of(first) != signature:
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
-    seen = Batch.of(first, device)
-    real = seen.mask.bool()
-    scaler = Scaler(torch.cat([seen.obs[real], expert.obs[steps]]))
-    change = Scaler((seen.next_obs - seen.obs)[real])
-    kind = {"evidence": EvidenceBelief, "gru": GruBelief}[config.belief]
-    with seeded(rng):
-        belief = kind(config.latent, config.width, signature, scaler, change).to(device)
-        dynamics = DynamicsHead(config.latent, config.width, signature, scaler, change).to(device)
-        policy = ActionHead(signature.obs + config.latent, config.width, signature).to(device)
-    generator = torch_generator(rng, device)
-    total = config.rounds * (config.inference_updates + config.imitation_updates) + 4 * config.imitation_updates
-    done = 0
-    inference = torch.optim.Adam([*belief.parameters(), *dynamics.parameters()], config.learning_rate)
-    cooling = torch.optim.lr_scheduler.CosineAnnealingLR(inference, config.rounds * config.inference_updates)
-    imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
+    expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
+    obs = Scaler(torch.cat([seen.obs, expert.obs], 1), torch.cat([seen.mask, expert.mask], 1))
+    change = Scaler(seen.next_obs - seen.obs, seen.mask)
+    model: LatentModel
+    if config.model == "discrete":
+        model = DiscreteModel(config.latent, config.width, signature, obs, change, draws)
+    else:
+        model = VariationalModel(config.model, config.latent, config.width, signature, obs, change, draws)
+    policy = ActionHead(model.inputs.obs_width + config.latent, config.width, signature, draws)
+    agent = DeconfoundedAgent(model, policy, config.resample)
 
-    def infer(data: Batch, inferred: int) -> None:
-        """One update of phi and psi; `inferred` have gone before."""
-        batch = data[torch.randint(len(data), (config.inference_batch,), generator=generator, device=device)]
-        keep = batch.mask.bool()
-        picked = torch.randint(int(keep.sum()), (config.inference_steps,), generator=generator, device=device)
-        mean, std = belief.posterior(belief(batch)[:, :-1][keep][picked])
-        real = batch[keep][picked]
-        theta_hat = reparametrise(mean, std, generator)
-        log_next = dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)
-        kl = gaussian_kl(mean, std, belief.prior_mean, belief.prior_std)
-        warm = min(1.0, inferred / (config.warm_up * config.rounds * config.inference_updates + 1))
-        loss = inference_loss(log_next, kl, config.beta * warm)
-        _descend(inference, loss)
-        cooling.step()
-        progress(done, total, {"inference": loss.item()})
+    inferences = config.rounds * config.inference_updates
+    total = inferences + config.rounds * config.imitation_updates + config.final_updates
+    inference = Adam([model], config.inference_rate, inferences if config.cooled else None)
+    imitation = Adam([policy], config.imitation_rate)
+    done, inferred = 0, 0
 
-    def imitate(mean: Tensor, std: Tensor) -> None:
-        """One update of eta, on steps of expert trials whose theta_hat_H is N(mean, std^2) [B, D]."""
-        index = torch.randint(len(where), (config.imitation_batch,), generator=generator, device=device)
-        trial = where[index, 0]
-        theta_hat = reparametrise(mean[trial], std[trial], generator)
-        features = torch.cat([scaler(obs[index]), theta_hat], -1)
-        log_policy = policy.log_prob(features, action[index])
-        loss = imitation_loss(log_policy)
-        _descend(imitation, loss)
-        progress(done, total, {"imitation": loss.item()})
+    def infer(data: Batch) -> None:
+        """One update of phi and psi."""
+        nonlocal done, inferred
+        batch = data.trials(draws.below(len(data), config.inference_batch))
+        warm = ramp(inferred, config.warm_up * inferences)
+        loss = model.loss(batch, config.inference_steps, config.beta * warm, draws)
+        inference.step(loss)
+        done, inferred = done + 1, inferred + 1
+        progress(done, total, {"inference": loss.mean().item()})
 
-    where, obs, action = steps.nonzero(), expert.obs[steps], expert.action[steps]
-    data = [first]
-    latents: Tensor | None = None
-    for i in range(config.rounds):
-        if latents is not None:
-            data.append(explore(Explorer(belief, policy, scaler, latents, config.random_share), rng))
-        joined = Batch.of(Trials.concatenate(data), device)
-        belief.train()
-        for j in range(config.inference_updates):
-            done += 1
-            infer(joined, i * config.inference_updates + j)
-        belief.eval()
-        mean, std = final_belief(belief, expert)
-        latents = reparametrise(mean, std, generator)
-        belief.set_prior(latents)
-        for _ in range(config.imitation_updates):
-            done += 1
-            imitate(mean, std)
-    imitation = torch.optim.Adam(policy.parameters(), config.learning_rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(imitation, 4 * config.imitation_updates)
-    for _ in range(4 * config.imitation_updates):
+    def imitate(data: Batch, belief: Tensor, optimizer: Adam) -> None:
+        """One update of eta, on steps of expert trials whose theta_hat_H is distributed as beliefs [S, B, P] say."""
+        nonlocal done
+        index = data.draw_steps(config.imitation_batch, draws)
+        real = data.steps(index)
+        seed = torch.arange(seeds, device=index.device)[:, None]
+        theta_hat = model.sample(belief[seed, index // data.mask.shape[2]], draws)
+        with torch.no_grad():
+            inputs = model.inputs.obs(real.obs)
+        loss = imitation_loss(policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
+        optimizer.step(loss)
         done += 1
-        imitate(mean, std)
-        schedule.step()
-    return DeconfoundedAgent(belief, policy, scaler, config.resample)
+        progress(done, total, {"imitation": loss.mean().item()})
+
+    latents: Tensor | None = None
+    for _ in range(config.rounds):
+        if latents is not None:
+            explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
+            new = Batch.of(explore(explorer, rngs), seeds, device)
+            seen = seen.joined(new) if config.accumulate else new
+            if not config.accumulate:
+                expert = Batch.of(drawn(trials, rngs), seeds, device)
+        model.train()
+        for _ in range(config.inference_updates):
+            infer(seen)
+        model.eval()
+        belief = final_belief(model, expert)
+        latents = model.sample(belief, draws)
+        if config.fit_prior:
+            model.set_prior(belief, draws)
+        for _ in range(config.imitation_updates):
+            imitate(expert, belief, imitation)
+        watch(done, total, agent)
+    final = Adam([policy], config.imitation_rate, config.final_updates)
+    for _ in range(config.final_updates):
+        imitate(expert, belief, final)
+    watch(done, total, agent)
+    return agent
 
 
 @torch.no_grad()
-def final_belief(belief: Belief, trials: Batch) -> tuple[Tensor, Tensor]:
-    """q_phi(theta_hat_H | tau) of whole trials: mean and std [B, D]."""
-    memories = []
-    for part in torch.arange(len(trials), device=trials.mask.device).split(64):
-        batch = trials[part]
-        memories.append(belief(batch)[torch.arange(len(part), device=part.device), batch.mask.sum(1).long()])
-    return belief.posterior(torch.cat(memories))
-
-
-def _descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    optimizer.zero_grad()
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_([p for group in optimizer.param_groups for p in group["params"]], 1.0)
-    optimizer.step()
+def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
+    """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
+    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
+    return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))

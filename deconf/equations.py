@@ -1,15 +1,32 @@
-"""The paper's equations as pure functions.
+"""The paper's equations as pure functions, each the only copy: what needs one calls it here.
 
 theta: hidden latent; theta_hat: learned latent; tau_:t = (s_0, a_0, ..., s_t): history. K counts values of theta.
+Arrays and tensors may have more axes in front; losses average over the last one, where `mask` is 1. Eq. (4) is
+the bandit itself: envs/bandit.py.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.task import Array
+
+
+def imitation_objective(log_expert: Array, taken: NDArray[np.bool_]) -> Array:
+    """Eq. (1): sum over a rollout of log pi_exp(a_t | s_t, theta) of the imitator's own actions.
+
+    log_expert [..., T], taken [..., T] (False after an episode's end) -> [...]. The larger, the better. (The paper
+    prints a minus sign inside an objective it maximises.)
+    """
+    return np.where(taken, log_expert, 0).sum(-1)
+
+
+def posterior_policy(log_belief: Array, policy: Array) -> Array:
+    """Eq. (2) and (5), left: E over theta of pi_exp(a | s, theta); [..., K] and [..., K, A] -> [..., A]."""
+    return (np.exp(log_belief)[..., None] * policy).sum(-2)
 
 
 def belief_update(log_belief: Array, log_dynamics: Array, log_policy: Array | None = None) -> Array:
@@ -28,20 +45,44 @@ def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor
     return 0.5 * (((mean - prior_mean) / prior_std) ** 2 + ratio**2 - 1 - 2 * ratio.log()).sum(-1)
 
 
-def inference_loss(log_next: Tensor, kl: Tensor, beta: float) -> Tensor:
+def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
+    """Mean over the last axis of those entries [..., M] whose mask is 1; 0 where none is."""
+    return (x * mask).sum(-1) / mask.sum(-1).clamp(min=1)
+
+
+def inference_loss(log_next: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
     """Eq. (6) with its sign turned, averaged over steps.
 
     log_next: log p_psi(s_{t+1} | s_t, a_t, theta_hat) for theta_hat ~ q_phi(. | tau_:t), and kl: of q_phi(. | tau_:t)
-    from the prior, both [M].
+    from the prior; all [..., M].
     """
-    return -(log_next - beta * kl).mean()
+    return -masked_mean(log_next - beta * kl, mask)
 
 
-def imitation_loss(log_policy: Tensor) -> Tensor:
-    """The last line of Algorithm 1: minus log pi_eta(a | s, ...) [M], averaged over steps."""
-    return -log_policy.mean()
+def offline_loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
+    """Eq. (7) with its sign turned, averaged over trajectories.
+
+    log_next, log_policy, mask: of the steps of each trajectory, for theta_hat ~ q_phi_off(. | tau_e) [..., B, T]; kl:
+    of q_phi_off(. | tau_e) from the prior [..., B].
+    """
+    return -(((log_next + log_policy) * mask).sum(-1) - beta * kl).mean(-1)
 
 
-def reparametrise(mean: Tensor, std: Tensor, rng: torch.Generator) -> Tensor:
-    """theta_hat ~ N(mean, std^2), differentiable; [..., D]."""
-    return mean + std * torch.randn(mean.shape, generator=rng, device=rng.device).to(mean)
+def imitation_loss(log_policy: Tensor, mask: Tensor) -> Tensor:
+    """The last line of Algorithm 1: minus log pi_eta(a | s, ...) [..., M], averaged over steps."""
+    return -masked_mean(log_policy, mask)
+
+
+def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
+    """Footnote 4: minus log sum_k p(k) prod_t p_psi(s_{t+1} | s_t, a_t, k), a step.
+
+    log_prior [..., K], log_next [..., B, T, K], mask [..., B, T] -> [...].
+    """
+    total = (log_next * mask[..., None]).sum(-2)
+    marginal = torch.logsumexp(log_prior[..., None, :] + total, -1)
+    return -marginal.sum(-1) / mask.sum((-2, -1))
+
+
+def reparametrise(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
+    """theta_hat ~ N(mean, std^2), differentiable, from noise ~ N(0, 1); [..., D]."""
+    return mean + std * noise

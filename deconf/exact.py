@@ -6,13 +6,15 @@ control step from the present state, and weighed by the Gaussian process noise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from deconf.equations import belief_update
 from envs import BatchEnv
 from envs.task import Array
-from experts.demos import Agent
+from experts.demos import Agent, Streams
 from experts.policy import Expert, sample_rows
 
 
@@ -53,8 +55,11 @@ class ExactAgent(Agent):
         self.env, self.expert, self.conditional = env, expert, conditional
         self.grid = Grid(env, expert, k)
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng, self.log_belief = rng, self.grid.prior(n)
+    def begin(self, n: int) -> None:
+        self.log_belief = self.grid.prior(n)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
@@ -68,3 +73,6 @@ class ExactAgent(Agent):
         log_policy = self.grid.log_policy(obs, action) if self.conditional else None
         updated = belief_update(self.log_belief, log_dynamics, log_policy)
         self.log_belief = np.where(alive[:, None], updated, self.log_belief)
+
+    def features(self) -> NDArray[np.float32]:
+        return np.exp(self.log_belief).astype(np.float32)

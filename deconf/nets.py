@@ -1,11 +1,14 @@
-"""What every method is built from: networks, action and observation heads, and scaling to unit size."""
+"""What every method is built from: networks side by side, action and observation heads, and scaling to unit size.
+
+S seeds train in one program: every parameter has a leading axis of S, and so has every tensor. Seeds share nothing, so
+that one's numbers are the same, bit for bit, whatever runs beside it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -13,37 +16,121 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envs.task import Array
-from experts.demos import Trials
+from envs.task import Array, InputError
+from experts.demos import Agent, Trials
+
+Rngs = np.random.Generator | Sequence[np.random.Generator]
+"""One generator for each seed; a single one stands for one seed."""
 
 Progress = Callable[[int, int, dict[str, float]], None]
-"""Called as training goes: updates done, updates in all, losses by name."""
+"""Called as training goes: updates done, updates in all, losses by name (the mean over seeds)."""
 
-T = TypeVar("T", bound=nn.Module)
+
+Watch = Callable[[int, int, Agent], None]
+"""Shown the agent now and then as training goes: updates done, updates in all, the agent so far."""
+
+Source = Trials | Callable[[Sequence[np.random.Generator]], Trials]
+"""Trials, or what draws fresh ones: as many for each generator."""
+
+
+def no_watch(done: int, total: int, agent: Agent) -> None:
+    """Look away."""
+
+
+def drawn(source: Source, rngs: Sequence[np.random.Generator]) -> Trials:
+    """The trials, or fresh ones."""
+    return source if isinstance(source, Trials) else source(rngs)
 
 
 def no_progress(done: int, total: int, losses: dict[str, float]) -> None:
     """Report nothing."""
 
 
-@contextmanager
-def seeded(rng: np.random.Generator) -> Iterator[None]:
-    """Initialise networks from rng and leave torch's global generator as it was."""
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(int(rng.integers(2**31)))  # of the CPU, where networks are made
-        yield
+def listed(rng: Rngs) -> list[np.random.Generator]:
+    """The generators, one a seed."""
+    return [rng] if isinstance(rng, np.random.Generator) else list(rng)
 
 
-def torch_generator(rng: np.random.Generator, device: str | torch.device = "cpu") -> torch.Generator:
-    """A torch generator drawn from a numpy one."""
-    return torch.Generator(device).manual_seed(int(rng.integers(2**31)))
+def ramp(done: int, until: float) -> float:
+    """Rises from 0 to 1."""
+    return min(1.0, done / until) if until else 1.0
 
 
-def mlp(inputs: int, width: int, outputs: int) -> nn.Sequential:
+class Draws:
+    """S independent streams of random numbers: row s of every draw comes from generator s alone."""
+
+    def __init__(self, rngs: Sequence[np.random.Generator], device: str | torch.device) -> None:
+        self.device = torch.device(device)
+        self._streams = [torch.Generator(device).manual_seed(int(rng.integers(2**31))) for rng in rngs]
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def uniform(self, *shape: int) -> Tensor:
+        """U(0, 1) [S, *shape]."""
+        return torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self._streams])
+
+    def normal(self, *shape: int) -> Tensor:
+        """N(0, 1) [S, *shape]."""
+        return torch.stack([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
+
+    def below(self, high: int, *shape: int) -> Tensor:
+        """Whole numbers 0 .. high - 1, [S, *shape]."""
+        return torch.stack([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
+
+
+def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
+    """[S, F] -> [S, 1, ..., 1, F], to go with tensors [S, ..., F]."""
+    return statistic.reshape(len(statistic), *[1] * (like.dim() - 2), -1)
+
+
+class Linear(nn.Module):
+    """S linear maps side by side: [S, ..., I] -> [S, ..., O]."""
+
+    def __init__(self, inputs: int, outputs: int, draws: Draws) -> None:
+        super().__init__()
+        bound = inputs**-0.5
+        self.weight = nn.Parameter((2 * draws.uniform(inputs, outputs) - 1) * bound)
+        self.bias = nn.Parameter((2 * draws.uniform(1, outputs) - 1) * bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows = x.reshape(len(x), -1, x.shape[-1])
+        return torch.baddbmm(self.bias, rows, self.weight).reshape(*x.shape[:-1], self.weight.shape[-1])
+
+
+def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:
     """Two hidden layers with ReLU."""
     return nn.Sequential(
-        nn.Linear(inputs, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs)
+        Linear(inputs, width, draws),
+        nn.ReLU(),
+        Linear(width, width, draws),
+        nn.ReLU(),
+        Linear(width, outputs, draws),
     )
+
+
+class Adam:
+    """Adam over stacked parameters, each seed's gradient clipped to norm 1, optionally cooled along a cosine."""
+
+    def __init__(self, modules: Iterable[nn.Module], learning_rate: float, updates: int | None = None) -> None:
+        self.parameters = list(dict.fromkeys(p for module in modules for p in module.parameters()))  # some are shared
+        self._adam = torch.optim.Adam(self.parameters, learning_rate)
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
+
+    def step(self, loss: Tensor) -> None:
+        """One update on losses [S]."""
+        self._adam.zero_grad()
+        loss.sum().backward()
+        with torch.no_grad():
+            # Summed one by one: a sum over a stack takes another order for one seed than for several.
+            squares = sum(p.grad.flatten(1).square().sum(1) for p in self.parameters if p.grad is not None)
+            scale = (1 / (torch.as_tensor(squares).sqrt() + 1e-6)).clamp(max=1)
+            for p in self.parameters:
+                if p.grad is not None:
+                    p.grad *= scale.reshape(-1, *[1] * (p.dim() - 1))
+        self._adam.step()
+        if self._schedule is not None:
+            self._schedule.step()
 
 
 @dataclass(frozen=True)
@@ -71,20 +158,62 @@ class Signature:
         return F.one_hot(action[..., 0].long(), self.actions).float() if self.actions else action
 
 
+def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance [S, F] of x [S, ..., F] where mask [S, ...] is 1."""
+    flat, weight = x.flatten(1, -2), mask.flatten(1)[..., None]
+    count = weight.sum(1)
+    mean = (flat * weight).sum(1) / count
+    return mean, ((flat - mean[:, None]).square() * weight).sum(1) / count
+
+
 class Scaler(nn.Module):
-    """(x - mean) / std, fitted to data once; columns that hardly vary keep their size."""
+    """(x - mean) / std, fitted to data [S, ..., F] where mask is 1, once; columns that hardly vary keep their size."""
 
     mean: Tensor
     std: Tensor
 
-    def __init__(self, data: Tensor) -> None:
+    def __init__(self, data: Tensor, mask: Tensor) -> None:
         super().__init__()
-        std = data.std(0)
-        self.register_buffer("mean", data.mean(0))
+        mean, variance = moments(data, mask)
+        std = variance.sqrt()
+        self.register_buffer("mean", mean)
         self.register_buffer("std", torch.where(std > 1e-6, std, torch.ones_like(std)))
 
-    def forward(self, x: Tensor | NDArray[np.float32]) -> Tensor:
-        return (torch.as_tensor(x, device=self.mean.device) - self.mean) / self.std
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
+
+
+class Inputs(nn.Module):
+    """Observations and actions as networks take them: scaled, and one-hot if discrete."""
+
+    def __init__(self, signature: Signature, obs: Scaler) -> None:
+        super().__init__()
+        self.signature, self.scaler = signature, obs
+        self.obs_width, self.action_width = signature.obs, signature.action_features
+
+    def obs(self, obs: Tensor) -> Tensor:
+        """[S, ..., O] -> [S, ..., obs_width]."""
+        return self.scaler(obs)
+
+    def action(self, action: Tensor) -> Tensor:
+        """[S, ..., A] -> [S, ..., action_width]."""
+        return self.signature.encode_action(action)
+
+
+class Embedding(Inputs):
+    """The paper's preprocessing (appendix D): an MLP for observations and a linear map for actions, to 32 each."""
+
+    def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
+        super().__init__(signature, obs)
+        self.obs_width = self.action_width = 32
+        self.embed_obs = mlp(signature.obs, width, 32, draws)
+        self.embed_action = Linear(signature.action_features, 32, draws)
+
+    def obs(self, obs: Tensor) -> Tensor:
+        return self.embed_obs(self.scaler(obs))
+
+    def action(self, action: Tensor) -> Tensor:
+        return self.embed_action(self.signature.encode_action(action))
 
 
 class Whitener(nn.Module):
@@ -96,73 +225,99 @@ class Whitener(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, features: int, momentum: float = 0.05) -> None:
+    def __init__(self, features: int, draws: Draws, momentum: float = 0.05) -> None:
         super().__init__()
         self.momentum = momentum
-        self.register_buffer("mean", torch.zeros(features))
-        self.register_buffer("variance", torch.ones(features))
+        self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
+        self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """[M, F] -> [M, F]."""
+    def forward(self, x: Tensor, mask: Tensor) -> Tensor:
+        """[S, ..., F], of which those count where mask [S, ...] is 1."""
         mean, variance = self.mean, self.variance
         if self.training:
-            mean, variance = x.mean(0), x.var(0, correction=0)
+            mean, variance = moments(x, mask)
             self.mean.lerp_(mean.detach(), self.momentum)
             self.variance.lerp_(variance.detach(), self.momentum)
-        return (x - mean) * torch.rsqrt(variance + 1e-5)
+        return (x - per_seed(mean, x)) * per_seed(torch.rsqrt(variance + 1e-5), x)
 
 
 class ActionHead(nn.Module):
     """Features -> a distribution over actions: categorical, or Gaussian with a learned std for each input."""
 
-    def __init__(self, features: int, width: int, signature: Signature) -> None:
+    def __init__(self, features: int, width: int, signature: Signature, draws: Draws) -> None:
         super().__init__()
         self.signature = signature
-        self.net = mlp(features, width, signature.actions or 2 * signature.action)
+        self.net = mlp(features, width, signature.actions or 2 * signature.action, draws)
 
     def _gaussian(self, features: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = self.net(features).chunk(2, -1)
         return mean, F.softplus(raw) + 0.01
 
     def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
-        """log pi(a | features) [...] of actions [..., A]."""
+        """log pi(a | features) [S, ...] of actions [S, ..., A]."""
         if self.signature.actions:
             return F.log_softmax(self.net(features), -1).gather(-1, action[..., :1].long())[..., 0]
         mean, std = self._gaussian(features)
         return torch.distributions.Normal(mean, std, validate_args=False).log_prob(action).sum(-1)
 
-    def sample(self, features: Tensor, rng: torch.Generator) -> Tensor:
-        """Action [N, A]; continuous ones are clipped to [-1, 1]."""
+    def sample(self, features: Tensor, draws: Draws) -> Tensor:
+        """Action [S, N, A]; continuous ones are clipped to [-1, 1]."""
         if self.signature.actions:
-            return torch.multinomial(F.softmax(self.net(features), -1), 1, generator=rng).float()
+            return sample_index(F.softmax(self.net(features), -1), draws)[..., None].float()
         mean, std = self._gaussian(features)
-        return (mean + std * torch.randn(mean.shape, generator=rng, device=rng.device)).clamp(-1, 1)
+        return (mean + std * draws.normal(*mean.shape[1:])).clamp(-1, 1)
+
+
+def sample_index(probs: Tensor, draws: Draws) -> Tensor:
+    """One index [S, ...] from each row of probabilities [S, ..., K]."""
+    cumulative = probs.cumsum(-1)
+    u = draws.uniform(*probs.shape[1:-1], 1) * cumulative[..., -1:]
+    return (u > cumulative).sum(-1).clamp(max=probs.shape[-1] - 1)
 
 
 class DynamicsHead(nn.Module):
-    """p_psi(s' | s, a, theta_hat): Bernoulli, or Gaussian about s + change, with one std a coordinate."""
+    """p_psi(s' | s, a, theta_hat): Bernoulli, or Gaussian about s + change, with one std a coordinate.
 
-    def __init__(self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler) -> None:
+    `inputs` may be shared with other networks. copies: how many models of the dynamics to predict with at once.
+    """
+
+    def __init__(self, latent: int, width: int, inputs: Inputs, change: Scaler, draws: Draws, copies: int = 1) -> None:
         super().__init__()
-        self.signature, self.obs, self.change = signature, obs, change
-        self.net = mlp(signature.obs + signature.action_features + latent, width, signature.obs)
-        self.log_std = nn.Parameter(torch.zeros(signature.obs))
+        self.inputs, self.change, self.copies = inputs, change, copies
+        self.signature = inputs.signature
+        self.net = mlp(inputs.obs_width + inputs.action_width + latent, width, copies * self.signature.obs, draws)
+        self.log_std = nn.Parameter(torch.zeros(len(draws), self.signature.obs, device=draws.device))
 
-    def log_prob(self, obs: Tensor, action: Tensor, next_obs: Tensor, theta_hat: Tensor) -> Tensor:
-        """log p_psi [...] of next observations [..., O], in units of the scaled change if Gaussian."""
-        inputs = [self.obs(obs), self.signature.encode_action(action), theta_hat]
-        out = self.net(torch.cat(inputs, -1))
+    def forward(self, obs: Tensor, action: Tensor, theta_hat: Tensor | None = None) -> Tensor:
+        """Logits, or means of the scaled change: [S, ..., copies, O]."""
+        inputs = [self.inputs.obs(obs), self.inputs.action(action)]
+        out = self.net(torch.cat(inputs if theta_hat is None else [*inputs, theta_hat], -1))
+        return out.unflatten(-1, (self.copies, self.signature.obs))
+
+    def log_prob(self, obs: Tensor, action: Tensor, next_obs: Tensor, theta_hat: Tensor | None = None) -> Tensor:
+        """log p_psi [S, ..., copies] of next observations [S, ..., O], in units of the scaled change if Gaussian."""
+        out = self(obs, action, theta_hat)
         if self.signature.binary:
-            return -F.binary_cross_entropy_with_logits(out, next_obs, reduction="none").sum(-1)
-        z = (self.change(next_obs - obs) - out) * torch.exp(-self.log_std)
-        return (-0.5 * z**2 - self.log_std).sum(-1) - 0.5 * z.shape[-1] * float(np.log(2 * np.pi))
+            target = next_obs[..., None, :].expand_as(out)
+            return -F.binary_cross_entropy_with_logits(out, target, reduction="none").sum(-1)
+        log_std = per_seed(self.log_std, out)
+        z = (self.change(next_obs - obs)[..., None, :] - out) * torch.exp(-log_std)
+        return (-0.5 * z**2 - log_std).sum(-1) - 0.5 * z.shape[-1] * float(np.log(2 * np.pi))
+
+    def sample(self, obs: Tensor, action: Tensor, theta_hat: Tensor, draws: Draws) -> Tensor:
+        """s' ~ p_psi [S, N, O]."""
+        out = self(obs, action, theta_hat)[..., 0, :]
+        if self.signature.binary:
+            return (draws.uniform(*out.shape[1:]) < torch.sigmoid(out)).float()
+        change = out + torch.exp(per_seed(self.log_std, out)) * draws.normal(*out.shape[1:])
+        return obs + change * per_seed(self.change.std, out) + per_seed(self.change.mean, out)
 
 
 @dataclass
 class Batch:
-    """Trials as tensors: the steps that took place, episodes joined end to end, padded at the end of a trial.
+    """Trials of S seeds as tensors: the steps that took place, episodes joined end to end and padded at the end.
 
-    obs, next_obs [B, T, O]; action [B, T, A]; mask [B, T], 1 for a step and 0 for padding.
+    obs, next_obs [S, B, T, O]; action [S, B, T, A]; mask [S, B, T], 1 for a step and 0 for padding.
     """
 
     obs: Tensor
@@ -171,31 +326,99 @@ class Batch:
     mask: Tensor
 
     @staticmethod
-    def of(trials: Trials, device: str | torch.device = "cpu") -> Batch:
-        """Join the episodes of each trial."""
+    def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
+        """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
+        if len(trials) % seeds:
+            raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
         mask = trials.mask.reshape(len(trials), -1)
-        order = np.argsort(~mask, axis=1, kind="stable")[:, : mask.sum(1).max()]
+        order = np.argsort(~mask, axis=1, kind="stable")
 
         def join(array: NDArray[np.float32]) -> Tensor:
-            flat = array.reshape(*mask.shape, -1)
-            return torch.as_tensor(np.take_along_axis(flat, order[..., None], 1), device=device)
+            flat = np.take_along_axis(array.reshape(*mask.shape, -1), order[..., None], 1)
+            return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
 
         steps = join(mask.astype(np.float32))[..., 0]
         return Batch(join(trials.obs[:, :, :-1]), join(trials.action), join(trials.obs[:, :, 1:]), steps)
 
     @staticmethod
     def step(
-        obs: NDArray[np.float32],
-        action: Array,
-        next_obs: NDArray[np.float32],
-        alive: NDArray[np.bool_],
-        device: torch.device,
+        obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> Batch:
-        """One transition each of N trials, without a time axis."""
-        return Batch(*(torch.as_tensor(x, dtype=torch.float32, device=device) for x in (obs, action, next_obs, alive)))
+        """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
+        rows = [torch.as_tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
+        action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
+        return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
 
-    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | None, ...]) -> Batch:
+    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int, ...]) -> Batch:
         return Batch(self.obs[index], self.action[index], self.next_obs[index], self.mask[index])
 
+    def trials(self, index: Tensor) -> Batch:
+        """Seed s's trials index[s], [S, K]."""
+        seed = torch.arange(len(index), device=index.device)[:, None]
+        return self[seed, index]
+
+    def steps(self, index: Tensor) -> Batch:
+        """Seed s's steps index[s] [S, K], as `draw_steps` counts them; without a time axis."""
+        return Batch(*(take_steps(x, index) for x in (self.obs, self.action, self.next_obs, self.mask)))
+
+    @cached_property
+    def _counted(self) -> Tensor:
+        return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
+
+    def joined(self, other: Batch) -> Batch:
+        """The trials of both."""
+        pairs = ((getattr(self, name), getattr(other, name)) for name in ("obs", "action", "next_obs", "mask"))
+        return Batch(*(torch.cat(pair, 1) for pair in pairs))
+
+    def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
+        """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""
+        if k is None:
+            return torch.arange(self.mask[0].numel(), device=self.mask.device).expand(len(self.mask), -1)
+        counted = self._counted
+        count = counted[:, -1:]
+        nth = (draws.uniform(k).double() * count).long().clamp(max=count - 1) + 1
+        return torch.searchsorted(counted, nth)
+
     def __len__(self) -> int:
-        return len(self.mask)
+        return self.mask.shape[1]
+
+
+def take_steps(x: Tensor, index: Tensor) -> Tensor:
+    """x [S, B, T, ...] at indices [S, K] into the B T of each seed -> [S, K, ...]."""
+    return x.flatten(1, 2)[torch.arange(len(index), device=index.device)[:, None], index]
+
+
+class LearnedAgent(Agent):
+    """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers."""
+
+    def __init__(self, policy: ActionHead) -> None:
+        parameter = next(policy.parameters())
+        self.seeds, self.device = len(parameter), parameter.device
+
+    def begin(self, n: int) -> None:
+        if n % self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
+        self._n = n // self.seeds
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        if len(rngs) != self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {len(rngs)} generators; it needs one for each")
+        self._draws = Draws(rngs, self.device)
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        self._obs = torch.as_tensor(obs, device=self.device).reshape(self.seeds, self._n, -1)
+        return self.choose(self._obs).double().cpu().numpy().reshape(len(obs), -1)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        """Observation [S, N, O] -> action [S, N, A]."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.remember(Batch.step(self._obs, action, next_obs, alive))
+
+    def remember(self, step: Batch) -> None:
+        """Take note of a transition; agents without memory need nothing here."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,15 +80,35 @@ class Trials:
             raise InputError(f"no trials could be read from {file}: {error}") from None
 
 
+class Streams:
+    """Random numbers for rows in equal groups: each group draws from its own generator, whatever the others do."""
+
+    def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
+        self.rngs = list(rngs)
+        self.groups = len(self.rngs)
+
+    def random(self, size: tuple[int, ...]) -> Array:
+        """U(0, 1) of that size, whose first axis counts rows."""
+        return np.concatenate([rng.random((size[0] // self.groups, *size[1:])) for rng in self.rngs])
+
+    def standard_normal(self, size: tuple[int, ...]) -> Array:
+        """N(0, 1), likewise."""
+        return np.concatenate([rng.standard_normal((size[0] // self.groups, *size[1:])) for rng in self.rngs])
+
+
 class Agent(ABC):
     """Something that acts in N trials side by side, from its own history alone."""
 
     @abstractmethod
-    def begin(self, n: int, rng: np.random.Generator) -> None:
+    def begin(self, n: int) -> None:
         """Forget everything: n new trials start, each under a theta of its own."""
 
-    def reset(self) -> None:  # noqa: B027 (most agents need nothing here)
-        """A new episode of the same trials starts: theta stays."""
+    @abstractmethod
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        """An episode starts, the first of new trials or the next of the same: theta stays.
+
+        rngs: its random numbers, one generator for each of equal groups of trials.
+        """
 
     @abstractmethod
     def act(self, obs: NDArray[np.float32]) -> Array:
@@ -98,6 +119,10 @@ class Agent(ABC):
     ) -> None:
         """What followed: one transition a trial; where `alive` [N] is False, the episode had ended before it."""
 
+    def features(self) -> NDArray[np.float32] | None:
+        """What the agent knows now [N, F], for probes of theta in it; None for agents without memory."""
+        return None
+
 
 class ExpertAgent(Agent):
     """The expert; it reads theta from the environment, or is told another: told [N, L]."""
@@ -105,8 +130,11 @@ class ExpertAgent(Agent):
     def __init__(self, env: BatchEnv, expert: Expert, told: Array | None = None) -> None:
         self.env, self.expert, self.told = env, expert, told
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng = rng
+    def begin(self, n: int) -> None:
+        pass
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         return self.expert.act(obs, self.env.theta if self.told is None else self.told, self._rng)
@@ -118,34 +146,42 @@ class RandomAgent(Agent):
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
 
-    def begin(self, n: int, rng: np.random.Generator) -> None:
-        self._rng = rng
+    def begin(self, n: int) -> None:
+        pass
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         if isinstance(self.space, spaces.Discrete):
-            return self._rng.integers(self.space.n, size=(len(obs), 1)).astype(float)
-        return self._rng.uniform(-1, 1, (len(obs), *self.space.shape))
+            return np.floor(self._rng.random((len(obs), 1)) * self.space.n)
+        return 2 * self._rng.random((len(obs), *self.space.shape)) - 1
 
 
 def run_trials(
-    env: BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None
+    env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
 ) -> tuple[Trials, Array]:
     """N trials of `episodes` episodes each -> Trials and returns [N, E].
 
-    seed: of the environments and, apart from them, of the agent. theta: forced [N, L], else drawn from p(theta).
+    seed: of the environments and, apart from them, of the agent; or one for each of several equal groups of trials, one
+    after another, each of which goes as it would go alone. theta: forced [N, L], else drawn from p(theta).
     """
     task, n = env.task, env.n
+    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(one) for one in seed]
+    if n % len(seeds):
+        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
     action: NDArray[np.float32] | None = None
     for e in range(episodes):
         if e == 0:
-            now = env.reset(seed, None if theta is None else {"theta": theta})
-            agent.begin(n, np.random.default_rng([seed, 1]))
+            each = [one + i for one in seeds for i in range(n // len(seeds))]
+            now = env.reset(each, None if theta is None else {"theta": theta})
+            agent.begin(n)
         else:
             now = env.reset(options={"keep_theta": True})
-            agent.reset()
+        agent.reset([np.random.default_rng([one, 1, e]) for one in seeds])
         obs[:, e, 0] = now
         for t in range(task.horizon):
             alive = env.alive

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -17,11 +18,18 @@ from envs import InputError, Task
 from envs.task import ASSETS, Array
 
 
+class Random(Protocol):
+    """What is drawn from: a numpy generator, or demos.Streams, whose rows are in `groups` equal groups."""
+
+    def random(self, size: tuple[int, ...]) -> Array: ...
+    def standard_normal(self, size: tuple[int, ...]) -> Array: ...
+
+
 class Expert(ABC):
     """pi_exp(a | s, theta), batched and Markov."""
 
     @abstractmethod
-    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
         """Observation [N, O], theta [N, L] -> sampled action [N, A]."""
 
     @abstractmethod
@@ -29,7 +37,7 @@ class Expert(ABC):
         """log pi_exp(a | s, theta) [N]."""
 
 
-def sample_rows(probs: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+def sample_rows(probs: Array, rng: Random) -> NDArray[np.int64]:
     """One index [N] from each row of probabilities [N, K], which need not be normalised."""
     cumulative = probs.cumsum(-1)
     return (rng.random((len(probs), 1)) * cumulative[:, -1:] > cumulative).sum(-1)
@@ -41,7 +49,7 @@ class DiscreteExpert(Expert):
     def __init__(self, task: Task) -> None:
         self.task = task
 
-    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
+    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
         return sample_rows(self._probs(obs, theta), rng)[:, None].astype(float)
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
@@ -59,17 +67,18 @@ class NetworkExpert(Expert):
     def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
         self.task, self.weights = task, weights
 
-    def mean(self, obs: Array, theta: Array) -> Array:
-        """mu [N, A], clipped to [-1, 1]."""
-        w = self.weights
-        hidden = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
-        for i in range(len(w) // 2 - 1):
+    def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
+        """mu [N, A], clipped to [-1, 1]. Rows in equal groups come out, bit for bit, as they would group by group."""
+        w, last = self.weights, len(self.weights) // 2 - 1
+        rows = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
+        hidden = rows.reshape(groups, -1, rows.shape[1])
+        for i in range(last):
             hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
-        last = len(w) // 2 - 1
-        return np.clip(hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"], -1, 1).astype(float)
+        out = hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"]
+        return np.clip(out.reshape(len(rows), -1), -1, 1).astype(float)
 
-    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
-        mean = self.mean(obs, theta)
+    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
+        mean = self.mean(obs, theta, getattr(rng, "groups", 1))
         return np.clip(mean + self.task.expert_noise * rng.standard_normal(mean.shape), -1, 1)
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:

@@ -87,7 +87,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert resumed.returncode == 0, resumed.stderr
     repeated = json.loads((out / "results.json").read_text())
     assert repeated["methods"] == results["methods"]
-    assert repeated["jobs_resumed"] == 3
+    assert repeated["resumed"] == 3
 
     (out / "settings.json").unlink()
     assert "not their settings.json" in command(*args, str(out), "--resume").stderr

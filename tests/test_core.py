@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,16 @@ import torch
 from safetensors.numpy import save_file
 
 import envs
+from benchmarks.methods import METHODS, Context, Preset
 from deconf import cloning, deconfounded, naive_rnn
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.dagger import DaggerConfig
+from deconf.deconfounded import DeconfoundedConfig
 from deconf.equations import gaussian_kl, imitation_loss, inference_loss, reparametrise
 from deconf.exact import ExactAgent
-from deconf.nets import Batch, Scaler, Signature
+from deconf.nets import Batch, Draws, Scaler, Signature, no_progress
+from deconf.offline import OfflineConfig
+from deconf.recurrent import RecurrentConfig
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
 
@@ -25,9 +31,10 @@ def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.B
 
 
 def explorer(name: str, n: int, episodes: int = 2) -> deconfounded.Explore:
-    def explore(agent: Agent | None, rng: np.random.Generator) -> Trials:
-        env = envs.BatchEnv(envs.get(name), n)
-        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, int(rng.integers(2**31)))[0]
+    def explore(agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
+        env = envs.BatchEnv(envs.get(name), n * len(rngs))
+        seeds = [int(rng.integers(2**31)) for rng in rngs]
+        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, seeds)[0]
 
     return explore
 
@@ -41,14 +48,14 @@ class TestEquations:
 
     def test_losses(self) -> None:
         """Eq. (6) of log p = -1, -3 and KL = 10, 20 with beta .1: -((-1 - 1) + (-3 - 2)) / 2 = 3.5."""
-        loss = inference_loss(torch.tensor([-1.0, -3.0]), torch.tensor([10.0, 20.0]), 0.1)
+        loss = inference_loss(torch.tensor([-1.0, -3.0]), torch.tensor([10.0, 20.0]), 0.1, torch.ones(2))
         assert loss.item() == pytest.approx(3.5)
-        assert imitation_loss(torch.tensor([-1.0, -3.0])).item() == pytest.approx(2)
+        assert imitation_loss(torch.tensor([-1.0, -3.0]), torch.ones(2)).item() == pytest.approx(2)
 
     def test_reparametrise(self) -> None:
         """Mean and std within 4 standard errors of 40,000 draws, and gradients flow to both."""
         mean, std = torch.full((40_000,), 2.0, requires_grad=True), torch.full((40_000,), 3.0, requires_grad=True)
-        drawn = reparametrise(mean, std, torch.Generator().manual_seed(0))
+        drawn = reparametrise(mean, std, torch.randn(40_000, generator=torch.Generator().manual_seed(0)))
         assert abs(drawn.mean().item() - 2) < 4 * 3 / 200
         assert abs(drawn.std().item() - 3) < 4 * 3 / 200 / np.sqrt(2)
         drawn.sum().backward()
@@ -61,11 +68,10 @@ class TestEquations:
 class TestBeliefs:
     def make(self, kind: type[Belief], name: str) -> tuple[Belief, Batch, Trials]:
         trials, _ = demonstrations(name, 6)
-        data, signature = Batch.of(trials), Signature.of(trials)
-        real = data.mask.bool()
-        change = Scaler((data.next_obs - data.obs)[real])
-        torch.manual_seed(0)
-        belief = kind(3, 32, signature, Scaler(data.obs[real]), change)  # type: ignore[call-arg]
+        data, signature = Batch.of(trials, 2), Signature.of(trials)
+        change = Scaler(data.next_obs - data.obs, data.mask)
+        draws = Draws([np.random.default_rng(i) for i in range(2)], "cpu")
+        belief = kind(3, 32, signature, Scaler(data.obs, data.mask), change, draws)  # type: ignore[call-arg, arg-type]
         belief(data)  # as in training, for running means that are not those of the start
         return belief.eval(), data, trials
 
@@ -73,28 +79,25 @@ class TestBeliefs:
         belief, data, _ = self.make(kind, name)
         memory = belief.start(len(data))
         memories = [memory]
-        for t in range(data.mask.shape[1]):
-            memory = belief.update(memory, data[:, t])
+        for t in range(data.mask.shape[2]):
+            memory = belief.update(memory, data[:, :, t])
             memories.append(memory)
-        ours, real = torch.stack(memories, 1), data.mask.bool()
-        theirs = belief(data)
-        torch.testing.assert_close(ours[:, 0], theirs[:, 0])
-        torch.testing.assert_close(ours[:, 1:][real], theirs[:, 1:][real], rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(torch.stack(memories, 2), belief(data), rtol=1e-4, atol=1e-4)
 
     def test_dead_steps_tell_nothing(self, kind: type[Belief], name: str) -> None:
         belief, data, _ = self.make(kind, name)
-        step = data[:, 0]
+        step = data[:, :, 0]
         step.mask = torch.zeros_like(step.mask)
-        memory = belief(data)[:, 3]
+        memory = belief(data)[:, :, 3]
         torch.testing.assert_close(belief.update(memory, step), memory)
 
     def test_order(self, kind: type[Belief], name: str) -> None:
         """The evidence belief does not care for the order of transitions; the GRU's does (so the check can fail)."""
         belief, data, _ = self.make(kind, name)
-        shortest = int(data.mask.sum(1).min())
-        turned = data[:, torch.arange(shortest - 1, -1, -1)]
-        mean, _ = belief.posterior(belief(data[:, :shortest])[:, -1])
-        mean_turned, _ = belief.posterior(belief(turned)[:, -1])
+        shortest = int(data.mask.sum(2).min())
+        turned = data[:, :, torch.arange(shortest - 1, -1, -1)]
+        mean, _ = belief.posterior(belief(data[:, :, :shortest])[:, :, -1])
+        mean_turned, _ = belief.posterior(belief(turned)[:, :, -1])
         same = torch.allclose(mean, mean_turned, atol=1e-4)
         assert same == (kind is EvidenceBelief)
 
@@ -125,11 +128,16 @@ class TestTrials:
         """Batch holds just the steps that took place, in order, each with its own successor."""
         env = envs.BatchEnv(envs.get("slippery_cartpole"), 8)
         trials, returns = run_trials(env, RandomAgent(env.task.action_space), 3, seed=0)
-        data = Batch.of(trials)
+        data = Batch.of(trials, 2)
         assert 0 < trials.mask.mean() < 0.5
         assert data.mask.sum() == trials.mask.sum()
-        np.testing.assert_array_equal(data.obs[0][data.mask[0].bool()], trials.obs[0, :, :-1][trials.mask[0]])
-        np.testing.assert_array_equal(data.next_obs[0][data.mask[0].bool()], trials.obs[0, :, 1:][trials.mask[0]])
+        taken = data[1, 2].mask.bool()  # trial 2 of seed 1 is number 6
+        assert (taken.float().diff() <= 0).all()
+        np.testing.assert_array_equal(data.obs[1, 2][taken], trials.obs[6, :, :-1][trials.mask[6]])
+        np.testing.assert_array_equal(data.next_obs[1, 2][taken], trials.obs[6, :, 1:][trials.mask[6]])
+        drawn = data.draw_steps(500, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+        assert data.steps(drawn).mask.all()
+        assert len(drawn[0].unique()) > 0.4 * data.mask[0].sum()
         assert (returns <= trials.mask.sum(-1)).all()  # at most one a step, none after the end
 
 
@@ -172,20 +180,21 @@ class TestMethods:
     def test_naive_rnn_is_deluded(self) -> None:
         """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
         trials, env = demonstrations("bandit", 1000, 1)
-        config = naive_rnn.NaiveConfig(updates=250, batch=100, chunk=100, learning_rate=3e-3)
+        config = RecurrentConfig(updates=250, batch=100, chunk=100, learning_rate=3e-3)
         agent = naive_rnn.fit(trials, config, np.random.default_rng(0))
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3)[1].mean() < 42
 
-    @pytest.mark.parametrize("kind", ["evidence", "gru"])
+    @pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
     def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
         """The same seed gives the same agent, and neither training nor acting touches torch's global generator."""
         trials, env = demonstrations("slippery_cartpole", 8)
         config = deconfounded.DeconfoundedConfig(
-            belief=kind,  # type: ignore[arg-type]
+            model=kind,  # type: ignore[arg-type]
             rounds=2,
             inference_updates=3,
             inference_batch=4,
             imitation_updates=3,
+            final_updates=3,
         )
         state = torch.get_rng_state()
         agents = [
@@ -196,15 +205,48 @@ class TestMethods:
         np.testing.assert_array_equal(first, second)
         assert torch.equal(torch.get_rng_state(), state)
 
+    @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
+    @pytest.mark.parametrize("method", ["deconfounded", "discrete", "offline", "naive_rnn", "dagger", "oracle"])
+    def test_seeds_do_not_touch_each_other(self, name: str, method: str) -> None:
+        """A seed's agent acts alike, bit for bit, whether it was trained alone or second of three."""
+        settings = Preset(
+            seeds=3,
+            expert_trials=4,
+            explore_trials=4,
+            eval_trials=4,
+            query_trials=4,
+            grid=3,
+            deconfounded=DeconfoundedConfig(
+                rounds=2, inference_updates=2, inference_batch=4, imitation_updates=2, final_updates=2
+            ),
+            discrete=DeconfoundedConfig(
+                model="discrete", rounds=2, inference_updates=2, inference_batch=4, imitation_updates=2, final_updates=2
+            ),
+            offline=OfflineConfig(
+                offline_updates=2, online_updates=2, online_batch=4, offline_batch=4, synthetic=4, online_steps=64
+            ),
+            naive=RecurrentConfig(updates=2, batch=4),
+            dagger=DaggerConfig(updates=2, rounds=2, batch=4),
+            cloning=cloning.CloningConfig(updates=3, batch=64),
+        )
+        key = {"oracle": "oracle_bc", "offline": "deconfounded_offline", "discrete": "deconfounded_discrete"}
+        task, found = envs.get(name), []
+        for seeds in ((5,), (4, 5, 6)):
+            context = Context(task, settings, seeds, no_progress)
+            agent = METHODS[key.get(method, method)](context)[key.get(method, method)]
+            trials, _ = run_trials(context.env, agent, task.episodes, list(seeds))
+            found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
+        np.testing.assert_array_equal(*found)
+
     def test_deconfounded_learns_from_physics(self) -> None:
         """A minute's budget cut to seconds: after training, the belief tells thetas apart on expert trials."""
         trials, env = demonstrations("tilted_cartpole", 48)
         theta = env.theta[:, 0].copy()
         config = deconfounded.DeconfoundedConfig(
-            rounds=2, inference_updates=150, inference_batch=8, imitation_updates=100, latent=2
+            rounds=2, inference_updates=150, inference_batch=8, imitation_updates=100, final_updates=100, latent=2
         )
         agent = deconfounded.fit(trials, explorer("tilted_cartpole", 32), config, np.random.default_rng(0))
-        mean, _ = deconfounded.final_belief(agent.belief, Batch.of(trials))
+        mean = agent.model.point(deconfounded.final_belief(agent.model, Batch.of(trials, 1)))[0]
         inputs = np.c_[mean.numpy(), np.ones(len(mean))]
         residual = theta - inputs @ np.linalg.lstsq(inputs, theta, rcond=None)[0]
         assert 1 - (residual**2).mean() / theta.var() > 0.5

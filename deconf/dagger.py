@@ -1,0 +1,79 @@
+"""Tier 3: expert queries, after DAgger (Ross et al., 2011). A recurrent policy learns from labels on its own roll-outs.
+
+The expert, which sees theta, is asked what it would do at each step that the imitator comes to. Actions in these
+histories are the imitator's, and so no evidence of theta: at its optimum this is the interventional policy (Ortega et
+al., 2021), whatever the dynamics tell. Expert roll-outs are not used: their actions would be evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deconf.nets import (
+    Adam,
+    Batch,
+    Draws,
+    Progress,
+    Rngs,
+    Scaler,
+    Signature,
+    Watch,
+    listed,
+    no_progress,
+    no_watch,
+)
+from deconf.recurrent import RecurrentAgent, RecurrentConfig
+from envs.task import InputError
+from experts.demos import Agent, Trials
+
+Query = Callable[[Agent | None, Sequence[np.random.Generator]], tuple[Trials, NDArray[np.float32]]]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each generator.
+
+Returns trials, and beside them what the expert would have done at each step [B, E, T, A]."""
+
+
+@dataclass(frozen=True)
+class DaggerConfig(RecurrentConfig):
+    """Updates are shared out equally over the rounds; each round queries on fresh roll-outs of the policy so far."""
+
+    rounds: int = 10
+
+
+def fit(
+    query: Query, config: DaggerConfig, rng: Rngs, progress: Progress = no_progress, watch: Watch = no_watch
+) -> RecurrentAgent:
+    """Label roll-outs, train on all labels so far, and again. Raises InputError for less than one round."""
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    rngs = listed(rng)
+    draws = Draws(rngs, config.device)
+    trials, labels = query(None, rngs)
+    data, label = Batch.of(trials, len(rngs), config.device), _labels(trials, labels, len(rngs), config.device)
+    agent = RecurrentAgent.new(config, Signature.of(trials), Scaler(data.obs, data.mask), draws)
+    chunks = -(-data.mask.shape[2] // config.chunk)
+    passes = -(-config.updates // (chunks * config.rounds))
+    total = passes * chunks * config.rounds
+    optimizer = Adam([agent.memory, agent.policy], config.learning_rate, total if config.cooled else None)
+    seed = torch.arange(len(rngs), device=data.mask.device)[:, None]
+    for i in range(config.rounds):
+        if i > 0:
+            trials, labels = query(agent, rngs)
+            data = data.joined(Batch.of(trials, len(rngs), config.device))
+            label = torch.cat([label, _labels(trials, labels, len(rngs), config.device)], 1)
+        for j in range(passes):
+            index = draws.below(len(data), config.batch)
+            losses = agent.clone(data.trials(index), label[seed, index], config.chunk, optimizer)
+            progress((i * passes + j + 1) * chunks, total, {"imitation": sum(losses) / chunks})
+        watch((i + 1) * passes * chunks, total, agent)
+    return agent
+
+
+def _labels(trials: Trials, labels: NDArray[np.float32], seeds: int, device: str) -> Tensor:
+    """[S, B, T, A], joined as the trials' own actions are."""
+    return Batch.of(Trials(trials.obs, labels, trials.mask, trials.actions), seeds, device).action

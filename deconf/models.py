@@ -1,0 +1,144 @@
+"""Latent-variable models of the dynamics: what infers theta_hat from a history, and is trained on exploration.
+
+Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a, theta_hat), trained on Eq. (6). Discrete: K models of the
+dynamics, and exact Bayesian inference over which one it is (footnote 4).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.equations import gaussian_kl, inference_loss, marginal_loss, reparametrise
+from deconf.nets import Batch, Draws, DynamicsHead, Inputs, Scaler, Signature, sample_index
+
+BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
+
+
+class LatentModel(nn.Module, ABC):
+    """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat."""
+
+    latent: int
+    inputs: Inputs
+
+    @abstractmethod
+    def start(self, n: int) -> Tensor:
+        """The memory [S, N, M] of n histories without a transition, for each seed."""
+
+    @abstractmethod
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        """Memory after one more transition each (step without a time axis); kept where its mask is 0."""
+
+    @abstractmethod
+    def last(self, batch: Batch) -> Tensor:
+        """The memory [S, B, M] of whole trials."""
+
+    @abstractmethod
+    def belief(self, memory: Tensor) -> Tensor:
+        """[..., M] -> [..., P]."""
+
+    @abstractmethod
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
+
+    @abstractmethod
+    def point(self, belief: Tensor) -> Tensor:
+        """What the belief says in one point: its mean, or its probabilities; for probes."""
+
+    @abstractmethod
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        """[S], to minimise, on trials [S, B, T]; steps: how many of them to predict, None for all."""
+
+    def set_prior(self, belief: Tensor, draws: Draws) -> None:
+        """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
+
+
+class VariationalModel(LatentModel):
+    """The paper's: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
+
+    def __init__(
+        self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__()
+        self.latent = latent
+        self.encoder: Belief = BELIEFS[kind](latent, width, signature, obs, change, draws)  # type: ignore[abstract]
+        self.inputs = self.encoder.inputs
+        self.dynamics = DynamicsHead(latent, width, self.inputs, change, draws)
+
+    def start(self, n: int) -> Tensor:
+        return self.encoder.start(n)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return self.encoder.update(memory, step)
+
+    def last(self, batch: Batch) -> Tensor:
+        return self.encoder(batch)[:, :, -1]
+
+    def belief(self, memory: Tensor) -> Tensor:
+        return torch.cat(self.encoder.posterior(memory), -1)
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        mean, std = belief.chunk(2, -1)
+        return reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+
+    def point(self, belief: Tensor) -> Tensor:
+        return belief.chunk(2, -1)[0]
+
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        index = batch.draw_steps(steps, draws)
+        real = batch.steps(index)
+        memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
+        seed = torch.arange(len(index), device=index.device)[:, None]
+        mean, std = self.encoder.posterior(memories[seed, index])
+        theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+        log_next = self.dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)[..., 0]
+        kl = gaussian_kl(mean, std, *self.encoder.prior(mean))
+        return inference_loss(log_next, kl, beta, real.mask)
+
+    def set_prior(self, belief: Tensor, draws: Draws) -> None:
+        self.encoder.set_prior(self.sample(belief, draws))
+
+
+class DiscreteModel(LatentModel):
+    """theta_hat is one of K, one-hot; p(k) and p_psi(s' | s, a, k) are fitted to the exact marginal likelihood.
+
+    The memory is the log-belief, updated by Bayes' rule: Eq. (5) with a learned model, without encoder or bound.
+    """
+
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__()
+        self.latent, self.inputs = latent, Inputs(signature, obs)
+        self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
+        self.logits = nn.Parameter(torch.zeros(len(draws), latent, device=draws.device))
+
+    def _evidence(self, batch: Batch) -> Tensor:
+        log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
+        return log_next * batch.mask[..., None]
+
+    def start(self, n: int) -> Tensor:
+        return F.log_softmax(self.logits, -1)[:, None].expand(-1, n, -1)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return F.log_softmax(memory + self._evidence(step), -1)
+
+    def last(self, batch: Batch) -> Tensor:
+        return F.log_softmax(self.start(len(batch)) + self._evidence(batch).sum(2), -1)
+
+    def belief(self, memory: Tensor) -> Tensor:
+        return memory.exp()
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        return F.one_hot(sample_index(belief, draws), self.latent).float()
+
+    def point(self, belief: Tensor) -> Tensor:
+        return belief
+
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
+        return marginal_loss(F.log_softmax(self.logits, -1), log_next, batch.mask)

@@ -1,0 +1,146 @@
+"""Tier 1 (appendix C, Algorithm 3): deconfounded imitation from expert demonstrations alone.
+
+An offline encoder reads whole expert trials, actions and all, and a decoder in two factors, dynamics and policy,
+explains both by one latent, Eq. (7). The encoder is deluded by actions, but the dynamics are not: they make synthetic
+trajectories under actions that are blind to the latent, and an online encoder is trained on these, Eq. (6). It is
+deployed as in Tier 2, by Algorithm 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deconf.deconfounded import DeconfoundedAgent, final_belief
+from deconf.equations import gaussian_kl, offline_loss
+from deconf.models import VariationalModel
+from deconf.nets import (
+    ActionHead,
+    Adam,
+    Batch,
+    Draws,
+    Progress,
+    Rngs,
+    Scaler,
+    Signature,
+    Watch,
+    listed,
+    no_progress,
+    no_watch,
+    ramp,
+)
+from experts.demos import Trials
+
+
+@dataclass(frozen=True)
+class OfflineConfig:
+    """Widths and amounts, for each seed. First Eq. (7), then Eq. (6): nothing of the second acts back on the first."""
+
+    width: int = 64
+    latent: int = 4
+    offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
+    offline_updates: int = 2000
+    offline_batch: int = 32  # trials
+    beta: float = 1e-3  # of Eq. (6), a step
+    warm_up: float = 0.5  # share of updates over which either beta rises to its value
+    online_updates: int = 2000
+    online_batch: int = 32  # synthetic trials
+    online_steps: int = 2048  # of them, whose next observation is predicted
+    refresh: int = 50  # updates between syntheses
+    synthetic: int = 128  # trials a synthesis
+    random_share: float = 0.1  # of synthetic actions that are uniformly random
+    learning_rate: float = 1e-3
+    device: str = "cpu"
+
+
+def fit(
+    trials: Trials, config: OfflineConfig, rng: Rngs, progress: Progress = no_progress, watch: Watch = no_watch
+) -> DeconfoundedAgent:
+    """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
+    rngs = listed(rng)
+    data, signature, draws = (
+        Batch.of(trials, len(rngs), config.device),
+        Signature.of(trials),
+        Draws(rngs, config.device),
+    )
+    obs, change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+    sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
+    offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
+    online.dynamics = offline.dynamics
+    policy = ActionHead(online.inputs.obs_width + config.latent, config.width, signature, draws)
+    total = config.offline_updates + config.online_updates
+
+    optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
+    for update in range(config.offline_updates):
+        batch = data.trials(draws.below(len(data), config.offline_batch))
+        warm = ramp(update, config.warm_up * config.offline_updates)
+        belief = offline.belief(offline.last(batch))
+        mean, std = belief.chunk(2, -1)
+        theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
+        log_next = offline.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)[..., 0]
+        log_policy = policy.log_prob(torch.cat([online.inputs.obs(batch.obs), theta_hat], -1), batch.action)
+        kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
+        loss = offline_loss(log_next, log_policy, kl, config.offline_beta * warm, batch.mask)
+        optimizer.step(loss)
+        progress(update + 1, total, {"offline": loss.mean().item()})
+    offline.eval()
+    latents = offline.sample(final_belief(offline, data), draws)
+    online.encoder.set_prior(latents)
+
+    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).unflatten(0, (len(rngs), -1))
+    agent = DeconfoundedAgent(online, policy)
+    optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
+    for update in range(config.online_updates):
+        if update % config.refresh == 0:
+            online.eval()
+            watch(config.offline_updates + update, total, agent)
+            synthetic = synthesise(online, policy, latents, starts, trials.mask.shape[2], config, draws)
+            online.train()
+        batch = synthetic.trials(draws.below(len(synthetic), config.online_batch))
+        warm = ramp(update, config.warm_up * config.online_updates)
+        loss = online.loss(batch, config.online_steps, config.beta * warm, draws)
+        optimizer.step(loss)
+        progress(config.offline_updates + update + 1, total, {"inference": loss.mean().item()})
+    online.eval()
+    watch(total, total, agent)
+    return agent
+
+
+@torch.no_grad()
+def synthesise(
+    model: VariationalModel,
+    policy: ActionHead,
+    latents: Tensor,
+    starts: Tensor,
+    horizon: int,
+    config: OfflineConfig,
+    draws: Draws,
+) -> Batch:
+    """Trials of the learned dynamics: a latent [S, B, D] a trial, and another, blind to it, for each episode's actions.
+
+    starts [S, B, E, O]: first observations of expert trials. Observations are kept within 6 standard deviations of
+    the data, where the dynamics were learned.
+    """
+    n, scaler = config.synthetic, model.inputs.scaler
+    seed = torch.arange(len(draws), device=draws.device)[:, None]
+    theta_hat = latents[seed, draws.below(latents.shape[1], n)]
+    begin = starts[seed, draws.below(starts.shape[1], n)]
+    low, high = (scaler.mean + k * scaler.std for k in (-6, 6))
+    steps: list[tuple[Tensor, Tensor, Tensor]] = []
+    for episode in range(starts.shape[2]):
+        obs, other = begin[:, :, episode], latents[seed, draws.below(latents.shape[1], n)]
+        for _ in range(horizon):
+            action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
+            uniform = draws.uniform(*action.shape[1:])
+            actions = policy.signature.actions
+            blind = (uniform * actions).floor() if actions else 2 * uniform - 1
+            action = torch.where(draws.uniform(n, 1) < config.random_share, blind, action)
+            next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
+            if not policy.signature.binary:
+                next_obs = torch.maximum(torch.minimum(next_obs, high[:, None]), low[:, None])
+            steps.append((obs, action, next_obs))
+            obs = next_obs
+    obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))
+    return Batch(obs, action, next_obs, torch.ones(len(draws), n, len(steps), device=draws.device))

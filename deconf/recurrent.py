@@ -1,0 +1,73 @@
+"""A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) and its training by likelihood: for naive_rnn and for dagger."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deconf.beliefs import GruMemory
+from deconf.equations import imitation_loss
+from deconf.nets import ActionHead, Adam, Batch, Draws, LearnedAgent, Scaler, Signature
+
+
+@dataclass(frozen=True)
+class RecurrentConfig:
+    """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
+
+    width: int = 64
+    updates: int = 2000
+    batch: int = 64
+    chunk: int = 50
+    learning_rate: float = 1e-3
+    cooled: bool = True  # the learning rate falls to 0 along a cosine
+    device: str = "cpu"
+
+
+class RecurrentAgent(LearnedAgent):
+    """Acts on the observation and on a memory of its own transitions, carried over resets."""
+
+    def __init__(self, memory: GruMemory, policy: ActionHead) -> None:
+        super().__init__(policy)
+        self.memory, self.policy = memory, policy
+
+    @staticmethod
+    def new(config: RecurrentConfig, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+        """One that knows nothing yet."""
+        memory = GruMemory(config.width, signature, obs, draws)
+        return RecurrentAgent(
+            memory, ActionHead(config.width + memory.inputs.obs_width, config.width, signature, draws)
+        )
+
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self._state = self.memory.start(self._n)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(torch.cat([self._state, self.memory.inputs.obs(obs)], -1), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        self._state = self.memory.update(self._state, step)
+
+    def features(self) -> NDArray[np.float32]:
+        return self._state.flatten(0, 1).cpu().numpy()
+
+    def clone(self, batch: Batch, label: Tensor, chunk: int, optimizer: Adam) -> list[float]:
+        """Pass through trials once, an update a chunk, the memory passed on; the loss of each.
+
+        label [S, B, T, A]: the expert's action at each step, which need not be the one taken.
+        """
+        state, losses = self.memory.start(len(batch)), []
+        for begin in range(0, batch.mask.shape[2], chunk):
+            part = batch[:, :, begin : begin + chunk]
+            states = self.memory(part, state)
+            features = torch.cat([states[:, :, :-1], self.memory.inputs.obs(part.obs)], -1)
+            log_policy = self.policy.log_prob(features, label[:, :, begin : begin + chunk])
+            loss = imitation_loss(log_policy.flatten(1), part.mask.flatten(1))
+            optimizer.step(loss)
+            state = states[:, :, -1].detach()
+            losses.append(loss.mean().item())
+        return losses
