@@ -18,7 +18,7 @@ from deconf.cloning import CloningConfig
 from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent
-from deconf.nets import Progress
+from deconf.nets import Progress, Source, Watch, no_watch
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from envs.task import Array
@@ -42,6 +42,7 @@ class Preset:
     explore_trials: int  # a round
     eval_trials: int
     query_trials: int  # a round
+    fresh: bool  # demonstrations are drawn anew for each round (deconfounded) or update (naive_rnn)
     grid: int
     deconfounded: DeconfoundedConfig
     discrete: DeconfoundedConfig
@@ -57,8 +58,10 @@ class Context:
     Seeds lie side by side: trials are in as many equal groups as there are seeds. `budget` counts what a seed used.
     """
 
-    def __init__(self, task: envs.Task, preset: Preset, seeds: Sequence[int], progress: Progress) -> None:
-        self.task, self.preset, self.seeds, self.progress = task, preset, list(seeds), progress
+    def __init__(
+        self, task: envs.Task, preset: Preset, seeds: Sequence[int], progress: Progress, watch: Watch = no_watch
+    ) -> None:
+        self.task, self.preset, self.seeds, self.progress, self.watch = task, preset, list(seeds), progress, watch
         self.expert = policy.load(task)
         self.env = envs.BatchEnv(task, preset.eval_trials * len(self.seeds))
         self.budget = {"expert_trials": 0, "exploration_trials": 0, "queries": 0}
@@ -71,6 +74,18 @@ class Context:
         seeds = [stream(DEMOS, seed) for seed in self.seeds]
         trials, _ = run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)
         return trials, env.theta.copy()
+
+    def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
+        """Fresh expert trials."""
+        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(rngs))
+        self.budget["expert_trials"] += self.preset.expert_trials
+        seeds = [stream(DEMOS, int(rng.integers(2**31))) for rng in rngs]
+        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
+
+    @property
+    def source(self) -> Source:
+        """What there is to imitate: a fixed set of trials, or fresh ones for each update."""
+        return self.demonstrate if self.preset.fresh else self.demonstrations[0]
 
     @property
     def rngs(self) -> list[np.random.Generator]:
@@ -105,23 +120,23 @@ def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent
 
 
 def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
-    trials, _ = context.demonstrations
-    return _deploy(name, deconfounded.fit(trials, context.explore, config, context.rngs, context.progress))
+    agent = deconfounded.fit(context.source, context.explore, config, context.rngs, context.progress, context.watch)
+    return _deploy(name, agent)
 
 
 def _offline(context: Context) -> dict[str, Agent]:
     trials, _ = context.demonstrations
-    agent = offline.fit(trials, context.preset.offline, context.rngs, context.progress)
+    agent = offline.fit(trials, context.preset.offline, context.rngs, context.progress, context.watch)
     return {"deconfounded_offline": agent}
 
 
 def _naive_rnn(context: Context) -> dict[str, Agent]:
-    agent = naive_rnn.fit(context.demonstrations[0], context.preset.naive, context.rngs, context.progress)
+    agent = naive_rnn.fit(context.source, context.preset.naive, context.rngs, context.progress, context.watch)
     return {"naive_rnn": agent}
 
 
 def _dagger(context: Context) -> dict[str, Agent]:
-    return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.progress)}
+    return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.progress, context.watch)}
 
 
 def _oracle(context: Context) -> dict[str, Agent]:

@@ -44,7 +44,9 @@ def parse() -> argparse.Namespace:
     parser = Parser(__doc__)
     parser.add_argument("--task", help="which task; see --list")
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
-    parser.add_argument("--preset", default="default", help=f"how much: {', '.join(PRESETS)} (default: default)")
+    parser.add_argument(
+        "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
+    )
     parser.add_argument("--methods", nargs="+", metavar="NAME", help="`all`, or some of those that --list names")
     parser.add_argument("--seeds", type=int, metavar="N", help="how many seeds; default: the preset's")
     parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")

@@ -62,12 +62,15 @@ class EvidenceBelief(Belief):
     Given theta the dynamics are Markov, so that p(theta | tau) depends on the *set* of transitions alone: log p(theta |
     tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
     sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
-    size however long the trial. Without a transition, q is the prior.
+    size however long the trial. Without a transition, q is the prior. A trial longer than those of training counts as
+    one of their length with the same mean evidence: the belief then grows no surer, but nothing is new to the network.
 
-    The evidence is whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its common
-    part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the latent
-    is ignored.
+    The evidence starts out whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its
+    common part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the
+    latent is ignored.
     """
+
+    longest: Tensor
 
     def __init__(
         self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
@@ -77,6 +80,7 @@ class EvidenceBelief(Belief):
         self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width, draws)
         self.whiten = Whitener(self.width, draws)
         self.out = mlp(2 * self.width + 1, width, 2 * latent, draws)
+        self.register_buffer("longest", torch.tensor(0.0))
 
     def _terms(self, batch: Batch) -> Tensor:
         """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
@@ -88,6 +92,8 @@ class EvidenceBelief(Belief):
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
+        if self.training:
+            self.longest.fill_(batch.mask.shape[2])
         return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 
     def start(self, n: int) -> Tensor:
@@ -97,7 +103,8 @@ class EvidenceBelief(Belief):
         return memory + self._terms(step)
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        total, count = memory[..., :-1], memory[..., -1:]
+        scale = (self.longest / memory[..., -1:]).clamp(max=1) if self.longest else 1.0
+        total, count = memory[..., :-1] * scale, memory[..., -1:] * scale
         n = 1 + count
         mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()

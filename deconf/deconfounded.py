@@ -98,6 +98,21 @@ class DeconfoundedAgent(LearnedAgent):
     def remember(self, step: Batch) -> None:
         self._memory = self.model.update(self._memory, step)
 
+    def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
+        """The imitation loss [S] on steps of expert trials; their theta_hat_H is drawn from beliefs [S, B, P]."""
+        index = batch.draw_steps(steps, draws)
+        real = batch.steps(index)
+        seed = torch.arange(len(index), device=index.device)[:, None]
+        theta_hat = self.model.sample(belief[seed, index // batch.mask.shape[2]], draws)
+        with torch.no_grad():
+            inputs = self.model.inputs.obs(real.obs)
+        return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        """The imitation loss [S] on the expert's trials, given theta_hat_H."""
+        return self.loss(batch, final_belief(self.model, batch), None, self._draws)
+
     @torch.no_grad()
     def features(self) -> NDArray[np.float32]:
         point = self.model.point(self.model.belief(self._memory))
@@ -180,15 +195,9 @@ def fit(
         progress(done, total, {"inference": loss.mean().item()})
 
     def imitate(data: Batch, belief: Tensor, optimizer: Adam) -> None:
-        """One update of eta, on steps of expert trials whose theta_hat_H is distributed as beliefs [S, B, P] say."""
+        """One update of eta."""
         nonlocal done
-        index = data.draw_steps(config.imitation_batch, draws)
-        real = data.steps(index)
-        seed = torch.arange(seeds, device=index.device)[:, None]
-        theta_hat = model.sample(belief[seed, index // data.mask.shape[2]], draws)
-        with torch.no_grad():
-            inputs = model.inputs.obs(real.obs)
-        loss = imitation_loss(policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
+        loss = agent.loss(data, belief, config.imitation_batch, draws)
         optimizer.step(loss)
         done += 1
         progress(done, total, {"imitation": loss.mean().item()})

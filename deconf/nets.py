@@ -217,28 +217,30 @@ class Embedding(Inputs):
 
 
 class Whitener(nn.Module):
-    """Features to mean 0 and standard deviation 1: by a batch's own while training, by their running means after.
+    """Features to mean 0 and standard deviation 1 on the first batch in training; the same affine map ever after.
 
-    Batch normalisation (Ioffe and Szegedy, 2015) without learned scales.
+    Data-dependent initialisation (Salimans and Kingma, 2016). Batch normalisation, whose map keeps changing with the
+    batch, does worse here: exploration and expert trials have different moments.
     """
 
     mean: Tensor
-    variance: Tensor
+    std: Tensor
+    fitted: Tensor
 
-    def __init__(self, features: int, draws: Draws, momentum: float = 0.05) -> None:
+    def __init__(self, features: int, draws: Draws) -> None:
         super().__init__()
-        self.momentum = momentum
         self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
-        self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
+        self.register_buffer("std", torch.ones(len(draws), features, device=draws.device))
+        self.register_buffer("fitted", torch.tensor(False))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """[S, ..., F], of which those count where mask [S, ...] is 1."""
-        mean, variance = self.mean, self.variance
-        if self.training:
-            mean, variance = moments(x, mask)
-            self.mean.lerp_(mean.detach(), self.momentum)
-            self.variance.lerp_(variance.detach(), self.momentum)
-        return (x - per_seed(mean, x)) * per_seed(torch.rsqrt(variance + 1e-5), x)
+        if self.training and not self.fitted:
+            mean, variance = moments(x.detach(), mask)
+            self.mean.copy_(mean)
+            self.std.copy_((variance + 1e-5).sqrt())
+            self.fitted.fill_(True)
+        return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
 
 
 class ActionHead(nn.Module):

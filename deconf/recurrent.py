@@ -62,12 +62,18 @@ class RecurrentAgent(LearnedAgent):
         """
         state, losses = self.memory.start(len(batch)), []
         for begin in range(0, batch.mask.shape[2], chunk):
-            part = batch[:, :, begin : begin + chunk]
-            states = self.memory(part, state)
-            features = torch.cat([states[:, :, :-1], self.memory.inputs.obs(part.obs)], -1)
-            log_policy = self.policy.log_prob(features, label[:, :, begin : begin + chunk])
-            loss = imitation_loss(log_policy.flatten(1), part.mask.flatten(1))
+            loss, state = self._loss(batch[:, :, begin : begin + chunk], label[:, :, begin : begin + chunk], state)
             optimizer.step(loss)
-            state = states[:, :, -1].detach()
             losses.append(loss.mean().item())
         return losses
+
+    def _loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        states = self.memory(batch, state)
+        features = torch.cat([states[:, :, :-1], self.memory.inputs.obs(batch.obs)], -1)
+        log_policy = self.policy.log_prob(features, label)
+        return imitation_loss(log_policy.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        """The imitation loss [S] on the expert's trials."""
+        return self._loss(batch, batch.action, self.memory.start(len(batch)))[0]

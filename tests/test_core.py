@@ -215,6 +215,7 @@ class TestMethods:
             explore_trials=4,
             eval_trials=4,
             query_trials=4,
+            fresh=False,
             grid=3,
             deconfounded=DeconfoundedConfig(
                 rounds=2, inference_updates=2, inference_batch=4, imitation_updates=2, final_updates=2
