@@ -1,54 +1,22 @@
-"""One (method, seed): train, evaluate, write one file. What is in the file is finished; what is not is not there."""
+"""The benchmark's job: train one method with some seeds, deploy it, and write down what came of it."""
 
 from __future__ import annotations
 
-import io
-import json
-import multiprocessing
-import os
-import signal
-import threading
 import time
-import zipfile
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from multiprocessing.queues import Queue
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 import envs
 from benchmarks import score
-from benchmarks.methods import COST, EVALUATION, LEARNED, METHODS, Context, Preset, stream
-from envs.console import write_atomically
+from benchmarks.methods import EVALUATION, LEARNED, METHODS, Context, stream
+from benchmarks.pool import Job, Ticker
 from envs.task import Array
 from experts.demos import Agent, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
-
-
-@dataclass(frozen=True)
-class Job:
-    """What to run, and the folder that its files belong in, one a seed; seeds run side by side in one program."""
-
-    task: str
-    preset: Preset
-    method: str
-    seeds: tuple[int, ...]
-    folder: Path
-
-    def file(self, seed: int) -> Path:
-        """An .npz file."""
-        return self.folder / f"{self.method}-{seed}.npz"
-
-    @property
-    def ticks(self) -> int:
-        """Of progress: in proportion to how long a job takes."""
-        return 100 * COST.get(self.method, 1) * len(self.seeds)
 
 
 class Recorder(Agent):
@@ -95,58 +63,35 @@ class Recorder(Agent):
         self.agent.observe(obs, action, next_obs, alive)
 
 
-_ticks: Queue[int]  # of this worker process, to the main one
+class BenchmarkJob(Job):
+    """Train and evaluate one method with some seeds."""
 
+    def run(self) -> str:
+        start, tick = time.time(), Ticker(self)
+        curve: dict[str, list[tuple[int, float]]] = {}
 
-def _die_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+        def progress(done: int, total: int, losses: dict[str, float]) -> None:
+            tick(0.8 * done / total)
+            if done % max(total // 400, 1) == 0:
+                for kind, loss in losses.items():
+                    curve.setdefault(kind, []).append((done, loss))
 
-
-def start_worker(ticks: Queue[int]) -> None:
-    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
-    global _ticks
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    _ticks = ticks
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def run_job(job: Job) -> str:
-    """Train and evaluate one method with some seeds, and write their files; returns a line that says how it went."""
-    start, told = time.time(), 0
-    curve: dict[str, list[tuple[int, float]]] = {}
-
-    def progress(done: int, total: int, losses: dict[str, float]) -> None:
-        nonlocal told
-        if (now := int(0.8 * job.ticks * done / total)) > told:
-            _ticks.put(now - told)
-            told = now
-        if done % max(total // 400, 1) == 0:
-            for kind, loss in losses.items():
-                curve.setdefault(kind, []).append((done, loss))
-
-    task = envs.get(job.task)
-    context = Context(task, job.preset, job.seeds, progress)
-    agents = METHODS[job.method](context)
-    trained = time.time() - start
-    found = {name: evaluate(context, agent, job.method in LEARNED) for name, agent in agents.items()}
-    meta = {"agents": list(agents), "curve": curve, "budget": context.budget, "span": (start, time.time())}
-    for i, seed in enumerate(job.seeds):
-        rows = slice(i * job.preset.eval_trials, (i + 1) * job.preset.eval_trials)
-        arrays: dict[str, Any] = {}
-        for name, (per_trial, probes, clip) in found.items():
-            arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
-            arrays[f"{name}/probe"] = probes[i]
-            if seed == 0 and name in CLIPPED:
-                arrays.update({f"{name}/{key}": value for key, value in clip.items()})
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, theta=context.env.theta[rows], meta=np.array(json.dumps(meta)), **arrays)
-        write_atomically(job.file(seed), buffer.getvalue())
-    _ticks.put(job.ticks - told)
-    return f"trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
+        context = Context(envs.get(self.task), self.preset, self.seeds, progress)
+        agents = METHODS[self.method](context)
+        trained = time.time() - start
+        found = {name: evaluate(context, agent, self.method in LEARNED) for name, agent in agents.items()}
+        meta = {"agents": list(agents), "curve": curve, "budget": context.budget, "span": (start, time.time())}
+        for i, seed in enumerate(self.seeds):
+            rows = slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
+            arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
+            for name, (per_trial, probes, clip) in found.items():
+                arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
+                arrays[f"{name}/probe"] = probes[i]
+                if seed == 0 and name in CLIPPED:
+                    arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+            self.save(seed, arrays, meta)
+        tick(1)
+        return f"trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
 
 
 def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, Array], Array, dict[str, Array]]:
@@ -164,13 +109,3 @@ def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, A
     probes = np.array([[score.probe(known[rows], theta[rows]) for known in features] for rows in groups])
     clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
     return {"returns": returns, "objective": objective}, probes, clip
-
-
-def load_job(job: Job, seed: int) -> dict[str, Any] | None:
-    """What a finished job wrote of a seed: arrays, and `meta` decoded. None if its file is missing or damaged."""
-    try:
-        with np.load(job.file(seed), allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}
-        return {**arrays, "meta": json.loads(str(arrays["meta"]))}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-        return None

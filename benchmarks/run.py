@@ -11,15 +11,10 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-import json
-import multiprocessing
 import os
 import platform
-import signal
 import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -29,11 +24,11 @@ import torch
 
 import envs
 from benchmarks import report, score
-from benchmarks.jobs import CLIPPED, Job, load_job, run_job, start_worker
-from benchmarks.methods import LEARNED, METHODS, REFERENCES, Preset
+from benchmarks.jobs import CLIPPED, BenchmarkJob
+from benchmarks.methods import METHODS, REFERENCES, Preset
+from benchmarks.pool import Finished, prepare, run_all, worked
 from benchmarks.presets import DEFAULT_METHODS, PRESETS, preset
-from envs.console import Parser, Progress, check_folder, run_command, write_atomically, write_json
-from envs.physics import cores
+from envs.console import Parser, run_command, write_atomically, write_json
 from experts import policy
 
 LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
@@ -55,6 +50,26 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
+def check_device(device: str) -> None:
+    """Raises InputError if torch cannot use it here."""
+    try:
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise envs.InputError(f"--device {device} cannot be used here; cpu always can") from None
+
+
+def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
+    """What a run must agree in for its jobs to be kept."""
+    return {
+        "task": task.name,
+        "task_version": task.version,
+        "preset": name,
+        "settings": asdict(settings),
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "expert": policy.fingerprint(task),
+    }
+
+
 def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
     """The task and methods asked for. Raises InputError for anything that cannot be run."""
     if args.task is None:
@@ -68,86 +83,9 @@ def check(args: argparse.Namespace) -> tuple[envs.Task, list[str]]:
             raise envs.closest("method", name, list(METHODS))
     if args.seeds is not None and args.seeds < 1:
         raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
-    try:
-        torch.zeros(1, device=args.device).item()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
+    check_device(args.device)
     policy.load(task)
     return task, [name for name in METHODS if name in {*methods, *REFERENCES}]
-
-
-def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
-    """Make the output folder, or see that what it holds can be gone on with."""
-    check_folder(folder)
-    check_folder(folder / "jobs")
-    file = folder / "settings.json"
-    if not file.exists():
-        if any((folder / "jobs").iterdir()):
-            raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
-        write_json(file, settings)
-    elif not resume:
-        raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
-    else:
-        try:
-            before = json.loads(file.read_text())
-        except ValueError:
-            raise envs.InputError(f"{file} is damaged; give another --out") from None
-        if before != json.loads(json.dumps(settings)):
-            raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
-
-
-Finished = list[tuple[str, int, dict[str, Any]]]
-"""Method, seed, and what its job wrote."""
-
-
-def _listed(seeds: tuple[int, ...]) -> str:
-    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(map(str, seeds))}"
-
-
-def make_jobs(
-    task: envs.Task, settings: Preset, methods: list[str], seeds: int, device: str, folder: Path
-) -> list[Job]:
-    """What is left to do: of each method the seeds without a file, in groups; references have nothing to share."""
-    jobs = []
-    for method in methods:
-        every = Job(task.name, settings, method, tuple(range(seeds)), folder)
-        left = [seed for seed in every.seeds if load_job(every, seed) is None]
-        groups = len(left) if method not in LEARNED else min(cores(), len(left)) if device == "cpu" else 1
-        jobs += [replace(every, seeds=tuple(map(int, part))) for part in np.array_split(left, groups) if len(part)]
-    return jobs
-
-
-def run_jobs(jobs: list[Job], label: str) -> None:
-    """Run jobs side by side, one core each, longest first."""
-    if not jobs:
-        return
-    context = multiprocessing.get_context("spawn")
-    workers = min(cores(), len(jobs))
-    os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
-    progress = Progress(sum(job.ticks for job in jobs), label)
-    ticks = context.Queue()
-    with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
-        heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for workers, which are made now, to inherit
-        futures = {pool.submit(run_job, job): job for job in jobs}
-        signal.signal(signal.SIGINT, heard)
-        try:
-            waiting = set(futures)
-            while waiting:
-                while not ticks.empty():
-                    progress.update(ticks.get())
-                for future in [f for f in waiting if f.done()]:
-                    waiting.remove(future)
-                    job = futures[future]
-                    progress.line(f"{job.method}, {_listed(job.seeds)}: {future.result()}")
-                time.sleep(0.1)
-        except BrokenProcessPool:
-            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
-        except BaseException:
-            for process in multiprocessing.active_children():
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    progress.close()
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
@@ -168,15 +106,6 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
         report.video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except (envs.InputError, OSError, RuntimeError) as error:  # no GL, or no encoder: the run is good all the same
         print(f"no video: {error}")
-
-
-def worked(spans: list[tuple[float, float]]) -> float:
-    """Seconds covered by spans of time: those of this command, and of the jobs that an earlier one finished."""
-    total, until = 0.0, -np.inf
-    for start, end in sorted(spans):
-        total += max(0.0, end - max(start, until))
-        until = max(until, end)
-    return total
 
 
 def rows(task: envs.Task, results: dict[str, Any], finished: Finished) -> str:
@@ -209,32 +138,21 @@ def main() -> None:
     settings = preset(args.preset, task, args.device)
     seeds = args.seeds or settings.seeds
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
-    about = {
-        "task": task.name,
-        "task_version": task.version,
-        "preset": args.preset,
-        "settings": asdict(settings),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-        "expert": policy.fingerprint(task),
-    }
-    prepare(folder, about, args.resume)
+    described = about(task, args.preset, settings)
+    prepare(folder, described, args.resume)
     start = time.time()
-    left = make_jobs(task, settings, methods, seeds, args.device, folder / "jobs")
-    run_jobs(left, f"{task.name}, {args.preset}")
-    finished = []
-    for method in methods:
-        every = Job(task.name, settings, method, tuple(range(seeds)), folder / "jobs")
-        finished += [(method, seed, data) for seed in every.seeds if (data := load_job(every, seed)) is not None]
+    label = f"{task.name}, {args.preset}"
+    finished, resumed = run_all(BenchmarkJob, task.name, settings, methods, seeds, args.device, folder / "jobs", label)
     results = {
         "task": task.name,
         "task_version": task.version,
         "preset": args.preset,
         "seeds": list(range(seeds)),
         "eval_trials": settings.eval_trials,
-        "versions": about["versions"],
+        "versions": described["versions"],
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
-        "wall_s": round(worked([(start, time.time()), *(tuple(data["meta"]["span"]) for *_, data in finished)]), 1),
-        "resumed": len(finished) - sum(len(job.seeds) for job in left),
+        "wall_s": round(worked(start, finished), 1),
+        "resumed": resumed,
         "methods": score.summarise(finished, task.episodes),
     }
     write_json(folder / "results.json", results)

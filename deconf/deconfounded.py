@@ -193,6 +193,7 @@ def fit(
         inference.step(loss)
         done, inferred = done + 1, inferred + 1
         progress(done, total, {"inference": loss.mean().item()})
+        watch(done, total, agent)
 
     def imitate(data: Batch, belief: Tensor, optimizer: Adam) -> None:
         """One update of eta."""
@@ -201,6 +202,7 @@ def fit(
         optimizer.step(loss)
         done += 1
         progress(done, total, {"imitation": loss.mean().item()})
+        watch(done, total, agent)
 
     latents: Tensor | None = None
     for _ in range(config.rounds):
@@ -220,11 +222,9 @@ def fit(
             model.set_prior(belief, draws)
         for _ in range(config.imitation_updates):
             imitate(expert, belief, imitation)
-        watch(done, total, agent)
     final = Adam([policy], config.imitation_rate, config.final_updates)
     for _ in range(config.final_updates):
         imitate(expert, belief, final)
-    watch(done, total, agent)
     return agent
 
 

@@ -217,30 +217,30 @@ class Embedding(Inputs):
 
 
 class Whitener(nn.Module):
-    """Features to mean 0 and standard deviation 1 on the first batch in training; the same affine map ever after.
+    """Features to mean 0 and standard deviation 1: by each batch's own in the first updates, by running means after.
 
-    Data-dependent initialisation (Salimans and Kingma, 2016). Batch normalisation, whose map keeps changing with the
-    batch, does worse here: exploration and expert trials have different moments.
+    Batch normalisation (Ioffe and Szegedy, 2015) that ends early: it is there to get training off the ground. For good,
+    it would do harm, since exploration and expert trials have different moments.
     """
 
     mean: Tensor
-    std: Tensor
-    fitted: Tensor
+    variance: Tensor
 
-    def __init__(self, features: int, draws: Draws) -> None:
+    def __init__(self, features: int, draws: Draws, updates: int = 300, momentum: float = 0.05) -> None:
         super().__init__()
+        self.left, self.momentum = updates, momentum
         self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
-        self.register_buffer("std", torch.ones(len(draws), features, device=draws.device))
-        self.register_buffer("fitted", torch.tensor(False))
+        self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """[S, ..., F], of which those count where mask [S, ...] is 1."""
-        if self.training and not self.fitted:
-            mean, variance = moments(x.detach(), mask)
-            self.mean.copy_(mean)
-            self.std.copy_((variance + 1e-5).sqrt())
-            self.fitted.fill_(True)
-        return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
+        mean, variance = self.mean, self.variance
+        if self.training and self.left > 0:
+            self.left -= 1
+            mean, variance = moments(x, mask)
+            self.mean.lerp_(mean.detach(), self.momentum)
+            self.variance.lerp_(variance.detach(), self.momentum)
+        return (x - per_seed(mean, x)) * per_seed(torch.rsqrt(variance + 1e-5), x)
 
 
 class ActionHead(nn.Module):

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import certify, run, score
+from benchmarks import certify, pool, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -94,7 +94,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
 
 
 def test_time_worked_counts_overlaps_once() -> None:
-    assert run.worked([(5, 6), (0, 2), (1, 3)]) == 4
+    assert pool.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
 
 @pytest.mark.parametrize("backend", ["off", "nonsense"])

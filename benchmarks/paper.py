@@ -1,0 +1,229 @@
+"""Figures 2 and 3 of the paper, on its bandit: `python benchmarks/paper.py`
+
+Figure 2: roll-outs of expert, conditional and interventional policy. Figure 3: P(best arm) on expert trajectories (a)
+and online (b), imitation loss (c) and best-arm pulls (d) during training; learned agents against the exact policies.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import envs
+from benchmarks.figures import figure_2, figure_3
+from benchmarks.methods import EVALUATION, METHODS, Context, stream
+from benchmarks.pool import Finished, Job, Ticker, prepare, run_all, worked
+from benchmarks.presets import PRESETS, preset
+from benchmarks.run import about, check_device
+from deconf.deconfounded import DeconfoundedAgent
+from deconf.equations import posterior_policy
+from deconf.exact import ExactAgent
+from deconf.nets import Batch
+from deconf.recurrent import RecurrentAgent
+from envs.console import Parser, run_command, write_atomically, write_json
+from envs.task import Array
+from experts import policy
+from experts.demos import Agent, ExpertAgent, run_trials
+
+SHOWN = ("naive_rnn", "deconfounded")  # in Figure 3
+LEARNERS = (*SHOWN, "deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
+TARGET = {"naive_rnn": "conditional"}  # whom a method should match; interventional, if not named
+POINTS = 40  # evaluations during training
+
+
+class Onlooker(Agent):
+    """Sees what the expert does, and notes what it would have done itself: `would` holds [N, A] a step."""
+
+    def __init__(self, agent: Agent, expert: ExpertAgent) -> None:
+        self.agent, self.expert = agent, expert
+
+    def begin(self, n: int) -> None:
+        self.agent.begin(n)
+        self.would: list[Array] = []
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self.agent.reset(rngs)
+        self.expert.reset([np.random.default_rng(rng.integers(2**63)) for rng in rngs])
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        self.would.append(self.agent.act(obs))
+        return self.expert.act(obs)
+
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.agent.observe(obs, action, next_obs, alive)
+
+
+class Known(ExactAgent):
+    """An exact policy that notes its action probabilities at each step, Eq. (2), (5): `policy` [N, K], `best` [N]."""
+
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self.policy: list[Array] = []
+        self.best: list[Array] = []
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        arms = self.grid.env.task.expert_probs(obs[: len(self.grid.theta)], self.grid.theta)
+        assert arms is not None
+        self.policy.append(posterior_policy(self.log_belief, arms))
+        self.best.append(np.take_along_axis(self.policy[-1], self.env.theta.astype(int), -1)[:, 0])
+        return super().act(obs)
+
+
+class FigureJob(Job):
+    """Train a method with some seeds, watched as it learns."""
+
+    def run(self) -> str:
+        start, tick = time.time(), Ticker(self)
+        task, n = envs.get(self.task), self.preset.eval_trials
+        few = min(n, 500)
+        seen: dict[str, list[Any]] = {"at": [], "loss": [], "pulls": []}
+
+        def watch(done: int, total: int, agent: Agent) -> None:
+            if done == total or done >= total * len(seen["at"]) / POINTS:
+                seen["at"].append(done)
+                seen["pulls"].append(online(context, agent, few)[1].reshape(len(self.seeds), -1).mean(1))
+                assert isinstance(agent, RecurrentAgent | DeconfoundedAgent)
+                seen["loss"].append(agent.held_out_loss(held_out).cpu().numpy())
+
+        context = Context(task, self.preset, self.seeds, lambda done, total, _: tick(0.95 * done / total), watch)
+        env = envs.BatchEnv(task, few * len(self.seeds))
+        seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
+        trials, _ = run_trials(env, ExpertAgent(env, context.expert), 1, seeds)
+        held_out = Batch.of(trials, len(seeds), self.preset.naive.device)
+        agent = METHODS[self.method](context)[self.method]
+        trained = time.time() - start
+        best, pulls = online(context, agent, n)
+        env = envs.BatchEnv(task, n * len(self.seeds))
+        onlooker = Onlooker(agent, ExpertAgent(env, context.expert))
+        run_trials(env, onlooker, 1, [stream(EVALUATION, seed) for seed in self.seeds])
+        would = np.concatenate(onlooker.would, -1) == env.theta
+        meta = {"span": (start, time.time()), "train_s": trained, "budget": context.budget}
+        for i, seed in enumerate(self.seeds):
+            rows = slice(i * n, (i + 1) * n)
+            arrays = {"online": best[rows].mean(0), "on_expert": would[rows].mean(0), "pulls": pulls[rows].mean()}
+            arrays |= {f"{key}_curve": np.array(seen[key])[:, i] for key in ("loss", "pulls")}
+            self.save(seed, {"at": np.array(seen["at"]), **arrays}, meta)
+        tick(1)
+        return f"{pulls.mean():.1f} best-arm pulls, trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
+
+
+def online(context: Context, agent: Agent, n: int) -> tuple[NDArray[np.bool_], Array]:
+    """Deploy in n trials a seed: whether each step's arm was the best [S n, T], and pulls of it [S n]."""
+    env = envs.BatchEnv(context.task, n * len(context.seeds))
+    trials, returns = run_trials(env, agent, 1, [stream(EVALUATION, seed) for seed in context.seeds])
+    return trials.action[:, 0, :, 0] == env.theta, returns[:, 0]
+
+
+def exact(task: envs.Task, n: int = 40_000) -> dict[str, dict[str, Any]]:
+    """Expert and exact policies: P(best arm) online and on expert trajectories [T], pulls, imitation loss."""
+    expert, found = policy.load(task), {}
+    for name in ("interventional", "conditional"):
+        env = envs.BatchEnv(task, n)
+        agent = Known(env, expert, name == "conditional")
+        _, returns = run_trials(env, agent, 1, seed=0)
+        found[name] = {"online": np.mean(agent.best, 1), "pulls": float(returns.mean())}
+        trials, _ = run_trials(env, Onlooker(agent, ExpertAgent(env, expert)), 1, seed=1)
+        arms = np.take_along_axis(np.stack(agent.policy, 1), trials.action[:, 0].astype(int), -1)
+        found[name] |= {"on_expert": np.mean(agent.best, 1), "loss": float(-np.log(arms).mean())}
+    probs = task.expert_probs(np.zeros((1, 1)), np.zeros((1, 1)))
+    assert probs is not None
+    always = np.full(task.horizon, probs.max())
+    loss = float(-(probs * np.log(probs)).sum())
+    found["expert"] = {"online": always, "on_expert": always, "pulls": float(always.sum()), "loss": loss}
+    return found
+
+
+def summarise(finished: Finished, references: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Pulls of each method and how far its curves are from the exact policy it should match."""
+    found = {}
+    for method in dict.fromkeys(name for name, *_ in finished):
+        data = [entry for name, _, entry in finished if name == method]
+        pulls, curve = np.array([float(entry["pulls"]) for entry in data]), np.mean([e["online"] for e in data], 0)
+        target = references[TARGET.get(method, "interventional")]
+        found[method] = {
+            "pulls": pulls.round(3).tolist(),
+            "pulls_mean": round(float(pulls.mean()), 3),
+            "pulls_se": round(float(pulls.std(ddof=1) / len(pulls) ** 0.5), 3) if len(pulls) > 1 else None,
+            "target": TARGET.get(method, "interventional"),
+            "target_pulls": round(target["pulls"], 3),
+            "max_gap_online": round(float(np.abs(curve - target["online"]).max()), 4),
+            "loss": round(float(np.mean([entry["loss_curve"][-1] for entry in data])), 4),
+            "online": curve.round(4).tolist(),
+            "on_expert": np.mean([entry["on_expert"] for entry in data], 0).round(4).tolist(),
+            "budget": data[0]["meta"]["budget"],
+            "train_s": round(float(np.mean([entry["meta"]["train_s"] for entry in data])), 1),
+        }
+    return found
+
+
+def table(methods: dict[str, Any]) -> str:
+    """One row a method."""
+    lines = ["method                  best-arm pulls   exact   max gap online   budget (a seed)"]
+    for name, entry in methods.items():
+        error = "" if entry["pulls_se"] is None else f" +- {entry['pulls_se']:.2f}"
+        budget = ", ".join(f"{value:,} {key.replace('_', ' ')}" for key, value in entry["budget"].items() if value)
+        pulls = f"{entry['pulls_mean']:.2f}{error}"
+        lines.append(
+            f"{name:23} {pulls:16} {entry['target_pulls']:.2f}   {entry['max_gap_online']:.3f}            {budget}"
+        )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--preset", default="default", help="; ".join(f"{k}: {text}" for k, text in PRESETS.items()))
+    parser.add_argument("--methods", nargs="+", default=list(SHOWN), metavar="NAME", help=f"of {', '.join(LEARNERS)}")
+    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many seeds (default: 10)")
+    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    parser.add_argument("--out", type=Path, help="output folder; default: results/paper-<preset>")
+    parser.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    args = parser.parse_args()
+    if args.preset not in PRESETS:
+        raise envs.closest("preset", args.preset, list(PRESETS))
+    for name in args.methods:
+        if name not in LEARNERS:
+            raise envs.closest("method", name, list(LEARNERS))
+    if args.seeds < 1:
+        raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
+    check_device(args.device)
+    task = envs.get("bandit")
+    settings = preset(args.preset, task, args.device)
+    folder = args.out or Path("results") / f"paper-{args.preset}"
+    described = about(task, args.preset, settings)
+    prepare(folder, described, args.resume)
+    start, label = time.time(), f"Figure 3, {args.preset}"
+    finished, resumed = run_all(
+        FigureJob, task.name, settings, args.methods, args.seeds, args.device, folder / "jobs", label
+    )
+    references = exact(task)
+    results = {
+        "preset": args.preset,
+        "seeds": args.seeds,
+        "eval_trials": settings.eval_trials,
+        "versions": described["versions"],
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
+        "wall_s": round(worked(start, finished), 1),
+        "resumed": resumed,
+        "exact": {name: {"pulls": round(e["pulls"], 3), "loss": round(e["loss"], 4)} for name, e in references.items()},
+        "methods": summarise(finished, references),
+    }
+    write_json(folder / "results.json", results)
+    rows = [f"{name},{seed},{float(entry['pulls']):.4f}" for name, seed, entry in finished]
+    write_atomically(folder / "rows.csv", "\n".join(["method,seed,pulls", *rows]) + "\n")
+    figure_2(task, folder / "figure2.png")
+    figure_3([entry for entry in finished if entry[0] in SHOWN], references, folder / "figure3.png")
+    print(f"\n{table(results['methods'])}\n\n{results['wall_s']:.0f} s -> {folder / 'figure3.png'}")
+
+
+if __name__ == "__main__":
+    run_command(main, "what was finished is kept, and --resume goes on")

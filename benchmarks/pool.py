@@ -1,0 +1,211 @@
+"""Jobs, one (method, some seeds) each, side by side in processes. What is in a job's files is finished, and kept."""
+
+from __future__ import annotations
+
+import io
+import json
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import zipfile
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from multiprocessing.queues import Queue
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import envs
+from benchmarks.methods import COST, LEARNED, Preset
+from envs.console import Progress, check_folder, write_atomically, write_json
+from envs.physics import cores
+
+
+@dataclass(frozen=True)
+class Job(ABC):
+    """What to run, and the folder that its files belong in, one a seed; seeds run side by side in one program."""
+
+    task: str
+    preset: Preset
+    method: str
+    seeds: tuple[int, ...]
+    folder: Path
+
+    @abstractmethod
+    def run(self) -> str:
+        """Do it, in a worker process, and write the files; returns a line that says how it went."""
+
+    def file(self, seed: int) -> Path:
+        """An .npz file."""
+        return self.folder / f"{self.method}-{seed}.npz"
+
+    @property
+    def ticks(self) -> int:
+        """Of progress: in proportion to how long a job takes."""
+        return 100 * COST.get(self.method, 1) * len(self.seeds)
+
+    def save(self, seed: int, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
+        """Write the file of a seed, atomically; meta holds at least `span`, when work began and ended."""
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)
+        write_atomically(self.file(seed), buffer.getvalue())
+
+    def load(self, seed: int) -> dict[str, Any] | None:
+        """What was written of a seed: arrays, and `meta` decoded. None if its file is missing or damaged."""
+        try:
+            with np.load(self.file(seed), allow_pickle=False) as data:
+                arrays = {key: data[key] for key in data.files}
+            return {**arrays, "meta": json.loads(str(arrays["meta"]))}
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+            return None
+
+
+_ticks: Queue[int]  # of this worker process, to the main one
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def start_worker(ticks: Queue[int]) -> None:
+    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
+    global _ticks
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    _ticks = ticks
+    torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+class Ticker:
+    """Tells the main process how far a job has come."""
+
+    def __init__(self, job: Job) -> None:
+        self.total, self.told = job.ticks, 0
+
+    def __call__(self, share: float) -> None:
+        """share: of the job, from 0 to 1, that is done."""
+        if (now := int(self.total * share)) > self.told:
+            _ticks.put(now - self.told)
+            self.told = now
+
+
+def _run(job: Job) -> str:
+    return job.run()
+
+
+Finished = list[tuple[str, int, dict[str, Any]]]
+"""Method, seed, and what its job wrote."""
+
+
+def run_all(
+    kind: type[Job],
+    task: str,
+    preset: Preset,
+    methods: Sequence[str],
+    seeds: int,
+    device: str,
+    folder: Path,
+    label: str,
+) -> tuple[Finished, int]:
+    """Run what has no file yet; returns all that is written now, and how many files were there before."""
+    every = [kind(task, preset, method, tuple(range(seeds)), folder) for method in methods]
+    left = [[seed for seed in job.seeds if job.load(seed) is None] for job in every]
+    parts = [
+        replace(job, seeds=part)
+        for job, missing in zip(every, left, strict=True)
+        for part in groups(job.method, missing, device)
+    ]
+    run_jobs(parts, label)
+    finished = [(job.method, seed, data) for job in every for seed in job.seeds if (data := job.load(seed)) is not None]
+    return finished, len(finished) - sum(map(len, left))
+
+
+def groups(method: str, left: list[int], device: str) -> list[tuple[int, ...]]:
+    """Seeds to run side by side: as many groups as cores, or one on a GPU; references have nothing to share."""
+    if not left:
+        return []
+    n = len(left) if method not in LEARNED else min(cores(), len(left)) if device == "cpu" else 1
+    return [tuple(map(int, part)) for part in np.array_split(left, n)]
+
+
+def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
+    """Make the output folder, or see that what it holds can be gone on with."""
+    check_folder(folder)
+    check_folder(folder / "jobs")
+    file = folder / "settings.json"
+    if not file.exists():
+        if any((folder / "jobs").iterdir()):
+            raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
+        write_json(file, settings)
+    elif not resume:
+        raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
+    else:
+        try:
+            before = json.loads(file.read_text())
+        except ValueError:
+            raise envs.InputError(f"{file} is damaged; give another --out") from None
+        if before != json.loads(json.dumps(settings)):
+            raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
+
+
+def run_jobs(jobs: list[Job], label: str) -> None:
+    """Run jobs side by side, one core each, longest first."""
+    if not jobs:
+        return
+    context = multiprocessing.get_context("spawn")
+    workers = min(cores(), len(jobs))
+    os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
+    progress = Progress(sum(job.ticks for job in jobs), label)
+    ticks = context.Queue()
+    with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
+        heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for workers, which are made now, to inherit
+        futures = {pool.submit(_run, job): job for job in jobs}
+        signal.signal(signal.SIGINT, heard)
+        try:
+            waiting = set(futures)
+            while waiting:
+                while not ticks.empty():
+                    progress.update(ticks.get())
+                for future in [f for f in waiting if f.done()]:
+                    waiting.remove(future)
+                    job = futures[future]
+                    progress.line(f"{job.method}, {listed(job.seeds)}: {future.result()}")
+                time.sleep(0.1)
+        except BrokenProcessPool:
+            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+        except BaseException:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    progress.close()
+
+
+def worked(start: float, finished: Finished) -> float:
+    """Seconds that this command, begun at `start`, and the jobs of those before it took; what overlaps counts once."""
+    return covered([(start, time.time()), *(tuple(data["meta"]["span"]) for *_, data in finished)])
+
+
+def covered(spans: list[tuple[float, float]]) -> float:
+    """Length of the union of spans of time."""
+    total, until = 0.0, -np.inf
+    for start, end in sorted(spans):
+        total += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return total
+
+
+def listed(seeds: tuple[int, ...]) -> str:
+    """seed 0, or seeds 0, 1, 2."""
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(map(str, seeds))}"
