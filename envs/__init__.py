@@ -20,6 +20,8 @@ import gymnasium
 from envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from envs.bandit import Bandit
 from envs.batch import BatchEnv
+from envs.forked_path import ForkedPath
+from envs.hidden_goal import HiddenGoal
 from envs.physics import MujocoTask
 from envs.slippery_cartpole import SlipperyCartpole
 from envs.task import InputError, Latent, Task
@@ -40,7 +42,9 @@ __all__ = [
     "names",
 ]
 
-TASKS: dict[str, type[Task]] = {cls.name: cls for cls in (Bandit, TiltedCartpole, SlipperyCartpole)}
+TASKS: dict[str, type[Task]] = {
+    cls.name: cls for cls in (Bandit, TiltedCartpole, SlipperyCartpole, HiddenGoal, ForkedPath)
+}
 
 
 def names() -> list[str]:

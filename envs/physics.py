@@ -26,6 +26,9 @@ class Edit(Protocol):
     def body_tilt(self, name: str, angle: float) -> None:
         """Turn a body about its parent's y axis; rad."""
 
+    def body_shift(self, name: str, x: float) -> None:
+        """Set a body's x in its parent's frame; m."""
+
     def body_mass(self, name: str, scale: float) -> None:
         """Scale a body's mass and inertia."""
 
@@ -57,6 +60,9 @@ class ModelEdit:
     def body_tilt(self, name: str, angle: float) -> None:
         self.model.body(name).quat[:] = _tilt(angle)
 
+    def body_shift(self, name: str, x: float) -> None:
+        self.model.body(name).pos[0] = x
+
     def body_mass(self, name: str, scale: float) -> None:
         self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
         self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
@@ -77,6 +83,9 @@ class SpecEdit:
 
     def body_tilt(self, name: str, angle: float) -> None:
         self.spec.body(name).quat = _tilt(angle)
+
+    def body_shift(self, name: str, x: float) -> None:
+        self.spec.body(name).pos[0] = x
 
     def body_mass(self, name: str, scale: float) -> None:
         for geom in self.spec.body(name).geoms:

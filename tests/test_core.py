@@ -16,7 +16,16 @@ from deconf import cloning, deconfounded, naive_rnn
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief
 from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
-from deconf.equations import gaussian_kl, imitation_loss, inference_loss, reparametrise
+from deconf.equations import (
+    gaussian_kl,
+    imitation_loss,
+    imitation_objective,
+    inference_loss,
+    marginal_loss,
+    offline_loss,
+    posterior_policy,
+    reparametrise,
+)
 from deconf.exact import ExactAgent
 from deconf.nets import Batch, Draws, Scaler, Signature, no_progress
 from deconf.offline import OfflineConfig
@@ -46,10 +55,34 @@ class TestEquations:
         assert gaussian_kl(ones, 2 * ones, 0 * ones, ones).item() == pytest.approx(2 - np.log(2))
         assert gaussian_kl(3 * ones, 2 * ones, 3 * ones, 2 * ones).item() == pytest.approx(0)
 
+    def test_objective(self) -> None:
+        """Eq. (1): -1 - 2, the third step came after the end."""
+        taken = np.array([True, True, False])
+        assert imitation_objective(np.array([-1.0, -2.0, -4.0]), taken) == -3
+
+    def test_posterior_policy(self) -> None:
+        """Eq. (2): half of (.6, .4) and half of (.2, .8)."""
+        policy_ = posterior_policy(np.log([[0.5, 0.5]]), np.array([[0.6, 0.4], [0.2, 0.8]]))
+        np.testing.assert_allclose(policy_, [[0.4, 0.6]])
+
+    def test_offline_loss(self) -> None:
+        """Eq. (7): two trajectories of (-1 - 2) + (-3 - 4) and (-1 - 1), KL 5 and 7, beta .5: (12.5 + 5.5) / 2."""
+        log_next, log_policy = torch.tensor([[-1.0, -3.0], [-1.0, -9.0]]), torch.tensor([[-2.0, -4.0], [-1.0, -9.0]])
+        mask, kl = torch.tensor([[1.0, 1.0], [1.0, 0.0]]), torch.tensor([5.0, 7.0])
+        assert offline_loss(log_next, log_policy, kl, 0.5, mask).item() == pytest.approx(9)
+
+    def test_marginal_loss(self) -> None:
+        """Footnote 4: .25 * .5 * .5 + .75 * .2 * .1 of one trajectory of two steps; the padding counts for nothing."""
+        log_next = torch.tensor([[[0.5, 0.2], [0.5, 0.1], [0.3, 0.3]]]).log()
+        loss = marginal_loss(torch.tensor([0.25, 0.75]).log(), log_next, torch.tensor([[1.0, 1.0, 0.0]]))
+        assert loss.item() == pytest.approx(-np.log(0.25 * 0.25 + 0.75 * 0.02) / 2)
+
     def test_losses(self) -> None:
         """Eq. (6) of log p = -1, -3 and KL = 10, 20 with beta .1: -((-1 - 1) + (-3 - 2)) / 2 = 3.5."""
         loss = inference_loss(torch.tensor([-1.0, -3.0]), torch.tensor([10.0, 20.0]), 0.1, torch.ones(2))
         assert loss.item() == pytest.approx(3.5)
+        half = inference_loss(torch.tensor([-1.0, -3.0]), torch.tensor([10.0, 20.0]), 0.1, torch.tensor([1.0, 0.0]))
+        assert half.item() == pytest.approx(2)
         assert imitation_loss(torch.tensor([-1.0, -3.0]), torch.ones(2)).item() == pytest.approx(2)
 
     def test_reparametrise(self) -> None:

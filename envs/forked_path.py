@@ -1,0 +1,31 @@
+"""A puck at a fork: the goal is left or right, and only a bump where no expert ever goes tells which.
+
+Tier 3. The experts part at once, and along their ways the dynamics are the same under either theta: nothing can be
+inferred from expert trajectories, and Tier 2 clones a mixture. Who does not know which way runs up the middle, into a
+soft bump that stands a little off, on the side away from the goal: its push gives theta away. An imitator that is told
+what the expert would do there (`dagger`) learns to read it.
+
+Latent: side, 0 is left and 1 is right. Noise and reward as in `Puck`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from envs.physics import Edit
+from envs.puck import Puck
+from envs.task import Array, Latent
+
+
+class ForkedPath(Puck):
+    """Goals at (-1, .8) and (1, .8) m; the bump at (.08, .8) or (-.08, .8)."""
+
+    name = "forked_path"
+    tier = 3
+    latents = (Latent("side", "", 0, 1, "categorical"),)
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        edit.body_shift("bump", 0.08 - 0.16 * float(theta[0]))
+
+    def goal(self, theta: Array) -> Array:
+        return np.stack([2 * theta[:, 0] - 1, np.full(len(theta), 0.8)], -1)

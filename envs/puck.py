@@ -1,0 +1,39 @@
+"""What the puck tasks share: a puck on a plane, pushed along x and y under process noise, is to reach a hidden goal."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import numpy as np
+from gymnasium import spaces
+
+from envs.physics import MujocoTask
+from envs.task import Array
+
+
+class Puck(MujocoTask):
+    """Joints `x` and `y` (m); action: the push along each, in units of the motors' gear."""
+
+    horizon = 100
+    expert_noise = 0.02
+    process_noise = {"x": (0.004, 0.05), "y": (0.004, 0.05)}
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation = {"x": (-4, 4), "y": (-4, 4), "x_velocity": (-10, 10), "y_velocity": (-10, 10)}
+
+    @abstractmethod
+    def goal(self, theta: Array) -> Array:
+        """Where to go [N, 2], m."""
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        x, y = rng.uniform(-0.03, 0.03, 2)
+        return self.state(x=(x, 0), y=(y, 0))
+
+    def observe(self, state: Array) -> Array:
+        joints = ("x", "y")
+        positions, velocities = ([read(state, joint) for joint in joints] for read in (self.qpos, self.qvel))
+        return np.stack([*positions, *velocities], -1)
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        off = self.observe(next_state)[:, :2] - self.goal(theta)
+        distance = np.linalg.norm(off, axis=-1)
+        return 0.8 * np.exp(-0.5 * (distance / 0.3) ** 2) + 0.2 * np.exp(-distance)
