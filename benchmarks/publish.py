@@ -15,18 +15,17 @@ import numpy as np
 from PIL import Image
 
 import envs
+from benchmarks import score
 from envs.console import Parser, check_folder, run_command
 
 
 def markdown(results: dict[str, Any]) -> str:
     """README's table of one task."""
-    lines = ["| method | score of each episode | last | 95% interval | after as many again |", "|---|---|---|---|---|"]
-    for name, entry in sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]):
-        scores = " ".join(f"{value + 0.0:.2f}" for value in np.round(entry["score"], 2))
-        interval = "-" if entry["ci95"] is None else "{:.2f} to {:.2f}".format(*entry["ci95"])
-        beyond = f"{entry['score_beyond'][-1]:.2f}" if "score_beyond" in entry else ""
-        lines.append(f"| {name} | {scores} | **{entry['score_last']:.2f}** | {interval} | {beyond} |")
-    return "\n".join(lines)
+    lines = [(*score.COLUMNS, "after as many again"), ("---",) * (len(score.COLUMNS) + 1)]
+    for row in score.rows(results["methods"]):
+        beyond = results["methods"][row[0]].get("score_beyond")
+        lines.append((*row, f"{beyond[-1]:.2f}" if beyond else ""))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def gif(video: Path, file: Path) -> None:

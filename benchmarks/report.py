@@ -18,6 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 import envs
+from benchmarks import score
 
 COLOURS = {
     "expert": "black",
@@ -25,6 +26,10 @@ COLOURS = {
     "conditional": "tab:red",
     "deconfounded": "tab:blue",
     "deconfounded_episode": "tab:cyan",
+    "deconfounded_gru": "navy",
+    "deconfounded_discrete": "tab:purple",
+    "deconfounded_offline": "tab:olive",
+    "dagger": "tab:pink",
     "naive_rnn": "tab:orange",
     "oracle_bc": "tab:gray",
     "blind_bc": "tab:brown",
@@ -102,10 +107,8 @@ border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}</sty
 <h1>{{ results.task }} (v{{ results.task_version }}), preset {{ results.preset }}</h1>
 <p>Scores: 0 = random actions, 1 = the expert that sees theta. {{ results.seeds|length }} seed(s),
 {{ results.eval_trials }} trials each, {{ "%.0f"|format(results.wall_s) }} s.</p>
-<table><tr><th>method<th>return<th colspan="{{ episodes }}">score of each episode<th>last<th>95% interval</tr>
-{% for name, m in methods %}<tr><td>{{ name }}<td>{{ "%.1f"|format(m.last_return) }}
-{% for s in m.score %}<td>{{ "%.2f"|format(s) }}{% endfor %}<td><b>{{ "%.2f"|format(m.score_last) }}</b>
-<td>{% if m.ci95 %}{{ "%.2f"|format(m.ci95[0]) }} .. {{ "%.2f"|format(m.ci95[1]) }}{% else %}-{% endif %}</tr>
+<table><tr>{% for name in columns %}<th>{{ name }}{% endfor %}</tr>
+{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}{% endfor %}</tr>
 {% endfor %}</table>
 {% for name, data in pictures %}<h2>{{ name }}</h2><img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
 {% endfor %}{% if movie %}<h2>One hidden theta, last episode of a trial</h2>
@@ -120,13 +123,9 @@ def page(results: dict[str, Any], folder: Path) -> str:
     def encoded(file: Path) -> str:
         return base64.b64encode(file.read_bytes()).decode()
 
-    methods = [
-        (name, {**entry, "last_return": np.mean(entry["return"], 0)[-1]})
-        for name, entry in sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"])
-    ]
     pictures = [(p.stem.capitalize(), encoded(p)) for p in (folder / "adaptation.png", folder / "learning.png")]
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
     how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
     template = jinja2.Environment(autoescape=True).from_string(_PAGE)
-    episodes = len(methods[0][1]["score"])
-    return template.render(results=results, methods=methods, pictures=pictures, movie=movie, how=how, episodes=episodes)
+    cells = {"columns": score.COLUMNS, "rows": score.rows(results["methods"])}
+    return template.render(results=results, pictures=pictures, movie=movie, how=how, **cells)

@@ -86,13 +86,25 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
     return methods
 
 
+COLUMNS = ("method", "return", "score of each episode", "last", "95% interval", "Eq. (1)", "theta R2", "data, a seed")
+
+
+def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
+    """The `methods` of results.json as rows of COLUMNS, best first; return, Eq. (1) and R^2 are of the last episode."""
+    found: list[tuple[str, ...]] = []
+    for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
+        scores = " ".join(f"{value + 0.0:.2f}" for value in np.round(entry["score"], 2))
+        interval = "-" if entry["ci95"] is None else "{:.2f} to {:.2f}".format(*(np.round(entry["ci95"], 2) + 0.0))
+        last = f"{np.round(entry['score_last'], 2) + 0.0:.2f}"
+        known = f"{entry['theta_r2'][-1]:.2f}" if entry["theta_r2"] else ""
+        data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
+        value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
+        found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data))
+    return found
+
+
 def table(results: dict[str, Any]) -> str:
-    """The results as a plain table, one row a method, best first."""
-    rows = [("method", "return", "score of each episode", "last", "95% interval")]
-    for name, entry in sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]):
-        per_episode = " ".join(f"{value:5.2f}" for value in entry["score"])
-        interval = "-" if entry["ci95"] is None else "{:.2f} .. {:.2f}".format(*entry["ci95"])
-        last = np.mean(entry["return"], 0)[-1]
-        rows.append((name, f"{last:.1f}", per_episode, f"{entry['score_last']:.2f}", interval))
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    """The results as a plain table."""
+    lines = [COLUMNS, *rows(results["methods"])]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
+    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)

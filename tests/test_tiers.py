@@ -1,0 +1,71 @@
+"""Where the theory ends: on each task marked so, what must fail fails, and what must work works."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import envs
+from benchmarks.methods import METHODS, Context
+from benchmarks.presets import preset
+from benchmarks.score import normalise
+from deconf.exact import ExactAgent, Grid
+from deconf.nets import no_progress
+from envs.task import Array
+from experts import policy
+from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+
+N, EPISODES = 48, 3
+
+
+def scores(env: envs.BatchEnv, agent: Agent) -> Array:
+    """Score [E] of an agent: 0 random, 1 the expert that sees theta."""
+    expert = policy.load(env.task)
+    zero, one, own = (
+        run_trials(env, who, EPISODES, seed=7)[1].mean(0)
+        for who in (RandomAgent(env.task.action_space), ExpertAgent(env, expert), agent)
+    )
+    return normalise(own, zero.mean(), one.mean())
+
+
+@pytest.mark.parametrize("name", [name for name in envs.names() if envs.get(name).tier != 2])
+def test_expert_trials_do_not_tell_theta(name: str) -> None:
+    """The exact posterior, from the dynamics of expert trials, stays the prior."""
+    env = envs.BatchEnv(envs.get(name), 8)
+    expert = policy.load(env.task)
+    grid = Grid(env, expert, 5)
+    agent, obs = ExpertAgent(env, expert), env.reset(0)
+    agent.reset([np.random.default_rng(0)])
+    for _ in range(env.task.horizon):
+        state, action = env.state, agent.act(obs)
+        obs = env.step(action)[0]
+        evidence = grid.log_dynamics(state, action, env.state)
+        np.testing.assert_allclose(evidence, np.broadcast_to(evidence[:, :1], evidence.shape), atol=1e-9)
+
+
+def test_nobody_wins_where_dynamics_do_not_know() -> None:
+    """hidden_goal: neither exact policy comes near the expert, and the interventional one does not learn."""
+    env = envs.BatchEnv(envs.get("hidden_goal"), N)
+    expert = policy.load(env.task)
+    interventional, conditional = (scores(env, ExactAgent(env, expert, kind, 9)) for kind in (False, True))
+    assert interventional.max() < 0.6
+    assert conditional.max() < 0.6
+    assert abs(interventional[-1] - interventional[0]) < 0.1
+
+
+def test_exact_policies_at_the_fork() -> None:
+    """forked_path: the bump tells, to whom actions are no evidence; the deluded go wrong half of the time."""
+    env = envs.BatchEnv(envs.get("forked_path"), N)
+    expert = policy.load(env.task)
+    assert scores(env, ExactAgent(env, expert, False))[-1] > 0.9
+    assert scores(env, ExactAgent(env, expert, True))[-1] < 0.7
+
+
+@pytest.mark.parametrize(("method", "works"), [("deconfounded", False), ("dagger", True)])
+def test_tier_3_needs_queries(method: str, works: bool) -> None:
+    """forked_path: given what dynamics tell, expert trials mix left and right; labels on own roll-outs do not."""
+    task = envs.get("forked_path")
+    context = Context(task, preset("smoke", task, "cpu"), [0], no_progress)
+    agent = METHODS[method](context)[method]
+    last = scores(envs.BatchEnv(task, N), agent)[-1]
+    assert (last > 0.75) if works else (last < 0.65)
