@@ -31,7 +31,7 @@ _CONTROL = Preset(
     query_trials=32,
     fresh=False,
     grid=21,
-    deconfounded=DeconfoundedConfig(inference_updates=800),
+    deconfounded=DeconfoundedConfig(inference_updates=800, inference_rate=2e-3),
     discrete=DeconfoundedConfig(model="discrete", latent=16, inference_updates=400),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
