@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,8 @@ import envs
 from benchmarks.methods import METHODS, Context
 from benchmarks.presets import preset
 from benchmarks.score import normalise
+from deconf.dagger import DaggerConfig
+from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent, Grid
 from deconf.nets import no_progress
 from envs.task import Array
@@ -65,7 +69,13 @@ def test_exact_policies_at_the_fork() -> None:
 def test_tier_3_needs_queries(method: str, works: bool) -> None:
     """forked_path: given what dynamics tell, expert trials mix left and right; labels on own roll-outs do not."""
     task = envs.get("forked_path")
-    context = Context(task, preset("smoke", task, "cpu"), [0], no_progress)
-    agent = METHODS[method](context)[method]
+    settings = replace(
+        preset("default", task, "cpu"),
+        expert_trials=64,
+        explore_trials=32,
+        deconfounded=DeconfoundedConfig(rounds=2, inference_updates=300, imitation_updates=300, final_updates=500),
+        dagger=DaggerConfig(updates=3000, batch=32, learning_rate=3e-3),
+    )
+    agent = METHODS[method](Context(task, settings, [0], no_progress))[method]
     last = scores(envs.BatchEnv(task, N), agent)[-1]
-    assert (last > 0.75) if works else (last < 0.65)
+    assert (last > 0.7) if works else (last < 0.6)
