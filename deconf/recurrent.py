@@ -28,7 +28,11 @@ class RecurrentConfig:
 
 
 class RecurrentAgent(LearnedAgent):
-    """Acts on the observation and on a memory of its own transitions, carried over resets."""
+    """Acts on the observation and on a memory of its own transitions, carried over resets.
+
+    The policy reads the observation itself, scaled, beside the memory: through the memory's embedding it cannot tell the
+    expert's small action noise from its own error, and clones less well.
+    """
 
     def __init__(self, memory: GruMemory, policy: ActionHead) -> None:
         super().__init__(policy)
@@ -38,16 +42,14 @@ class RecurrentAgent(LearnedAgent):
     def new(config: RecurrentConfig, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
         """One that knows nothing yet."""
         memory = GruMemory(config.width, signature, obs, draws)
-        return RecurrentAgent(
-            memory, ActionHead(config.width + memory.inputs.obs_width, config.width, signature, draws)
-        )
+        return RecurrentAgent(memory, ActionHead(config.width + signature.obs, config.width, signature, draws))
 
     def begin(self, n: int) -> None:
         super().begin(n)
         self._state = self.memory.start(self._n)
 
     def choose(self, obs: Tensor) -> Tensor:
-        return self.policy.sample(torch.cat([self._state, self.memory.inputs.obs(obs)], -1), self._draws)
+        return self.policy.sample(torch.cat([self._state, self.memory.inputs.scaler(obs)], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
         self._state = self.memory.update(self._state, step)
@@ -69,7 +71,7 @@ class RecurrentAgent(LearnedAgent):
 
     def _loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         states = self.memory(batch, state)
-        features = torch.cat([states[:, :, :-1], self.memory.inputs.obs(batch.obs)], -1)
+        features = torch.cat([states[:, :, :-1], self.memory.inputs.scaler(batch.obs)], -1)
         log_policy = self.policy.log_prob(features, label)
         return imitation_loss(log_policy.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
 
