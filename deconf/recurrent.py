@@ -30,8 +30,8 @@ class RecurrentConfig:
 class RecurrentAgent(LearnedAgent):
     """Acts on the observation and on a memory of its own transitions, carried over resets.
 
-    The policy reads the observation itself, scaled, beside the memory: through the memory's embedding it cannot tell the
-    expert's small action noise from its own error, and clones less well.
+    The policy reads the observation itself, scaled, beside the memory: through the memory's embedding it cannot tell
+    the expert's small action noise from its own error, and clones less well.
     """
 
     def __init__(self, memory: GruMemory, policy: ActionHead) -> None:
