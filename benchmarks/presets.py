@@ -50,7 +50,7 @@ _BANDIT = Preset(
         latent=5,
         beta=5e-3,
         rounds=2,
-        inference_updates=800,
+        inference_updates=1200,
         inference_batch=64,
         inference_steps=6400,
         inference_rate=3e-3,
@@ -122,7 +122,7 @@ def _smoke(full: Preset) -> Preset:
     """One seed, and little of everything; the bandit's belief gets enough to be ahead of naive cloning."""
     bandit = full is _BANDIT
     amounts: dict[str, Any] = {"rounds": 1 if bandit else 2, "imitation_updates": 400 if bandit else 100}
-    few: dict[str, Any] = {} if bandit else {"inference_updates": 100, "final_updates": 400}
+    few: dict[str, Any] = {"inference_updates": 800} if bandit else {"inference_updates": 100, "final_updates": 400}
     return replace(
         full,
         seeds=1,
