@@ -108,12 +108,14 @@ def test_no_gl_is_only_a_note(backend: str) -> None:
 class TestScore:
     def test_by_hand(self) -> None:
         """Random 10, expert 30: a return of 25 scores .75, and the interval of two seeds .7 and .8 holds both."""
-        returns = {
-            "random": {0: np.full((4, 2), 10.0), 1: np.full((4, 2), 10.0)},
-            "expert": {0: np.full((4, 2), 30.0), 1: np.full((4, 2), 30.0)},
-            "other": {0: np.full((4, 2), 24.0), 1: np.full((4, 2), 26.0)},
-        }
-        methods = score.summarise(returns, 2)
+        finished = []
+        for name, by_seed in {"random": (10.0, 10.0), "expert": (30.0, 30.0), "other": (24.0, 26.0)}.items():
+            for seed, value in enumerate(by_seed):
+                arrays = {"returns": np.full((4, 2), value), "objective": np.full((4, 2), -value), "probe": np.ones(2)}
+                wrote = {f"{name}/{key}": array for key, array in arrays.items()}
+                finished.append((name, seed, {**wrote, "meta": {"agents": [name], "budget": {}}}))
+        methods = score.summarise(finished, 2)
+        assert methods["other"]["objective"] == [-25, -25]
         assert methods["other"]["score"] == [0.75, 0.75]
         assert methods["other"]["return"] == [[24.0, 24.0], [26.0, 26.0]]
         assert methods["other"]["ci95"] == pytest.approx([0.7, 0.8])
