@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 import envs
-from benchmarks.pool import Finished
+from benchmarks.pool import Finished, by_method
 from benchmarks.report import COLOURS
 from deconf.exact import ExactAgent
 from envs.task import Array
@@ -56,8 +56,7 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
     titles = ["(a) on expert trajectories", "(b) online", "(c) imitation loss, held out", "(d) online, during training"]
     for panel, title in zip(panels, titles, strict=True):
         panel.set(title=title)
-    for method in dict.fromkeys(name for name, *_ in finished):
-        data = [entry for name, _, entry in finished if name == method]
+    for method, data in by_method(finished).items():
         share = np.linspace(0, 1, 101)
         for panel, key in zip(panels, ("on_expert", "online", "loss_curve", "pulls_curve"), strict=True):
             curves = np.array([entry[key] for entry in data], float)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 import envs
 from benchmarks import score
 from benchmarks.methods import EVALUATION, LEARNED, METHODS, Context, stream
-from benchmarks.pool import Job, Ticker
+from benchmarks.pool import Job, JobMonitor
 from envs.task import Array
 from experts.demos import Agent, run_trials
 
@@ -63,35 +62,36 @@ class Recorder(Agent):
         self.agent.observe(obs, action, next_obs, alive)
 
 
+class CurveMonitor(JobMonitor):
+    """Keeps the losses of training, at some 400 updates."""
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        super().update(done, total, losses, agent)
+        if done % max(total // 400, 1) == 0:
+            for kind, loss in losses.items():
+                self.kept.setdefault(kind, []).append((done, loss))
+
+
 class BenchmarkJob(Job):
     """Train and evaluate one method with some seeds."""
 
     def run(self) -> str:
-        start, tick = time.time(), Ticker(self)
-        curve: dict[str, list[tuple[int, float]]] = {}
-
-        def progress(done: int, total: int, losses: dict[str, float]) -> None:
-            tick(0.8 * done / total)
-            if done % max(total // 400, 1) == 0:
-                for kind, loss in losses.items():
-                    curve.setdefault(kind, []).append((done, loss))
-
-        context = Context(envs.get(self.task), self.preset, self.seeds, progress)
+        monitor = CurveMonitor(self, 0.8)
+        context = Context(envs.get(self.task), self.preset, self.seeds, monitor)
         agents = METHODS[self.method](context)
-        trained = time.time() - start
+        trained = monitor.worked()
         found = {name: evaluate(context, agent, self.method in LEARNED) for name, agent in agents.items()}
-        meta = {"agents": list(agents), "curve": curve, "budget": context.budget, "span": (start, time.time())}
+        meta = {"agents": list(agents), "curve": monitor.kept, "budget": monitor.budget}
         for i, seed in enumerate(self.seeds):
-            rows = slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
+            rows = context.rows(i)
             arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
             for name, (per_trial, probes, clip) in found.items():
                 arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
                 arrays[f"{name}/probe"] = probes[i]
                 if seed == 0 and name in CLIPPED:
                     arrays.update({f"{name}/{key}": value for key, value in clip.items()})
-            self.save(seed, arrays, meta)
-        tick(1)
-        return f"trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
+            self.save(seed, arrays, monitor, meta)
+        return f"trained in {trained:.0f} s, all in {monitor.close():.0f} s"
 
 
 def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, Array], Array, dict[str, Array]]:
@@ -104,8 +104,7 @@ def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, A
     recorder.note()
     objective = score.objective(context.expert, trials, context.env.theta)
     features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)
-    n = len(theta) // len(seeds)
-    groups = [slice(i * n, (i + 1) * n) for i in range(len(seeds))]
+    groups = map(context.rows, range(len(seeds)))
     probes = np.array([[score.probe(known[rows], theta[rows]) for known in features] for rows in groups])
     clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
     return {"returns": returns, "objective": objective}, probes, clip

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 import envs
 from deconf import cloning, dagger, deconfounded, naive_rnn, offline
+from deconf.agents import Monitor
 from deconf.cloning import CloningConfig
 from deconf.dagger import DaggerConfig
+from deconf.data import Source
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent
-from deconf.nets import Progress, Source, Watch, no_watch
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from envs.task import Array
@@ -55,32 +56,32 @@ class Preset:
 class Context:
     """One task, preset and some seeds: data, made when first asked for, and the environments agents are scored in.
 
-    Seeds lie side by side: trials are in as many equal groups as there are seeds. `budget` counts what a seed used.
+    Seeds lie side by side: trials are in as many equal groups as there are seeds.
     """
 
-    def __init__(
-        self, task: envs.Task, preset: Preset, seeds: Sequence[int], progress: Progress, watch: Watch = no_watch
-    ) -> None:
-        self.task, self.preset, self.seeds, self.progress, self.watch = task, preset, list(seeds), progress, watch
+    def __init__(self, task: envs.Task, preset: Preset, seeds: Sequence[int], monitor: Monitor | None = None) -> None:
+        self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
         self.expert = policy.load(task)
         self.env = envs.BatchEnv(task, preset.eval_trials * len(self.seeds))
-        self.budget = {"expert_trials": 0, "exploration_trials": 0, "queries": 0}
+
+    def rows(self, i: int) -> slice:
+        """Trials, of those that agents are scored in, of the i-th seed."""
+        return slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
+
+    def _expert_trials(self, seeds: list[int]) -> tuple[Trials, Array]:
+        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(seeds))
+        self.monitor.budget["expert_trials"] += self.preset.expert_trials
+        seeds = [stream(DEMOS, seed) for seed in seeds]
+        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0], env.theta
 
     @cached_property
     def demonstrations(self) -> tuple[Trials, Array]:
         """Expert trials, and beside them theta [B, L] for the oracle."""
-        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(self.seeds))
-        self.budget["expert_trials"] += self.preset.expert_trials
-        seeds = [stream(DEMOS, seed) for seed in self.seeds]
-        trials, _ = run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)
-        return trials, env.theta.copy()
+        return self._expert_trials(self.seeds)
 
     def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
         """Fresh expert trials."""
-        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(rngs))
-        self.budget["expert_trials"] += self.preset.expert_trials
-        seeds = [stream(DEMOS, int(rng.integers(2**31))) for rng in rngs]
-        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
+        return self._expert_trials([int(rng.integers(2**31)) for rng in rngs])[0]
 
     @property
     def source(self) -> Source:
@@ -92,7 +93,9 @@ class Context:
         """For initial weights and batches; the same for every method of a seed."""
         return [np.random.default_rng([seed, 0]) for seed in self.seeds]
 
-    def _blind(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, envs.BatchEnv]:
+    def _roll_out(
+        self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]
+    ) -> tuple[Trials, envs.BatchEnv]:
         env = envs.BatchEnv(self.task, n * len(rngs))
         seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
         behaviour = agent or RandomAgent(self.task.action_space)
@@ -100,13 +103,13 @@ class Context:
 
     def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
         """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
-        self.budget["exploration_trials"] += self.preset.explore_trials
-        return self._blind(self.preset.explore_trials, agent, rngs)[0]
+        self.monitor.budget["exploration_trials"] += self.preset.explore_trials
+        return self._roll_out(self.preset.explore_trials, agent, rngs)[0]
 
     def query(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, NDArray[np.float32]]:
         """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
-        trials, env = self._blind(self.preset.query_trials, agent, rngs)
-        self.budget["queries"] += int(trials.mask.sum()) // len(rngs)
+        trials, env = self._roll_out(self.preset.query_trials, agent, rngs)
+        self.monitor.budget["queries"] += int(trials.mask.sum()) // len(rngs)
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
         theta, random = env.theta, Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
@@ -120,23 +123,23 @@ def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent
 
 
 def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
-    agent = deconfounded.fit(context.source, context.explore, config, context.rngs, context.progress, context.watch)
+    agent = deconfounded.fit(context.source, context.explore, config, context.rngs, context.monitor)
     return _deploy(name, agent)
 
 
 def _offline(context: Context) -> dict[str, Agent]:
     trials, _ = context.demonstrations
-    agent = offline.fit(trials, context.preset.offline, context.rngs, context.progress, context.watch)
+    agent = offline.fit(trials, context.preset.offline, context.rngs, context.monitor)
     return {"deconfounded_offline": agent}
 
 
 def _naive_rnn(context: Context) -> dict[str, Agent]:
-    agent = naive_rnn.fit(context.source, context.preset.naive, context.rngs, context.progress, context.watch)
+    agent = naive_rnn.fit(context.source, context.preset.naive, context.rngs, context.monitor)
     return {"naive_rnn": agent}
 
 
 def _dagger(context: Context) -> dict[str, Agent]:
-    return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.progress, context.watch)}
+    return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.monitor)}
 
 
 def _oracle(context: Context) -> dict[str, Agent]:
@@ -148,14 +151,14 @@ def _oracle(context: Context) -> dict[str, Agent]:
         context.rngs,
         encode(theta),
         lambda: encode(context.env.theta),
-        context.progress,
+        context.monitor,
     )
     return {"oracle_bc": agent}
 
 
 def _blind(context: Context) -> dict[str, Agent]:
     trials, _ = context.demonstrations
-    return {"blind_bc": cloning.fit(trials, context.preset.cloning, context.rngs, progress=context.progress)}
+    return {"blind_bc": cloning.fit(trials, context.preset.cloning, context.rngs, monitor=context.monitor)}
 
 
 def _exact(context: Context, conditional: bool) -> dict[str, Agent]:

@@ -6,9 +6,6 @@ and online (b), imitation loss (c) and best-arm pulls (d) during training; learn
 
 from __future__ import annotations
 
-import os
-import platform
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,17 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import envs
+from benchmarks import commands
 from benchmarks.figures import figure_2, figure_3
 from benchmarks.methods import EVALUATION, METHODS, Context, stream
-from benchmarks.pool import Finished, Job, Ticker, prepare, run_all, worked
-from benchmarks.presets import PRESETS, preset
-from benchmarks.run import about, check_device
+from benchmarks.pool import Finished, Job, JobMonitor, by_method
+from deconf.data import Batch
 from deconf.deconfounded import DeconfoundedAgent
 from deconf.equations import posterior_policy
 from deconf.exact import ExactAgent
-from deconf.nets import Batch
 from deconf.recurrent import RecurrentAgent
-from envs.console import Parser, run_command, write_atomically, write_json
+from envs.console import run_command, write_atomically, write_json
 from envs.task import Array
 from experts import policy
 from experts.demos import Agent, ExpertAgent, run_trials
@@ -78,42 +74,49 @@ class Known(ExactAgent):
         return super().act(obs)
 
 
+class FigureMonitor(JobMonitor):
+    """Deploys the agent and measures its imitation loss POINTS times as it learns."""
+
+    def watch(self, context: Context, held_out: Batch, trials: int) -> None:
+        """Begin: on held-out expert trials, and on so many of the agent's own."""
+        self.context, self.held_out, self.trials = context, held_out, trials
+        self.kept = {"at": [], "loss": [], "pulls": []}  # updates [P], and for each seed [P, S]
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        super().update(done, total, losses, agent)
+        seen = self.kept
+        due = not seen["at"] or done == total or done * POINTS // total > seen["at"][-1] * POINTS // total
+        if due and isinstance(agent, RecurrentAgent | DeconfoundedAgent):
+            pulls = online(self.context, agent, self.trials)[1]
+            seen["at"].append(done)
+            seen["pulls"].append(pulls.reshape(len(self.context.seeds), -1).mean(1).tolist())
+            seen["loss"].append(agent.held_out_loss(self.held_out).tolist())
+
+
 class FigureJob(Job):
     """Train a method with some seeds, watched as it learns."""
 
     def run(self) -> str:
-        start, tick = time.time(), Ticker(self)
-        task, n = envs.get(self.task), self.preset.eval_trials
+        task, n, monitor = envs.get(self.task), self.preset.eval_trials, FigureMonitor(self, 0.95)
         few = min(n, 500)
-        seen: dict[str, list[Any]] = {"at": [], "loss": [], "pulls": []}
-
-        def watch(done: int, total: int, agent: Agent) -> None:
-            if done == total or done >= total * len(seen["at"]) / POINTS:
-                seen["at"].append(done)
-                seen["pulls"].append(online(context, agent, few)[1].reshape(len(self.seeds), -1).mean(1))
-                assert isinstance(agent, RecurrentAgent | DeconfoundedAgent)
-                seen["loss"].append(agent.held_out_loss(held_out).cpu().numpy())
-
-        context = Context(task, self.preset, self.seeds, lambda done, total, _: tick(0.95 * done / total), watch)
+        context = Context(task, self.preset, self.seeds, monitor)
         env = envs.BatchEnv(task, few * len(self.seeds))
         seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
         trials, _ = run_trials(env, ExpertAgent(env, context.expert), 1, seeds)
-        held_out = Batch.of(trials, len(seeds), self.preset.naive.device)
+        monitor.watch(context, Batch.of(trials, len(seeds), self.preset.naive.device), few)
         agent = METHODS[self.method](context)[self.method]
-        trained = time.time() - start
+        trained = monitor.worked()
         best, pulls = online(context, agent, n)
-        env = envs.BatchEnv(task, n * len(self.seeds))
-        onlooker = Onlooker(agent, ExpertAgent(env, context.expert))
-        run_trials(env, onlooker, 1, [stream(EVALUATION, seed) for seed in self.seeds])
-        would = np.concatenate(onlooker.would, -1) == env.theta
-        meta = {"span": (start, time.time()), "train_s": trained, "budget": context.budget}
+        onlooker = Onlooker(agent, ExpertAgent(context.env, context.expert))
+        run_trials(context.env, onlooker, 1, [stream(EVALUATION, seed) for seed in self.seeds])
+        would = np.concatenate(onlooker.would, -1) == context.env.theta
+        meta = {"train_s": trained, "budget": monitor.budget}
         for i, seed in enumerate(self.seeds):
-            rows = slice(i * n, (i + 1) * n)
+            rows, seen = context.rows(i), monitor.kept
             arrays = {"online": best[rows].mean(0), "on_expert": would[rows].mean(0), "pulls": pulls[rows].mean()}
             arrays |= {f"{key}_curve": np.array(seen[key])[:, i] for key in ("loss", "pulls")}
-            self.save(seed, {"at": np.array(seen["at"]), **arrays}, meta)
-        tick(1)
-        return f"{pulls.mean():.1f} best-arm pulls, trained in {trained:.0f} s, all in {time.time() - start:.0f} s"
+            self.save(seed, {"at": np.array(seen["at"]), **arrays}, monitor, meta)
+        return f"{pulls.mean():.1f} best-arm pulls, trained in {trained:.0f} s, all in {monitor.close():.0f} s"
 
 
 def online(context: Context, agent: Agent, n: int) -> tuple[NDArray[np.bool_], Array]:
@@ -145,8 +148,7 @@ def exact(task: envs.Task, n: int = 40_000) -> dict[str, dict[str, Any]]:
 def summarise(finished: Finished, references: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Pulls of each method and how far its curves are from the exact policy it should match."""
     found = {}
-    for method in dict.fromkeys(name for name, *_ in finished):
-        data = [entry for name, _, entry in finished if name == method]
+    for method, data in by_method(finished).items():
         pulls, curve = np.array([float(entry["pulls"]) for entry in data]), np.mean([e["online"] for e in data], 0)
         target = references[TARGET.get(method, "interventional")]
         found[method] = {
@@ -180,43 +182,17 @@ def table(methods: dict[str, Any]) -> str:
 
 def main() -> None:
     """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--preset", default="default", help="; ".join(f"{k}: {text}" for k, text in PRESETS.items()))
-    parser.add_argument("--methods", nargs="+", default=list(SHOWN), metavar="NAME", help=f"of {', '.join(LEARNERS)}")
-    parser.add_argument("--seeds", type=int, default=10, metavar="N", help="how many seeds (default: 10)")
-    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
-    parser.add_argument("--out", type=Path, help="output folder; default: results/paper-<preset>")
-    parser.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
-    args = parser.parse_args()
-    if args.preset not in PRESETS:
-        raise envs.closest("preset", args.preset, list(PRESETS))
-    for name in args.methods:
-        if name not in LEARNERS:
-            raise envs.closest("method", name, list(LEARNERS))
-    if args.seeds < 1:
-        raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
-    check_device(args.device)
+    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}").parse_args()
+    methods = commands.check(args, LEARNERS, SHOWN)
+    args.seeds = args.seeds or 10
     task = envs.get("bandit")
-    settings = preset(args.preset, task, args.device)
     folder = args.out or Path("results") / f"paper-{args.preset}"
-    described = about(task, args.preset, settings)
-    prepare(folder, described, args.resume)
-    start, label = time.time(), f"Figure 3, {args.preset}"
-    finished, resumed = run_all(
-        FigureJob, task.name, settings, args.methods, args.seeds, args.device, folder / "jobs", label
-    )
+    finished, results = commands.run(FigureJob, task, args, methods, folder)
     references = exact(task)
-    results = {
-        "preset": args.preset,
-        "seeds": args.seeds,
-        "eval_trials": settings.eval_trials,
-        "versions": described["versions"],
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
-        "wall_s": round(worked(start, finished), 1),
-        "resumed": resumed,
-        "exact": {name: {"pulls": round(e["pulls"], 3), "loss": round(e["loss"], 4)} for name, e in references.items()},
-        "methods": summarise(finished, references),
+    results["exact"] = {
+        name: {"pulls": round(e["pulls"], 3), "loss": round(e["loss"], 4)} for name, e in references.items()
     }
+    results["methods"] = summarise(finished, references)
     write_json(folder / "results.json", results)
     rows = [f"{name},{seed},{float(entry['pulls']):.4f}" for name, seed, entry in finished]
     write_atomically(folder / "rows.csv", "\n".join(["method,seed,pulls", *rows]) + "\n")
@@ -226,4 +202,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    run_command(main, "what was finished is kept, and --resume goes on")
+    run_command(main, commands.KEPT)

@@ -12,7 +12,7 @@ import time
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
@@ -25,8 +25,12 @@ import torch
 
 import envs
 from benchmarks.methods import COST, LEARNED, Preset
+from deconf.agents import Monitor, State
 from envs.console import Progress, check_folder, write_atomically, write_json
 from envs.physics import cores
+from experts.demos import Agent
+
+SAVE_EVERY_S = 60.0  # a checkpoint within a job
 
 
 @dataclass(frozen=True)
@@ -52,10 +56,10 @@ class Job(ABC):
         """Of progress: in proportion to how long a job takes."""
         return 100 * COST.get(self.method, 1) * len(self.seeds)
 
-    def save(self, seed: int, arrays: dict[str, Any], meta: dict[str, Any]) -> None:
-        """Write the file of a seed, atomically; meta holds at least `span`, when work began and ended."""
+    def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
+        """Write the file of a seed, atomically; beside `meta` it holds when the job was at work."""
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)
+        np.savez_compressed(buffer, meta=np.array(json.dumps({**meta, "spans": monitor.spans()})), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
     def load(self, seed: int) -> dict[str, Any] | None:
@@ -87,21 +91,57 @@ def start_worker(ticks: Queue[int]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-class Ticker:
-    """Tells the main process how far a job has come."""
+class JobMonitor(Monitor):
+    """Tells the main process how far a job has come, and keeps a checkpoint of its training beside its files.
 
-    def __init__(self, job: Job) -> None:
-        self.total, self.told = job.ticks, 0
+    share: of the whole job, that training takes. `kept` goes into the checkpoint, and comes back from it.
+    """
 
-    def __call__(self, share: float) -> None:
-        """share: of the job, from 0 to 1, that is done."""
-        if (now := int(self.total * share)) > self.told:
+    def __init__(self, job: Job, share: float) -> None:
+        super().__init__()
+        self.ticks, self.share, self.told = job.ticks, share, 0
+        self.device = job.preset.naive.device
+        self.file = job.folder / f".{job.method}-{'-'.join(map(str, job.seeds))}.pt"
+        self.start, self.saved = time.time(), time.monotonic()
+        self.before: list[tuple[float, float]] = []
+        self.kept: State = {}
+
+    def spans(self) -> list[tuple[float, float]]:
+        """When the job was at work: from, to."""
+        return [*self.before, (self.start, time.time())]
+
+    def worked(self) -> float:
+        """Seconds of work so far."""
+        return sum(end - start for start, end in self.spans())
+
+    def _tell(self, share: float) -> None:
+        if (now := int(self.ticks * share)) > self.told:
             _ticks.put(now - self.told)
             self.told = now
 
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        self._tell(self.share * done / total)
 
-def _run(job: Job) -> str:
-    return job.run()
+    def save(self, state: Callable[[], State]) -> None:
+        if time.monotonic() - self.saved >= SAVE_EVERY_S:
+            buffer = io.BytesIO()
+            torch.save({"training": state(), "kept": self.kept, "budget": self.budget, "spans": self.spans()}, buffer)
+            write_atomically(self.file, buffer.getvalue())
+            self.saved = time.monotonic()
+
+    def load(self) -> State | None:
+        try:
+            state = torch.load(self.file, self.device, weights_only=True)
+        except Exception:  # missing, or damaged, which torch tells in many ways: begin again
+            return None
+        self.kept, self.before, self.budget = state["kept"], state["spans"], state["budget"]
+        return state["training"]
+
+    def close(self) -> float:
+        """The job is done, and its checkpoint is of no more use; returns the seconds of work it took."""
+        self._tell(1)
+        self.file.unlink(missing_ok=True)
+        return self.worked()
 
 
 Finished = list[tuple[str, int, dict[str, Any]]]
@@ -129,6 +169,14 @@ def run_all(
     run_jobs(parts, label)
     finished = [(job.method, seed, data) for job in every for seed in job.seeds if (data := job.load(seed)) is not None]
     return finished, len(finished) - sum(map(len, left))
+
+
+def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
+    """What the jobs of each method wrote, by seed."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for method, _, data in finished:
+        found.setdefault(method, []).append(data)
+    return found
 
 
 def groups(method: str, left: list[int], device: str) -> list[tuple[int, ...]]:
@@ -170,7 +218,7 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     ticks = context.Queue()
     with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
         heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for workers, which are made now, to inherit
-        futures = {pool.submit(_run, job): job for job in jobs}
+        futures = {pool.submit(job.run): job for job in jobs}
         signal.signal(signal.SIGINT, heard)
         try:
             waiting = set(futures)
@@ -194,7 +242,8 @@ def run_jobs(jobs: list[Job], label: str) -> None:
 
 def worked(start: float, finished: Finished) -> float:
     """Seconds that this command, begun at `start`, and the jobs of those before it took; what overlaps counts once."""
-    return covered([(start, time.time()), *(tuple(data["meta"]["span"]) for *_, data in finished)])
+    spans = (tuple(span) for *_, data in finished for span in data["meta"]["spans"])
+    return covered([(start, time.time()), *spans])
 
 
 def covered(spans: list[tuple[float, float]]) -> float:

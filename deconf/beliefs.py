@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.nets import Batch, Draws, Embedding, Inputs, Linear, Scaler, Signature, Whitener, mlp, per_seed
+from deconf.data import Batch, Draws, Signature
+from deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
 
 
 class Belief(nn.Module, ABC):

@@ -8,21 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from deconf.agents import LearnedAgent, Monitor
+from deconf.data import Batch, Draws, Rngs, Signature, listed, take_steps
 from deconf.equations import imitation_loss
-from deconf.nets import (
-    ActionHead,
-    Adam,
-    Batch,
-    Draws,
-    LearnedAgent,
-    Progress,
-    Rngs,
-    Scaler,
-    Signature,
-    listed,
-    no_progress,
-    take_steps,
-)
+from deconf.nets import ActionHead, Adam, Scaler
 from envs.task import Array
 from experts.demos import Trials
 
@@ -59,30 +48,27 @@ def fit(
     rng: Rngs,
     theta: Array | None = None,
     side: Callable[[], Array] | None = None,
-    progress: Progress = no_progress,
+    monitor: Monitor | None = None,
 ) -> MemorylessAgent:
     """Clone the expert step by step; trials are in as many equal groups as there are generators in rng.
 
     theta [B, F]: features of each trial's theta, for the oracle, whose agent then asks `side` for those [N, F] of the
     environments it acts in. Without both: blind BC.
     """
-    rngs = listed(rng)
-    data, signature, draws = (
-        Batch.of(trials, len(rngs), config.device),
-        Signature.of(trials),
-        Draws(rngs, config.device),
-    )
+    rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
+    data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     scaler = Scaler(data.obs, data.mask)
     features = scaler(data.obs)
     if theta is not None:
         each = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], 1, -1)
         features = torch.cat([features, each.expand(-1, -1, features.shape[2], -1)], -1)
     policy = ActionHead(features.shape[-1], config.width, signature, draws)
+    agent = MemorylessAgent(policy, scaler, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)
     for update in range(config.updates):
         index = data.draw_steps(config.batch, draws)
         log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
         loss = imitation_loss(log_policy, torch.ones_like(log_policy))
         optimizer.step(loss)
-        progress(update + 1, config.updates, {"imitation": loss.mean().item()})
-    return MemorylessAgent(policy, scaler, side)
+        monitor.update(update + 1, config.updates, {"imitation": loss.mean().item()}, agent)
+    return agent

@@ -15,20 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.nets import (
-    Adam,
-    Batch,
-    Draws,
-    Progress,
-    Rngs,
-    Scaler,
-    Signature,
-    Watch,
-    listed,
-    no_progress,
-    no_watch,
-)
-from deconf.recurrent import RecurrentAgent, RecurrentConfig
+from deconf.agents import Monitor
+from deconf.data import Batch, Draws, Rngs, Signature, listed, take
+from deconf.nets import Scaler
+from deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 from envs.task import InputError
 from experts.demos import Agent, Trials
 
@@ -45,9 +35,7 @@ class DaggerConfig(RecurrentConfig):
     rounds: int = 10
 
 
-def fit(
-    query: Query, config: DaggerConfig, rng: Rngs, progress: Progress = no_progress, watch: Watch = no_watch
-) -> RecurrentAgent:
+def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
     """Label roll-outs, train on all labels so far, and again. Raises InputError for less than one round."""
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
@@ -56,21 +44,15 @@ def fit(
     trials, labels = query(None, rngs)
     data, label = Batch.of(trials, len(rngs), config.device), _labels(trials, labels, len(rngs), config.device)
     agent = RecurrentAgent.new(config, Signature.of(trials), Scaler(data.obs, data.mask), draws)
-    chunks = -(-data.mask.shape[2] // config.chunk)
-    passes = -(-config.updates // (chunks * config.rounds))
-    total = passes * chunks * config.rounds
-    optimizer = Adam([agent.memory, agent.policy], config.learning_rate, total if config.cooled else None)
-    seed = torch.arange(len(rngs), device=data.mask.device)[:, None]
+    cloner = Cloner(agent, config, data.mask.shape[2], monitor or Monitor(), config.rounds)
     for i in range(config.rounds):
         if i > 0:
             trials, labels = query(agent, rngs)
             data = data.joined(Batch.of(trials, len(rngs), config.device))
             label = torch.cat([label, _labels(trials, labels, len(rngs), config.device)], 1)
-        for j in range(passes):
+        for _ in range(cloner.passes):
             index = draws.below(len(data), config.batch)
-            losses = agent.clone(data.trials(index), label[seed, index], config.chunk, optimizer)
-            progress((i * passes + j + 1) * chunks, total, {"imitation": sum(losses) / chunks})
-        watch((i + 1) * passes * chunks, total, agent)
+            cloner.learn(data.trials(index), take(label, index))
     return agent
 
 

@@ -16,26 +16,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
+from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconf.equations import imitation_loss
 from deconf.models import DiscreteModel, LatentModel, VariationalModel
-from deconf.nets import (
-    ActionHead,
-    Adam,
-    Batch,
-    Draws,
-    LearnedAgent,
-    Progress,
-    Rngs,
-    Scaler,
-    Signature,
-    Source,
-    Watch,
-    drawn,
-    listed,
-    no_progress,
-    no_watch,
-    ramp,
-)
+from deconf.nets import ActionHead, Adam, Scaler
 from envs.task import InputError
 from experts.demos import Agent, Trials
 
@@ -62,9 +47,8 @@ class DeconfoundedConfig:
     imitation_batch: int | None = 1024  # steps; None: all there are
     imitation_rate: float = 1e-3
     cooled: bool = True  # learning rates fall to 0 along a cosine
-    accumulate: bool = (
-        True  # explorations of all rounds; else each round's is used alone, and demonstrations drawn anew
-    )
+    # Use the explorations of all rounds; else each round's alone, with demonstrations drawn anew if there is a source.
+    accumulate: bool = True
     fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
     device: str = "cpu"
     random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
@@ -102,8 +86,7 @@ class DeconfoundedAgent(LearnedAgent):
         """The imitation loss [S] on steps of expert trials; their theta_hat_H is drawn from beliefs [S, B, P]."""
         index = batch.draw_steps(steps, draws)
         real = batch.steps(index)
-        seed = torch.arange(len(index), device=index.device)[:, None]
-        theta_hat = self.model.sample(belief[seed, index // batch.mask.shape[2]], draws)
+        theta_hat = self.model.sample(take(belief, index // batch.mask.shape[2]), draws)
         with torch.no_grad():
             inputs = self.model.inputs.obs(real.obs)
         return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
@@ -133,26 +116,17 @@ class Explorer(DeconfoundedAgent):
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
         self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
-        index = self._draws.below(self.latents.shape[1], self._n)
-        self._drawn = self.latents[torch.arange(self.seeds, device=self.device)[:, None], index]
+        self._drawn = take(self.latents, self._draws.below(self.latents.shape[1], self._n))
 
     def latent(self) -> Tensor:
         return torch.where(self._blind, self._drawn, super().latent())
 
     def choose(self, obs: Tensor) -> Tensor:
-        action, actions = super().choose(obs), self.policy.signature.actions
-        uniform = self._draws.uniform(*action.shape[1:])
-        other = (uniform * actions).floor() if actions else 2 * uniform - 1
-        return torch.where(self._draws.uniform(self._n, 1) < self.random_share, other, action)
+        return self.policy.signature.randomise(super().choose(obs), self.random_share, self._draws)
 
 
 def fit(
-    trials: Source,
-    explore: Explore,
-    config: DeconfoundedConfig,
-    rng: Rngs,
-    progress: Progress = no_progress,
-    watch: Watch = no_watch,
+    trials: Source, explore: Explore, config: DeconfoundedConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> DeconfoundedAgent:
     """Algorithm 1.
 
@@ -161,8 +135,8 @@ def fit(
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs = listed(rng)
-    seeds, device = len(rngs), config.device
+    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    seeds = len(rngs)
     shown, first = drawn(trials, rngs), explore(None, rngs)
     signature = Signature.of(shown)
     if Signature.of(first) != signature:
@@ -175,6 +149,7 @@ def fit(
         model = DiscreteModel(config.latent, config.width, signature, obs, change, draws)
     else:
         model = VariationalModel(config.model, config.latent, config.width, signature, obs, change, draws)
+    model.eval()  # but for its updates
     policy = ActionHead(model.inputs.obs_width + config.latent, config.width, signature, draws)
     agent = DeconfoundedAgent(model, policy, config.resample)
 
@@ -182,49 +157,47 @@ def fit(
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
     inference = Adam([model], config.inference_rate, inferences if config.cooled else None)
     imitation = Adam([policy], config.imitation_rate)
-    done, inferred = 0, 0
 
-    def infer(data: Batch) -> None:
-        """One update of phi and psi."""
-        nonlocal done, inferred
-        batch = data.trials(draws.below(len(data), config.inference_batch))
-        warm = ramp(inferred, config.warm_up * inferences)
-        loss = model.loss(batch, config.inference_steps, config.beta * warm, draws)
-        inference.step(loss)
-        done, inferred = done + 1, inferred + 1
-        progress(done, total, {"inference": loss.mean().item()})
-        watch(done, total, agent)
-
-    def imitate(data: Batch, belief: Tensor, optimizer: Adam) -> None:
+    def imitate(done: int, optimizer: Adam) -> None:
         """One update of eta."""
-        nonlocal done
-        loss = agent.loss(data, belief, config.imitation_batch, draws)
+        loss = agent.loss(expert, belief, config.imitation_batch, draws)
         optimizer.step(loss)
-        done += 1
-        progress(done, total, {"imitation": loss.mean().item()})
-        watch(done, total, agent)
+        monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
-    latents: Tensor | None = None
-    for _ in range(config.rounds):
-        if latents is not None:
+    begin, done = 0, 0
+    checkpoint = Checkpoint(
+        monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
+    )
+    if before := checkpoint.load():
+        begin, belief, latents, seen = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
+        expert = Batch(*before["expert"]) if before["expert"] else expert
+        done = begin * (config.inference_updates + config.imitation_updates)
+    for i in range(begin, config.rounds):
+        if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
             new = Batch.of(explore(explorer, rngs), seeds, device)
             seen = seen.joined(new) if config.accumulate else new
             if not config.accumulate:
                 expert = Batch.of(drawn(trials, rngs), seeds, device)
-        model.train()
-        for _ in range(config.inference_updates):
-            infer(seen)
-        model.eval()
+        for j in range(config.inference_updates):  # of phi and psi
+            warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
+            batch = seen.trials(draws.below(len(seen), config.inference_batch))
+            loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
+            done += 1
+            monitor.update(done, total, {"inference": loss}, agent)
         belief = final_belief(model, expert)
         latents = model.sample(belief, draws)
         if config.fit_prior:
             model.set_prior(belief, draws)
         for _ in range(config.imitation_updates):
-            imitate(expert, belief, imitation)
+            imitate(done, imitation)
+            done += 1
+        fresh = None if shown is trials else expert.tensors
+        checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=seen.tensors, expert=fresh)
     final = Adam([policy], config.imitation_rate, config.final_updates)
     for _ in range(config.final_updates):
-        imitate(expert, belief, final)
+        imitate(done, final)
+        done += 1
     return agent
 
 

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.data import Batch, Draws, Signature, take
 from deconf.equations import gaussian_kl, inference_loss, marginal_loss, reparametrise
-from deconf.nets import Batch, Draws, DynamicsHead, Inputs, Scaler, Signature, sample_index
+from deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 
@@ -56,6 +57,14 @@ class LatentModel(nn.Module, ABC):
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
 
+    def learn(self, optimizer: Adam, batch: Batch, steps: int | None, beta: float, draws: Draws) -> float:
+        """One update on `loss`; returns its mean over seeds."""
+        self.train()
+        loss = self.loss(batch, steps, beta, draws)
+        self.eval()
+        optimizer.step(loss)
+        return loss.mean().item()
+
 
 class VariationalModel(LatentModel):
     """The paper's: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
@@ -92,8 +101,7 @@ class VariationalModel(LatentModel):
         index = batch.draw_steps(steps, draws)
         real = batch.steps(index)
         memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
-        seed = torch.arange(len(index), device=index.device)[:, None]
-        mean, std = self.encoder.posterior(memories[seed, index])
+        mean, std = self.encoder.posterior(take(memories, index))
         theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
         log_next = self.dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)[..., 0]
         kl = gaussian_kl(mean, std, *self.encoder.prior(mean))

@@ -7,45 +7,32 @@ paper's belief.
 
 from __future__ import annotations
 
-from deconf.nets import (
-    Adam,
-    Batch,
-    Draws,
-    Progress,
-    Rngs,
-    Scaler,
-    Signature,
-    Source,
-    Watch,
-    drawn,
-    listed,
-    no_progress,
-    no_watch,
-)
-from deconf.recurrent import RecurrentAgent, RecurrentConfig
+from deconf.agents import Checkpoint, Monitor
+from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
+from deconf.nets import Scaler
+from deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 
 
-def fit(
-    trials: Source, config: RecurrentConfig, rng: Rngs, progress: Progress = no_progress, watch: Watch = no_watch
-) -> RecurrentAgent:
+def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng.
 
     Or clone what draws them: fresh ones for every batch.
     """
-    rngs = listed(rng)
+    rngs, monitor = listed(rng), monitor or Monitor()
     shown = drawn(trials, rngs)
     data, draws = Batch.of(shown, len(rngs), config.device), Draws(rngs, config.device)
     agent = RecurrentAgent.new(config, Signature.of(shown), Scaler(data.obs, data.mask), draws)
-    chunks = -(-data.mask.shape[2] // config.chunk)
-    passes = -(-config.updates // chunks)
-    total = passes * chunks
-    optimizer = Adam([agent.memory, agent.policy], config.learning_rate, total if config.cooled else None)
-    for i in range(passes):
-        if shown is not trials:
-            batch = Batch.of(drawn(trials, rngs), len(rngs), config.device)
-        else:
+    cloner = Cloner(agent, config, data.mask.shape[2], monitor)
+    checkpoint = Checkpoint(
+        monitor, rngs, memory=agent.memory, policy=agent.policy, optimizer=cloner.optimizer, draws=draws
+    )
+    if before := checkpoint.load():
+        cloner.done = before["done"]
+    while cloner.done < cloner.total:
+        if shown is trials:
             batch = data.trials(draws.below(len(data), config.batch))
-        losses = agent.clone(batch, batch.action, config.chunk, optimizer)
-        progress((i + 1) * chunks, total, {"imitation": sum(losses) / chunks})
-        watch((i + 1) * chunks, total, agent)
+        else:
+            batch = Batch.of(drawn(trials, rngs), len(rngs), config.device)
+        cloner.learn(batch, batch.action)
+        checkpoint.save(done=cloner.done)
     return agent

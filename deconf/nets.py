@@ -1,4 +1,4 @@
-"""What every method is built from: networks side by side, action and observation heads, and scaling to unit size.
+"""Networks of S seeds side by side: layers, Adam, scaling to unit size, and heads for actions and observations.
 
 S seeds train in one program: every parameter has a leading axis of S, and so has every tensor. Seeds share nothing, so
 that one's numbers are the same, bit for bit, whatever runs beside it.
@@ -6,77 +6,15 @@ that one's numbers are the same, bit for bit, whatever runs beside it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from envs.task import Array, InputError
-from experts.demos import Agent, Trials
-
-Rngs = np.random.Generator | Sequence[np.random.Generator]
-"""One generator for each seed; a single one stands for one seed."""
-
-Progress = Callable[[int, int, dict[str, float]], None]
-"""Called as training goes: updates done, updates in all, losses by name (the mean over seeds)."""
-
-
-Watch = Callable[[int, int, Agent], None]
-"""Shown the agent now and then as training goes: updates done, updates in all, the agent so far."""
-
-Source = Trials | Callable[[Sequence[np.random.Generator]], Trials]
-"""Trials, or what draws fresh ones: as many for each generator."""
-
-
-def no_watch(done: int, total: int, agent: Agent) -> None:
-    """Look away."""
-
-
-def drawn(source: Source, rngs: Sequence[np.random.Generator]) -> Trials:
-    """The trials, or fresh ones."""
-    return source if isinstance(source, Trials) else source(rngs)
-
-
-def no_progress(done: int, total: int, losses: dict[str, float]) -> None:
-    """Report nothing."""
-
-
-def listed(rng: Rngs) -> list[np.random.Generator]:
-    """The generators, one a seed."""
-    return [rng] if isinstance(rng, np.random.Generator) else list(rng)
-
-
-def ramp(done: int, until: float) -> float:
-    """Rises from 0 to 1."""
-    return min(1.0, done / until) if until else 1.0
-
-
-class Draws:
-    """S independent streams of random numbers: row s of every draw comes from generator s alone."""
-
-    def __init__(self, rngs: Sequence[np.random.Generator], device: str | torch.device) -> None:
-        self.device = torch.device(device)
-        self._streams = [torch.Generator(device).manual_seed(int(rng.integers(2**31))) for rng in rngs]
-
-    def __len__(self) -> int:
-        return len(self._streams)
-
-    def uniform(self, *shape: int) -> Tensor:
-        """U(0, 1) [S, *shape]."""
-        return torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self._streams])
-
-    def normal(self, *shape: int) -> Tensor:
-        """N(0, 1) [S, *shape]."""
-        return torch.stack([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
-
-    def below(self, high: int, *shape: int) -> Tensor:
-        """Whole numbers 0 .. high - 1, [S, *shape]."""
-        return torch.stack([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
+from deconf.data import Draws, Signature
 
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
@@ -117,6 +55,17 @@ class Adam:
         self._adam = torch.optim.Adam(self.parameters, learning_rate)
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
 
+    def state_dict(self) -> dict[str, Any]:
+        """Moments and schedule."""
+        schedule = {} if self._schedule is None else self._schedule.state_dict()
+        return {"adam": self._adam.state_dict(), "schedule": schedule}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self._adam.load_state_dict(state["adam"])
+        if self._schedule is not None:
+            self._schedule.load_state_dict(state["schedule"])
+
     def step(self, loss: Tensor) -> None:
         """One update on losses [S]."""
         self._adam.zero_grad()
@@ -131,31 +80,6 @@ class Adam:
         self._adam.step()
         if self._schedule is not None:
             self._schedule.step()
-
-
-@dataclass(frozen=True)
-class Signature:
-    """The kind of data: O, A, the number of discrete actions (0: continuous), and whether observations are 0 or 1."""
-
-    obs: int
-    action: int
-    actions: int
-    binary: bool
-
-    @staticmethod
-    def of(trials: Trials) -> Signature:
-        """Read off data. Observations that hold only 0 and 1 are modelled as Bernoulli, others as Gaussian."""
-        binary = bool(np.isin(trials.obs, (0, 1)).all())
-        return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
-
-    @property
-    def action_features(self) -> int:
-        """Width of an action as a network's input: one-hot if discrete."""
-        return self.actions or self.action
-
-    def encode_action(self, action: Tensor) -> Tensor:
-        """[..., A] -> [..., action_features]."""
-        return F.one_hot(action[..., 0].long(), self.actions).float() if self.actions else action
 
 
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -231,6 +155,12 @@ class Whitener(nn.Module):
         self.left, self.momentum = updates, momentum
         self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
         self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
+
+    def get_extra_state(self) -> Tensor:
+        return torch.tensor(self.left)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        self.left = int(state)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         """[S, ..., F], of which those count where mask [S, ...] is 1."""
@@ -313,114 +243,3 @@ class DynamicsHead(nn.Module):
             return (draws.uniform(*out.shape[1:]) < torch.sigmoid(out)).float()
         change = out + torch.exp(per_seed(self.log_std, out)) * draws.normal(*out.shape[1:])
         return obs + change * per_seed(self.change.std, out) + per_seed(self.change.mean, out)
-
-
-@dataclass
-class Batch:
-    """Trials of S seeds as tensors: the steps that took place, episodes joined end to end and padded at the end.
-
-    obs, next_obs [S, B, T, O]; action [S, B, T, A]; mask [S, B, T], 1 for a step and 0 for padding.
-    """
-
-    obs: Tensor
-    action: Tensor
-    next_obs: Tensor
-    mask: Tensor
-
-    @staticmethod
-    def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
-        """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
-        if len(trials) % seeds:
-            raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
-        mask = trials.mask.reshape(len(trials), -1)
-        order = np.argsort(~mask, axis=1, kind="stable")
-
-        def join(array: NDArray[np.float32]) -> Tensor:
-            flat = np.take_along_axis(array.reshape(*mask.shape, -1), order[..., None], 1)
-            return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
-
-        steps = join(mask.astype(np.float32))[..., 0]
-        return Batch(join(trials.obs[:, :, :-1]), join(trials.action), join(trials.obs[:, :, 1:]), steps)
-
-    @staticmethod
-    def step(
-        obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> Batch:
-        """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
-        rows = [torch.as_tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
-        action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
-        return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
-
-    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int, ...]) -> Batch:
-        return Batch(self.obs[index], self.action[index], self.next_obs[index], self.mask[index])
-
-    def trials(self, index: Tensor) -> Batch:
-        """Seed s's trials index[s], [S, K]."""
-        seed = torch.arange(len(index), device=index.device)[:, None]
-        return self[seed, index]
-
-    def steps(self, index: Tensor) -> Batch:
-        """Seed s's steps index[s] [S, K], as `draw_steps` counts them; without a time axis."""
-        return Batch(*(take_steps(x, index) for x in (self.obs, self.action, self.next_obs, self.mask)))
-
-    @cached_property
-    def _counted(self) -> Tensor:
-        return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
-
-    def joined(self, other: Batch) -> Batch:
-        """The trials of both."""
-        pairs = ((getattr(self, name), getattr(other, name)) for name in ("obs", "action", "next_obs", "mask"))
-        return Batch(*(torch.cat(pair, 1) for pair in pairs))
-
-    def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
-        """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""
-        if k is None:
-            return torch.arange(self.mask[0].numel(), device=self.mask.device).expand(len(self.mask), -1)
-        counted = self._counted
-        count = counted[:, -1:]
-        nth = (draws.uniform(k).double() * count).long().clamp(max=count - 1) + 1
-        return torch.searchsorted(counted, nth)
-
-    def __len__(self) -> int:
-        return self.mask.shape[1]
-
-
-def take_steps(x: Tensor, index: Tensor) -> Tensor:
-    """x [S, B, T, ...] at indices [S, K] into the B T of each seed -> [S, K, ...]."""
-    return x.flatten(1, 2)[torch.arange(len(index), device=index.device)[:, None], index]
-
-
-class LearnedAgent(Agent):
-    """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers."""
-
-    def __init__(self, policy: ActionHead) -> None:
-        parameter = next(policy.parameters())
-        self.seeds, self.device = len(parameter), parameter.device
-
-    def begin(self, n: int) -> None:
-        if n % self.seeds:
-            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
-        self._n = n // self.seeds
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        if len(rngs) != self.seeds:
-            raise InputError(f"an agent of {self.seeds} seeds was given {len(rngs)} generators; it needs one for each")
-        self._draws = Draws(rngs, self.device)
-
-    @torch.no_grad()
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        self._obs = torch.as_tensor(obs, device=self.device).reshape(self.seeds, self._n, -1)
-        return self.choose(self._obs).double().cpu().numpy().reshape(len(obs), -1)
-
-    def choose(self, obs: Tensor) -> Tensor:
-        """Observation [S, N, O] -> action [S, N, A]."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def observe(
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
-        self.remember(Batch.step(self._obs, action, next_obs, alive))
-
-    def remember(self, step: Batch) -> None:
-        """Take note of a transition; agents without memory need nothing here."""

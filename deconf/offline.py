@@ -13,24 +13,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from deconf.agents import Monitor, ramp
+from deconf.data import Batch, Draws, Rngs, Signature, listed, take
 from deconf.deconfounded import DeconfoundedAgent, final_belief
 from deconf.equations import gaussian_kl, offline_loss
 from deconf.models import VariationalModel
-from deconf.nets import (
-    ActionHead,
-    Adam,
-    Batch,
-    Draws,
-    Progress,
-    Rngs,
-    Scaler,
-    Signature,
-    Watch,
-    listed,
-    no_progress,
-    no_watch,
-    ramp,
-)
+from deconf.nets import ActionHead, Adam, Scaler
 from experts.demos import Trials
 
 
@@ -55,16 +43,10 @@ class OfflineConfig:
     device: str = "cpu"
 
 
-def fit(
-    trials: Trials, config: OfflineConfig, rng: Rngs, progress: Progress = no_progress, watch: Watch = no_watch
-) -> DeconfoundedAgent:
+def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
-    rngs = listed(rng)
-    data, signature, draws = (
-        Batch.of(trials, len(rngs), config.device),
-        Signature.of(trials),
-        Draws(rngs, config.device),
-    )
+    rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
+    data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     obs, change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
     offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
@@ -84,27 +66,22 @@ def fit(
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta * warm, batch.mask)
         optimizer.step(loss)
-        progress(update + 1, total, {"offline": loss.mean().item()})
+        monitor.update(update + 1, total, {"offline": loss.mean().item()})
     offline.eval()
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
 
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).unflatten(0, (len(rngs), -1))
+    online.eval()
     agent = DeconfoundedAgent(online, policy)
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
         if update % config.refresh == 0:
-            online.eval()
-            watch(config.offline_updates + update, total, agent)
             synthetic = synthesise(online, policy, latents, starts, trials.mask.shape[2], config, draws)
-            online.train()
         batch = synthetic.trials(draws.below(len(synthetic), config.online_batch))
         warm = ramp(update, config.warm_up * config.online_updates)
-        loss = online.loss(batch, config.online_steps, config.beta * warm, draws)
-        optimizer.step(loss)
-        progress(config.offline_updates + update + 1, total, {"inference": loss.mean().item()})
-    online.eval()
-    watch(total, total, agent)
+        inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
+        monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
     return agent
 
 
@@ -124,19 +101,15 @@ def synthesise(
     the data, where the dynamics were learned.
     """
     n, scaler = config.synthetic, model.inputs.scaler
-    seed = torch.arange(len(draws), device=draws.device)[:, None]
-    theta_hat = latents[seed, draws.below(latents.shape[1], n)]
-    begin = starts[seed, draws.below(starts.shape[1], n)]
+    theta_hat = take(latents, draws.below(latents.shape[1], n))
+    begin = take(starts, draws.below(starts.shape[1], n))
     low, high = (scaler.mean + k * scaler.std for k in (-6, 6))
     steps: list[tuple[Tensor, Tensor, Tensor]] = []
     for episode in range(starts.shape[2]):
-        obs, other = begin[:, :, episode], latents[seed, draws.below(latents.shape[1], n)]
+        obs, other = begin[:, :, episode], take(latents, draws.below(latents.shape[1], n))
         for _ in range(horizon):
             action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
-            uniform = draws.uniform(*action.shape[1:])
-            actions = policy.signature.actions
-            blind = (uniform * actions).floor() if actions else 2 * uniform - 1
-            action = torch.where(draws.uniform(n, 1) < config.random_share, blind, action)
+            action = policy.signature.randomise(action, config.random_share, draws)
             next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
             if not policy.signature.binary:
                 next_obs = torch.maximum(torch.minimum(next_obs, high[:, None]), low[:, None])

@@ -9,9 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from deconf.agents import LearnedAgent, Monitor
 from deconf.beliefs import GruMemory
+from deconf.data import Batch, Draws, Signature
 from deconf.equations import imitation_loss
-from deconf.nets import ActionHead, Adam, Batch, Draws, LearnedAgent, Scaler, Signature
+from deconf.nets import ActionHead, Adam, Scaler
 
 
 @dataclass(frozen=True)
@@ -57,19 +59,8 @@ class RecurrentAgent(LearnedAgent):
     def features(self) -> NDArray[np.float32]:
         return self._state.flatten(0, 1).cpu().numpy()
 
-    def clone(self, batch: Batch, label: Tensor, chunk: int, optimizer: Adam) -> list[float]:
-        """Pass through trials once, an update a chunk, the memory passed on; the loss of each.
-
-        label [S, B, T, A]: the expert's action at each step, which need not be the one taken.
-        """
-        state, losses = self.memory.start(len(batch)), []
-        for begin in range(0, batch.mask.shape[2], chunk):
-            loss, state = self._loss(batch[:, :, begin : begin + chunk], label[:, :, begin : begin + chunk], state)
-            optimizer.step(loss)
-            losses.append(loss.mean().item())
-        return losses
-
-    def _loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """The imitation loss [S] of labels [S, B, T, A] after a memory [S, B, W], and the memory after the batch."""
         states = self.memory(batch, state)
         features = torch.cat([states[:, :, :-1], self.memory.inputs.scaler(batch.obs)], -1)
         log_policy = self.policy.log_prob(features, label)
@@ -78,4 +69,32 @@ class RecurrentAgent(LearnedAgent):
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
         """The imitation loss [S] on the expert's trials."""
-        return self._loss(batch, batch.action, self.memory.start(len(batch)))[0]
+        return self.loss(batch, batch.action, self.memory.start(len(batch)))[0]
+
+
+class Cloner:
+    """Trains an agent by likelihood: passes through trials, an update a chunk, the memory passed on between chunks.
+
+    Updates are shared out equally over `rounds`; `passes` counts those of one round, `done` the updates so far.
+    """
+
+    def __init__(
+        self, agent: RecurrentAgent, config: RecurrentConfig, steps: int, monitor: Monitor, rounds: int = 1
+    ) -> None:
+        self.agent, self.chunk, self.monitor, self.done = agent, config.chunk, monitor, 0
+        self.chunks = -(-steps // config.chunk)
+        self.passes = -(-config.updates // (self.chunks * rounds))
+        self.total = self.passes * self.chunks * rounds
+        cooled = self.total if config.cooled else None
+        self.optimizer = Adam([agent.memory, agent.policy], config.learning_rate, cooled)
+
+    def learn(self, batch: Batch, label: Tensor) -> None:
+        """One pass. label [S, B, T, A]: the expert's action at each step, which need not be the one taken."""
+        state, losses = self.agent.memory.start(len(batch)), []
+        for begin in range(0, self.chunks * self.chunk, self.chunk):
+            part = slice(begin, begin + self.chunk)
+            loss, state = self.agent.loss(batch[:, :, part], label[:, :, part], state)
+            self.optimizer.step(loss)
+            losses.append(loss.mean().item())
+        self.done += self.chunks
+        self.monitor.update(self.done, self.total, {"imitation": sum(losses) / self.chunks}, self.agent)

@@ -107,9 +107,7 @@ class Task(ABC):
 
     name: ClassVar[str]
     version: ClassVar[int] = 0
-    tier: ClassVar[int | None] = (
-        2  # which of the paper's tiers identifies the interventional policy; None: nothing does
-    )
+    tier: ClassVar[int | None] = 2  # of the paper, that identifies the interventional policy; None: none does
     latents: ClassVar[tuple[Latent, ...]]
     horizon: ClassVar[int]
     episodes: ClassVar[int] = 5  # of one trial

@@ -15,6 +15,7 @@ from benchmarks.methods import METHODS, Context, Preset
 from deconf import cloning, deconfounded, naive_rnn
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief
 from deconf.dagger import DaggerConfig
+from deconf.data import Batch, Draws, Signature
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.equations import (
     gaussian_kl,
@@ -27,7 +28,7 @@ from deconf.equations import (
     reparametrise,
 )
 from deconf.exact import ExactAgent
-from deconf.nets import Batch, Draws, Scaler, Signature, no_progress
+from deconf.nets import Scaler
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from experts import policy
@@ -266,7 +267,7 @@ class TestMethods:
         key = {"oracle": "oracle_bc", "offline": "deconfounded_offline", "discrete": "deconfounded_discrete"}
         task, found = envs.get(name), []
         for seeds in ((5,), (4, 5, 6)):
-            context = Context(task, settings, seeds, no_progress)
+            context = Context(task, settings, seeds)
             agent = METHODS[key.get(method, method)](context)[key.get(method, method)]
             trials, _ = run_trials(context.env, agent, task.episodes, list(seeds))
             found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)

@@ -13,7 +13,6 @@ from benchmarks.presets import preset
 from benchmarks.score import normalise
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent, Grid
-from deconf.nets import no_progress
 from envs.task import Array
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
@@ -73,6 +72,6 @@ def test_tier_2_fails_at_the_fork() -> None:
         explore_trials=32,
         deconfounded=DeconfoundedConfig(rounds=2, inference_updates=300, imitation_updates=300, final_updates=500),
     )
-    agent = METHODS["deconfounded"](Context(task, settings, [0], no_progress))["deconfounded"]
+    agent = METHODS["deconfounded"](Context(task, settings, [0]))["deconfounded"]
     last = scores(envs.BatchEnv(task, N), agent)[-1]
     assert last < 0.6

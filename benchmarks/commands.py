@@ -1,0 +1,91 @@
+"""What run.py and paper.py share: their arguments, the checks of these, and what a run says of itself."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import envs
+from benchmarks.methods import Preset
+from benchmarks.pool import Finished, Job, prepare, run_all, worked
+from benchmarks.presets import PRESETS, preset
+from envs.console import Parser
+from experts import policy
+
+LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
+KEPT = "what was finished is kept, and --resume goes on"
+
+
+def parser(description: str | None, methods: str) -> Parser:
+    """Arguments of a run; methods: help on what they may be."""
+    made = Parser(description)
+    made.add_argument(
+        "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
+    )
+    made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
+    made.add_argument("--seeds", type=int, metavar="N", help="how many seeds; default: the preset's")
+    made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    made.add_argument("--out", type=Path, help="output folder; default: a folder under results/")
+    made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    return made
+
+
+def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]) -> list[str]:
+    """The methods asked for. Raises InputError for anything that cannot be run."""
+    if args.preset not in PRESETS:
+        raise envs.closest("preset", args.preset, list(PRESETS))
+    methods = list(known) if args.methods == ["all"] else args.methods or list(default)
+    for name in methods:
+        if name not in known:
+            raise envs.closest("method", name, list(known))
+    if args.seeds is not None and args.seeds < 1:
+        raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
+    try:
+        torch.zeros(1, device=args.device).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
+    return methods
+
+
+def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
+    """What a run must agree in for its jobs to be kept."""
+    return {
+        "task": task.name,
+        "task_version": task.version,
+        "preset": name,
+        "settings": asdict(settings),
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "expert": policy.fingerprint(task),
+    }
+
+
+def run(
+    kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
+) -> tuple[Finished, dict[str, Any]]:
+    """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
+    settings = preset(args.preset, task, args.device)
+    seeds = args.seeds or settings.seeds
+    described = about(task, args.preset, settings)
+    prepare(folder, described, args.resume)
+    start, label = time.time(), f"{task.name}, {args.preset}"
+    finished, resumed = run_all(kind, task.name, settings, methods, seeds, args.device, folder / "jobs", label)
+    return finished, {
+        "task": task.name,
+        "task_version": task.version,
+        "preset": args.preset,
+        "seeds": list(range(seeds)),
+        "eval_trials": settings.eval_trials,
+        "versions": described["versions"],
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
+        "wall_s": round(worked(start, finished), 1),
+        "resumed": resumed,
+    }

@@ -1,0 +1,115 @@
+"""What fitting a method and deploying it have in common: the monitor of training, and the agent of S seeds."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from deconf.data import Batch, Draws
+from deconf.nets import ActionHead
+from envs.task import Array, InputError
+from experts.demos import Agent
+
+State = dict[str, Any]
+"""Tensors, numbers, strings, and lists and dictionaries of these."""
+
+
+class Monitor:
+    """What training reports to, and where it leaves what it needs to go on after an interruption. This one is deaf.
+
+    `budget` counts the data that a seed used, by kind; whoever makes the data counts it.
+    """
+
+    def __init__(self) -> None:
+        self.budget: dict[str, int] = {"expert_trials": 0, "exploration_trials": 0, "queries": 0}
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        """Updates done, updates in all, losses by name (the mean over seeds), and the agent so far, if it can act."""
+
+    def save(self, state: Callable[[], State]) -> None:
+        """Training could go on from here, given `state()`."""
+
+    def load(self) -> State | None:
+        """What was saved, if training was interrupted."""
+        return None
+
+
+class Stateful(Protocol):
+    """A network, an optimizer, or random numbers."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
+
+
+class Checkpoint:
+    """The parts of a training run, to be left with its monitor and put back as they were."""
+
+    def __init__(self, monitor: Monitor, rngs: Sequence[np.random.Generator], **parts: Stateful) -> None:
+        self.monitor, self.rngs, self.parts = monitor, rngs, parts
+
+    def save(self, **rest: Any) -> None:
+        """rest: what else is needed to go on."""
+        self.monitor.save(
+            lambda: {
+                "rngs": [rng.bit_generator.state for rng in self.rngs],
+                "parts": {name: part.state_dict() for name, part in self.parts.items()},
+                "rest": rest,
+            }
+        )
+
+    def load(self) -> State | None:
+        """Put the parts back; returns the rest. None, and nothing is touched, if nothing was saved."""
+        if (state := self.monitor.load()) is None:
+            return None
+        for rng, before in zip(self.rngs, state["rngs"], strict=True):
+            rng.bit_generator.state = before
+        for name, part in self.parts.items():
+            part.load_state_dict(state["parts"][name])
+        return state["rest"]
+
+
+def ramp(done: int, until: float) -> float:
+    """Rises from 0 to 1."""
+    return min(1.0, done / until) if until else 1.0
+
+
+class LearnedAgent(Agent):
+    """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers."""
+
+    def __init__(self, policy: ActionHead) -> None:
+        parameter = next(policy.parameters())
+        self.seeds, self.device = len(parameter), parameter.device
+
+    def begin(self, n: int) -> None:
+        if n % self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
+        self._n = n // self.seeds
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        if len(rngs) != self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {len(rngs)} generators; it needs one for each")
+        self._draws = Draws(rngs, self.device)
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        self._obs = torch.as_tensor(obs, device=self.device).reshape(self.seeds, self._n, -1)
+        return self.choose(self._obs).double().cpu().numpy().reshape(len(obs), -1)
+
+    @abstractmethod
+    def choose(self, obs: Tensor) -> Tensor:
+        """Observation [S, N, O] -> action [S, N, A]."""
+
+    @torch.no_grad()
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.remember(Batch.step(self._obs, action, next_obs, alive))
+
+    def remember(self, step: Batch) -> None:
+        """Take note of a transition; agents without memory need nothing here."""

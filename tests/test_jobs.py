@@ -1,0 +1,103 @@
+"""Jobs of a run: a checkpoint within one, and what it must not change."""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import envs
+from benchmarks import pool
+from benchmarks.jobs import BenchmarkJob, CurveMonitor
+from benchmarks.paper import FigureJob
+from benchmarks.presets import preset
+from deconf.deconfounded import DeconfoundedConfig
+from deconf.recurrent import RecurrentConfig
+from experts.demos import Agent
+
+
+def settings(name: str, fresh: bool) -> Any:
+    """Twenty-odd updates."""
+    model = DeconfoundedConfig(
+        width=16, rounds=5, inference_updates=2, imitation_updates=2, inference_batch=4, final_updates=4
+    )
+    return replace(
+        preset("smoke", envs.get(name), "cpu"),
+        expert_trials=8,
+        explore_trials=4,
+        eval_trials=8,
+        fresh=fresh,
+        deconfounded=replace(model, accumulate=not fresh),
+        naive=RecurrentConfig(width=16, updates=12, chunk=300, batch=4),
+    )
+
+
+@pytest.mark.parametrize("share", [0.45, 0.8])
+@pytest.mark.parametrize(
+    ("kind", "task", "method", "fresh"),
+    [
+        (BenchmarkJob, "slippery_cartpole", "deconfounded", False),
+        (BenchmarkJob, "slippery_cartpole", "naive_rnn", False),
+        (FigureJob, "bandit", "deconfounded_gru", True),
+        (FigureJob, "bandit", "naive_rnn", True),
+    ],
+)
+def test_interrupted_training_goes_on(
+    kind: type[pool.Job],
+    task: str,
+    method: str,
+    fresh: bool,
+    share: float,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A job that was killed and begun again writes, bit for bit, what it would have written."""
+    monkeypatch.setattr(pool, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    whole, broken = (kind(task, settings(task, fresh), method, (0, 1), tmp_path / name) for name in ("whole", "broken"))
+    for job in (whole, broken):
+        job.folder.mkdir()
+    whole.run()
+
+    def unplugged(
+        self: pool.JobMonitor, done: int, total: int, losses: dict[str, float], agent: Agent | None = None
+    ) -> None:
+        tell(self, done, total, losses, agent)
+        seen.append(done / total)
+        if max(seen[:-1], default=0) < share <= done / total:
+            raise KeyboardInterrupt
+
+    seen: list[float] = []
+    tell = pool.JobMonitor.update
+    monkeypatch.setattr(pool.JobMonitor, "update", unplugged)
+    with pytest.raises(KeyboardInterrupt):
+        broken.run()
+    assert [file.suffix for file in broken.folder.iterdir()] == [".pt"]
+    first = len(seen)
+    broken.run()
+    assert seen[0] < seen[first] <= seen[first - 1]  # it went on
+    for seed in (0, 1):
+        expected, found = whole.load(seed), broken.load(seed)
+        assert expected is not None
+        assert found is not None
+        for key in expected.keys() - {"meta"}:
+            np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
+        assert {k: v for k, v in found["meta"].items() if k not in ("spans", "train_s")} == {
+            k: v for k, v in expected["meta"].items() if k not in ("spans", "train_s")
+        }
+        assert len(found["meta"]["spans"]) == 2
+    assert not list(broken.folder.glob(".*.pt"))
+
+
+def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
+    monitor = CurveMonitor(job, 0.8)
+    assert monitor.load() is None
+    for junk in (b"", b"junk", b"PK\x03\x04 half a zip"):
+        monitor.file.write_bytes(junk)
+        assert monitor.load() is None
