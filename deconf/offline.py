@@ -32,7 +32,7 @@ class OfflineConfig:
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
     beta: float = 1e-3  # of Eq. (6), a step
-    warm_up: float = 0.5  # share of updates over which either beta rises to its value
+    warm_up: float = 0.5  # share of online updates over which this beta rises to its value
     online_updates: int = 2000
     online_batch: int = 32  # synthetic trials
     online_steps: int = 2048  # of them, whose next observation is predicted
@@ -57,14 +57,13 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
         batch = data.trials(draws.below(len(data), config.offline_batch))
-        warm = ramp(update, config.warm_up * config.offline_updates)
         belief = offline.belief(offline.last(batch))
         mean, std = belief.chunk(2, -1)
         theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
         log_next = offline.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)[..., 0]
         log_policy = policy.log_prob(torch.cat([online.inputs.obs(batch.obs), theta_hat], -1), batch.action)
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
-        loss = offline_loss(log_next, log_policy, kl, config.offline_beta * warm, batch.mask)
+        loss = offline_loss(log_next, log_policy, kl, config.offline_beta, batch.mask)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
     offline.eval()
