@@ -35,7 +35,7 @@ _CONTROL = Preset(
     discrete=DeconfoundedConfig(model="discrete", latent=16, inference_updates=400),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
-    dagger=DaggerConfig(updates=6000, learning_rate=3e-3),
+    dagger=DaggerConfig(updates=4500, learning_rate=3e-3),
     cloning=CloningConfig(),
 )
 _ON_BANDIT = DeconfoundedConfig(

@@ -75,4 +75,5 @@ class ExactAgent(Agent):
         self.log_belief = np.where(alive[:, None], updated, self.log_belief)
 
     def features(self) -> NDArray[np.float32]:
-        return np.exp(self.log_belief).astype(np.float32)
+        """The posterior mean of the encoded theta."""
+        return (np.exp(self.log_belief) @ self.env.task.encode_theta(self.grid.theta)).astype(np.float32)

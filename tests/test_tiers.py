@@ -63,9 +63,10 @@ def test_exact_policies_at_the_fork() -> None:
     assert scores(env, ExactAgent(env, expert, True))[-1] < 0.7
 
 
-def test_tier_2_fails_at_the_fork() -> None:
-    """forked_path: given what dynamics tell, expert trials mix left and right."""
-    task = envs.get("forked_path")
+@pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
+def test_tier_2_fails(name: str) -> None:
+    """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
+    task = envs.get(name)
     settings = replace(
         preset("default", task, "cpu"),
         expert_trials=64,
