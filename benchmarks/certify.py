@@ -140,6 +140,7 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (witness.dynamics, witness.actions))
+    ratio = actions / dynamics if dynamics else None  # None where expert trials tell nothing of theta
     return {
         "task": task.name,
         "task_version": task.version,
@@ -149,7 +150,11 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
         "return_expert": float(one),
         "interventional": {"return": interventional.tolist(), "score": scored["int"].tolist()},
         "conditional": {"return": conditional.tolist(), "score": scored["cond"].tolist()},
-        "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": actions / dynamics},
+        "evidence_nats_per_step": {
+            "dynamics": dynamics,
+            "actions": actions,
+            "delusion_ratio": ratio,
+        },
         "inferability": [inferability(task, belief, witness.grid.theta, truth) for belief in beliefs],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
@@ -190,7 +195,9 @@ def picture(result: dict[str, Any], file: Path) -> None:
     middle.legend(frameon=False)
     evidence = result["evidence_nats_per_step"]
     right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
-    right.set(yscale="log", ylabel="nats a step", title=f"evidence of theta, ratio {evidence['delusion_ratio']:.3g}")
+    ratio = evidence["delusion_ratio"]
+    told = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
+    right.set(yscale="symlog", ylabel="nats a step", title=told)
     figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
     figure.savefig(file, dpi=110)
     plt.close(figure)

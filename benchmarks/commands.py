@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import platform
 import time
@@ -25,14 +26,14 @@ LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
 
 
-def parser(description: str | None, methods: str) -> Parser:
-    """Arguments of a run; methods: help on what they may be."""
+def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
+    """Arguments of a run; methods: help on what they may be; seeds: how many by default, if not the preset's."""
     made = Parser(description)
     made.add_argument(
         "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
     )
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
-    made.add_argument("--seeds", type=int, metavar="N", help="how many seeds; default: the preset's")
+    made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     made.add_argument("--out", type=Path, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
@@ -53,7 +54,7 @@ def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]
         torch.zeros(1, device=args.device).item()
     except (RuntimeError, AssertionError, NotImplementedError):
         raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
-    return methods
+    return list(dict.fromkeys(methods))
 
 
 def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
@@ -65,7 +66,18 @@ def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
         "settings": asdict(settings),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
         "expert": policy.fingerprint(task),
+        "code": code(task),
     }
+
+
+def code(task: envs.Task) -> str:
+    """SHA-256 of the source and the MJCF that a run's numbers depend on."""
+    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
+    own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "paper"))
+    for file in (*sources, *own, envs.task.ASSETS / f"{task.name}.xml"):
+        digest.update(file.read_bytes() if file.exists() else b"")
+    return digest.hexdigest()
 
 
 def run(

@@ -50,16 +50,15 @@ class Recorder(Agent):
         self.episode += 1
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        action = self.agent.act(obs)
-        if self.episode == self.env.task.episodes and self.env.alive[self.trial]:
-            self.states.append(self.env.state[self.trial].copy())
-            self.actions.append(action[self.trial])
-        return action
+        return self.agent.act(obs)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         self.agent.observe(obs, action, next_obs, alive)
+        if self.episode == self.env.task.episodes and alive[self.trial]:
+            self.states.append(self.env.state[self.trial].copy())
+            self.actions.append(action[self.trial])
 
 
 class CurveMonitor(JobMonitor):
@@ -81,7 +80,7 @@ class BenchmarkJob(Job):
         agents = METHODS[self.method](context)
         trained = monitor.worked()
         found = {name: evaluate(context, agent, self.method in LEARNED) for name, agent in agents.items()}
-        meta = {"agents": list(agents), "curve": monitor.kept, "budget": monitor.budget}
+        meta = {"agents": list(agents), "curve": monitor.kept}
         for i, seed in enumerate(self.seeds):
             rows = context.rows(i)
             arrays: dict[str, Any] = {"theta": context.env.theta[rows]}

@@ -1,4 +1,4 @@
-"""The methods that the benchmark scores, by name: how each agent comes about for one seed.
+"""The methods that the benchmark scores, by name: how each agent comes about, for seeds side by side.
 
 Learned methods get trials without theta; only the oracle gets theta, and only references get the environment.
 """
@@ -43,7 +43,7 @@ class Preset:
     explore_trials: int  # a round
     eval_trials: int
     query_trials: int  # a round
-    fresh: bool  # demonstrations are drawn anew for each round (deconfounded) or update (naive_rnn)
+    fresh: int  # expert trials drawn anew for each update of naive_rnn, and round of what does not accumulate; or 0
     grid: int
     deconfounded: DeconfoundedConfig
     discrete: DeconfoundedConfig
@@ -68,25 +68,24 @@ class Context:
         """Trials, of those that agents are scored in, of the i-th seed."""
         return slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
 
-    def _expert_trials(self, seeds: list[int]) -> tuple[Trials, Array]:
-        env = envs.BatchEnv(self.task, self.preset.expert_trials * len(seeds))
-        self.monitor.budget["expert_trials"] += self.preset.expert_trials
+    def _expert_trials(self, n: int, seeds: list[int]) -> tuple[Trials, Array]:
+        env = envs.BatchEnv(self.task, n * len(seeds))
+        self.monitor.spend("expert_trials", [n] * len(seeds))
         seeds = [stream(DEMOS, seed) for seed in seeds]
         return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0], env.theta
 
     @cached_property
     def demonstrations(self) -> tuple[Trials, Array]:
         """Expert trials, and beside them theta [B, L] for the oracle."""
-        return self._expert_trials(self.seeds)
+        return self._expert_trials(self.preset.expert_trials, self.seeds)
 
     def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
         """Fresh expert trials."""
-        return self._expert_trials([int(rng.integers(2**31)) for rng in rngs])[0]
+        return self._expert_trials(self.preset.fresh, [int(rng.integers(2**31)) for rng in rngs])[0]
 
-    @property
-    def source(self) -> Source:
-        """What there is to imitate: a fixed set of trials, or fresh ones for each update."""
-        return self.demonstrate if self.preset.fresh else self.demonstrations[0]
+    def source(self, fresh: bool) -> Source:
+        """What there is to imitate: the fixed set of trials, or what draws fresh ones."""
+        return self.demonstrate if fresh else self.demonstrations[0]
 
     @property
     def rngs(self) -> list[np.random.Generator]:
@@ -97,19 +96,19 @@ class Context:
         self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]
     ) -> tuple[Trials, envs.BatchEnv]:
         env = envs.BatchEnv(self.task, n * len(rngs))
+        self.monitor.spend("exploration_trials", [n] * len(rngs))
         seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
         behaviour = agent or RandomAgent(self.task.action_space)
         return run_trials(env, behaviour, self.task.episodes, seeds)[0], env
 
     def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
         """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
-        self.monitor.budget["exploration_trials"] += self.preset.explore_trials
         return self._roll_out(self.preset.explore_trials, agent, rngs)[0]
 
     def query(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, NDArray[np.float32]]:
         """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
         trials, env = self._roll_out(self.preset.query_trials, agent, rngs)
-        self.monitor.budget["queries"] += int(trials.mask.sum()) // len(rngs)
+        self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
         theta, random = env.theta, Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
@@ -123,7 +122,8 @@ def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent
 
 
 def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
-    agent = deconfounded.fit(context.source, context.explore, config, context.rngs, context.monitor)
+    source = context.source(context.preset.fresh > 0 and not config.accumulate)
+    agent = deconfounded.fit(source, context.explore, config, context.rngs, context.monitor)
     return _deploy(name, agent)
 
 
@@ -134,7 +134,7 @@ def _offline(context: Context) -> dict[str, Agent]:
 
 
 def _naive_rnn(context: Context) -> dict[str, Agent]:
-    agent = naive_rnn.fit(context.source, context.preset.naive, context.rngs, context.monitor)
+    agent = naive_rnn.fit(context.source(context.preset.fresh > 0), context.preset.naive, context.rngs, context.monitor)
     return {"naive_rnn": agent}
 
 

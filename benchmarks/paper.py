@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import envs
-from benchmarks import commands
+from benchmarks import commands, score
 from benchmarks.figures import figure_2, figure_3
 from benchmarks.methods import EVALUATION, METHODS, Context, stream
 from benchmarks.pool import Finished, Job, JobMonitor, by_method
@@ -110,7 +110,7 @@ class FigureJob(Job):
         onlooker = Onlooker(agent, ExpertAgent(context.env, context.expert))
         run_trials(context.env, onlooker, 1, [stream(EVALUATION, seed) for seed in self.seeds])
         would = np.concatenate(onlooker.would, -1) == context.env.theta
-        meta = {"train_s": trained, "budget": monitor.budget}
+        meta = {"train_s": trained}
         for i, seed in enumerate(self.seeds):
             rows, seen = context.rows(i), monitor.kept
             arrays = {"online": best[rows].mean(0), "on_expert": would[rows].mean(0), "pulls": pulls[rows].mean()}
@@ -161,7 +161,7 @@ def summarise(finished: Finished, references: dict[str, dict[str, Any]]) -> dict
             "loss": round(float(np.mean([entry["loss_curve"][-1] for entry in data])), 4),
             "online": curve.round(4).tolist(),
             "on_expert": np.mean([entry["on_expert"] for entry in data], 0).round(4).tolist(),
-            "budget": data[0]["meta"]["budget"],
+            "budget": score.mean_budget(data),
             "train_s": round(float(np.mean([entry["meta"]["train_s"] for entry in data])), 1),
         }
     return found
@@ -182,9 +182,8 @@ def table(methods: dict[str, Any]) -> str:
 
 def main() -> None:
     """The command line."""
-    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}").parse_args()
+    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10).parse_args()
     methods = commands.check(args, LEARNERS, SHOWN)
-    args.seeds = args.seeds or 10
     task = envs.get("bandit")
     folder = args.out or Path("results") / f"paper-{args.preset}"
     finished, results = commands.run(FigureJob, task, args, methods, folder)
@@ -198,6 +197,7 @@ def main() -> None:
     write_atomically(folder / "rows.csv", "\n".join(["method,seed,pulls", *rows]) + "\n")
     figure_2(task, folder / "figure2.png")
     figure_3([entry for entry in finished if entry[0] in SHOWN], references, folder / "figure3.png")
+    figure_3(finished, references, folder / "tiers.png")
     print(f"\n{table(results['methods'])}\n\n{results['wall_s']:.0f} s -> {folder / 'figure3.png'}")
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import multiprocessing
 import os
+import re
 import signal
 import threading
 import time
@@ -24,7 +25,7 @@ import numpy as np
 import torch
 
 import envs
-from benchmarks.methods import COST, LEARNED, Preset
+from benchmarks.methods import COST, LEARNED, METHODS, Preset
 from deconf.agents import Monitor, State
 from envs.console import Progress, check_folder, write_atomically, write_json
 from envs.physics import cores
@@ -57,9 +58,12 @@ class Job(ABC):
         return 100 * COST.get(self.method, 1) * len(self.seeds)
 
     def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
-        """Write the file of a seed, atomically; beside `meta` it holds when the job was at work."""
+        """Write the file of a seed, atomically; beside `meta` it holds the seed's budget, and when work went on."""
         buffer = io.BytesIO()
-        np.savez_compressed(buffer, meta=np.array(json.dumps({**meta, "spans": monitor.spans()})), **arrays)
+        i = self.seeds.index(seed)
+        budget = {kind: each[i] for kind, each in monitor.budget.items()}
+        whole = {**meta, "budget": budget, "spans": monitor.spans()}
+        np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
     def load(self, seed: int) -> dict[str, Any] | None:
@@ -158,7 +162,7 @@ def run_all(
     folder: Path,
     label: str,
 ) -> tuple[Finished, int]:
-    """Run what has no file yet; returns all that is written now, and how many files were there before."""
+    """Run what has no file yet; returns all that is in the folder now, and how many files were there before."""
     every = [kind(task, preset, method, tuple(range(seeds)), folder) for method in methods]
     left = [[seed for seed in job.seeds if job.load(seed) is None] for job in every]
     parts = [
@@ -167,8 +171,20 @@ def run_all(
         for part in groups(job.method, missing, device)
     ]
     run_jobs(parts, label)
-    finished = [(job.method, seed, data) for job in every for seed in job.seeds if (data := job.load(seed)) is not None]
+    for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
+        stale.unlink()
+    done = written(every[0], folder)
+    finished = [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
     return finished, len(finished) - sum(map(len, left))
+
+
+def written(like: Job, folder: Path) -> list[Job]:
+    """A job for each file in the folder, those of other methods and seeds than this command's too; in order."""
+    named = [re.fullmatch(r"(\w+)-(\d+)", file.stem) for file in folder.glob("*.npz")]
+    pairs = [(match[1], int(match[2])) for match in named if match and match[1] in METHODS]
+    order = list(METHODS)
+    pairs.sort(key=lambda pair: (order.index(pair[0]), pair[1]))
+    return [replace(like, method=method, seeds=(seed,)) for method, seed in pairs]
 
 
 def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
@@ -203,8 +219,9 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             before = json.loads(file.read_text())
         except ValueError:
             raise envs.InputError(f"{file} is damaged; give another --out") from None
-        if before != json.loads(json.dumps(settings)):
-            raise envs.InputError(f"{folder} holds a run with other settings; give another --out")
+        now = json.loads(json.dumps(settings))
+        if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
+            raise envs.InputError(f"{folder} holds a run with another {differ[0]}; give another --out, or remove it")
 
 
 def run_jobs(jobs: list[Job], label: str) -> None:

@@ -29,7 +29,7 @@ _CONTROL = Preset(
     explore_trials=64,
     eval_trials=128,
     query_trials=32,
-    fresh=False,
+    fresh=0,
     grid=21,
     deconfounded=DeconfoundedConfig(inference_updates=800, inference_rate=2e-3),
     discrete=DeconfoundedConfig(model="discrete", latent=16, inference_updates=400),
@@ -53,7 +53,7 @@ _BANDIT = Preset(
     explore_trials=8000,
     eval_trials=4000,
     query_trials=2000,
-    fresh=False,
+    fresh=0,
     grid=0,
     deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=6400),
     discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=800),
@@ -77,9 +77,8 @@ _BANDIT = Preset(
 _PAPER = replace(  # appendix D and table 1; what they leave open is in docs/paper.md
     _BANDIT,
     seeds=10,
-    expert_trials=100,
     explore_trials=400,  # for four updates of 100
-    fresh=True,
+    fresh=100,
     deconfounded=DeconfoundedConfig(
         model="gru",
         width=256,
@@ -100,6 +99,7 @@ _PAPER = replace(  # appendix D and table 1; what they leave open is in docs/pap
         fit_prior=False,
         random_share=1.0,
     ),
+    discrete=replace(_BANDIT.discrete, rounds=40, inference_updates=40, imitation_updates=40),
     naive=RecurrentConfig(width=256, updates=5000, batch=100, chunk=100, learning_rate=1e-3, cooled=False),
 )
 

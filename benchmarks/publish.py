@@ -42,18 +42,22 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="output folder of a finished run")
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     args = parser.parse_args()
-    if not (args.run / "results.json").is_file():
-        raise envs.InputError(f"{args.run} holds no results.json; give the output folder of a finished run")
+    wanted = [args.run / name for name in ("results.json", "adaptation.png")]
+    if not all(file.is_file() for file in wanted):
+        raise envs.InputError(f"{args.run} holds no results.json and adaptation.png of a finished run of run.py")
     try:
-        results = json.loads((args.run / "results.json").read_text())
-    except ValueError:
-        raise envs.InputError(f"{args.run / 'results.json'} is damaged; run the benchmark again") from None
+        results = json.loads(wanted[0].read_text())
+        text = markdown(results)
+    except (ValueError, KeyError):
+        raise envs.InputError(f"{wanted[0]} is damaged; run the benchmark again") from None
+    if results["preset"] == "smoke":
+        raise envs.InputError(f"{args.run} is a smoke run, whose figures mean nothing; give one of another preset")
     check_folder(args.docs)
     shutil.copy(args.run / "results.json", args.docs / f"{results['task']}.json")
     shutil.copy(args.run / "adaptation.png", args.docs / f"{results['task']}.png")
     if (args.run / "video.mp4").exists():
         gif(args.run / "video.mp4", args.docs / f"{results['task']}.gif")
-    print(markdown(results))
+    print(text)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
 
 
 def learning(curves: dict[str, list[dict[str, Any]]], title: str, file: Path) -> None:
-    """Training losses over updates, one panel a loss; a thin line a seed."""
+    """Training losses over updates, one panel a loss; a thin line a group of seeds that trained side by side."""
     kinds = sorted({kind for seeds in curves.values() for curve in seeds for kind in curve})
     figure, panels = plt.subplots(1, max(len(kinds), 1), figsize=(4.5 * max(len(kinds), 1), 3.4), layout="constrained")
     for panel, kind in zip(np.atleast_1d(panels), kinds, strict=False):
@@ -92,10 +92,9 @@ def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], fil
         frames = zip(clip["state"], clip["action"], strict=True)
         columns.append([_labelled(paint(state, action), name) for state, action in frames])
     columns = [column for column in columns if column]
-    settings: dict[str, Any] = {"quality": 6, "macro_block_size": 8} if file.suffix == ".mp4" else {"loop": 0}
     rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
     writer: Any
-    with imageio.get_writer(file, fps=rate, **settings) as writer:
+    with imageio.get_writer(file, fps=rate, quality=6, macro_block_size=8) as writer:
         for t in range(max(len(frames) for frames in columns)):  # who failed early stands still
             writer.append_data(np.concatenate([frames[min(t, len(frames) - 1)] for frames in columns], 1))
 

@@ -44,13 +44,22 @@ def probe(features: Array, theta: Array, ridge: float = 1e-3) -> float:
 
 
 def bootstrap(values: Array) -> list[float] | None:
-    """95% percentile-bootstrap interval of the mean over seeds; None for a single seed."""
+    """95% percentile-bootstrap interval of the mean over seeds; None for a single seed.
+
+    Of few seeds it is too narrow: of three it is just their range, which holds the mean three times in four.
+    """
     if len(values) < 2:
         return None
     if np.ptp(values) == 0:
         return [float(values[0])] * 2
     interval = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=0).confidence_interval
     return [float(interval.low), float(interval.high)]
+
+
+def mean_budget(jobs: Sequence[dict[str, Any]]) -> dict[str, int]:
+    """What a seed used, by kind of data: the mean over jobs."""
+    budgets = [job["meta"]["budget"] for job in jobs]
+    return {kind: round(float(np.mean([budget[kind] for budget in budgets]))) for kind in budgets[0]}
 
 
 def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int) -> dict[str, Any]:
@@ -79,7 +88,7 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
             "ci95": bootstrap(scores[:, episodes - 1]),
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": probes[:, :episodes].mean(0).round(4).tolist(),
-            "budget": jobs[0][1]["meta"]["budget"],
+            "budget": mean_budget([data for _, data in jobs]),
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()

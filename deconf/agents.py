@@ -23,11 +23,16 @@ State = dict[str, Any]
 class Monitor:
     """What training reports to, and where it leaves what it needs to go on after an interruption. This one is deaf.
 
-    `budget` counts the data that a seed used, by kind; whoever makes the data counts it.
+    `budget` counts the data that each seed used, by kind; whoever makes the data tells by `spend`.
     """
 
     def __init__(self) -> None:
-        self.budget: dict[str, int] = {"expert_trials": 0, "exploration_trials": 0, "queries": 0}
+        self.budget: dict[str, list[int]] = {}
+
+    def spend(self, kind: str, each: Sequence[int]) -> None:
+        """Each seed used so much more of a kind of data."""
+        before = self.budget.get(kind, [0] * len(each))
+        self.budget[kind] = [int(a + b) for a, b in zip(before, each, strict=True)]
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         """Updates done, updates in all, losses by name (the mean over seeds), and the agent so far, if it can act."""
@@ -98,8 +103,10 @@ class LearnedAgent(Agent):
 
     @torch.no_grad()
     def act(self, obs: NDArray[np.float32]) -> Array:
-        self._obs = torch.as_tensor(obs, device=self.device).reshape(self.seeds, self._n, -1)
-        return self.choose(self._obs).double().cpu().numpy().reshape(len(obs), -1)
+        return self.choose(self._tensor(obs)).double().cpu().numpy().reshape(len(obs), -1)
+
+    def _tensor(self, obs: NDArray[np.float32]) -> Tensor:
+        return torch.as_tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)
 
     @abstractmethod
     def choose(self, obs: Tensor) -> Tensor:
@@ -109,7 +116,7 @@ class LearnedAgent(Agent):
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        self.remember(Batch.step(self._obs, action, next_obs, alive))
+        self.remember(Batch.step(self._tensor(obs), action, next_obs, alive))
 
     def remember(self, step: Batch) -> None:
         """Take note of a transition; agents without memory need nothing here."""

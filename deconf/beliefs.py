@@ -63,8 +63,8 @@ class EvidenceBelief(Belief):
     Given theta the dynamics are Markov, so that p(theta | tau) depends on the *set* of transitions alone: log p(theta |
     tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
     sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
-    size however long the trial. Without a transition, q is the prior. A trial longer than those of training counts as
-    one of their length with the same mean evidence: the belief then grows no surer, but nothing is new to the network.
+    size however long the trial. Without a transition, q is the prior. A trial longer than training's can be counts as
+    one of that length with the same mean evidence: the belief then grows no surer, but nothing is new to the network.
 
     The evidence starts out whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its
     common part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the

@@ -49,7 +49,7 @@ class Draws:
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Go on from there."""
         for i, stream in enumerate(self._streams):
-            stream.set_state(state[str(i)])
+            stream.set_state(state[str(i)].cpu())  # wherever it was loaded to
 
     def uniform(self, *shape: int) -> Tensor:
         """U(0, 1) [S, *shape]."""
@@ -162,8 +162,15 @@ class Batch:
         return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
 
     def joined(self, other: Batch) -> Batch:
-        """The trials of both."""
-        return Batch(*(torch.cat(pair, 1) for pair in zip(self.tensors, other.tensors, strict=True)))
+        """The trials of both; the shorter ones are padded."""
+        steps = max(self.mask.shape[2], other.mask.shape[2])
+
+        def padded(x: Tensor) -> Tensor:
+            return torch.cat([x, x.new_zeros(*x.shape[:2], steps - x.shape[2], *x.shape[3:])], 2)
+
+        return Batch(
+            *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
+        )
 
     def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
         """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""

@@ -19,7 +19,7 @@ from torch import Tensor
 from deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
 from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconf.equations import imitation_loss
-from deconf.models import DiscreteModel, LatentModel, VariationalModel
+from deconf.models import BELIEFS, DiscreteModel, LatentModel, VariationalModel
 from deconf.nets import ActionHead, Adam, Scaler
 from envs.task import InputError
 from experts.demos import Agent, Trials
@@ -30,7 +30,11 @@ Explore = Callable[[Agent | None, Sequence[np.random.Generator]], Trials]
 
 @dataclass(frozen=True)
 class DeconfoundedConfig:
-    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy."""
+    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy.
+
+    The discrete model has no bound to weigh and no step to leave out: beta, warm_up, inference_steps and fit_prior are
+    not for it.
+    """
 
     model: Literal["evidence", "gru", "discrete"] = "evidence"
     width: int = 64
@@ -52,13 +56,12 @@ class DeconfoundedConfig:
     fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
     device: str = "cpu"
     random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
-    resample: Literal["step", "episode"] = "step"
 
 
 class DeconfoundedAgent(LearnedAgent):
     """Algorithm 2. resample: draw theta_hat anew every step, or once an episode."""
 
-    def __init__(self, model: LatentModel, policy: ActionHead, resample: str = "step") -> None:
+    def __init__(self, model: LatentModel, policy: ActionHead, resample: Literal["step", "episode"] = "step") -> None:
         super().__init__(policy)
         self.model, self.policy, self.resample = model, policy, resample
 
@@ -131,10 +134,13 @@ def fit(
     """Algorithm 1.
 
     trials: of the expert, without theta; in as many equal groups as there are generators in rng, one after another. Or
-    what draws them, for fresh ones every round. explore: called once a round. Raises InputError if the two disagree.
+    what draws them: fresh ones every round, if config does not accumulate.
+    explore: called once a round. Raises InputError if the two disagree.
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    if config.model not in (*BELIEFS, "discrete"):
+        raise InputError(f"model was {config.model!r}; it must be one of {', '.join(BELIEFS)}, discrete")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
     shown, first = drawn(trials, rngs), explore(None, rngs)
@@ -142,7 +148,8 @@ def fit(
     if Signature.of(first) != signature:
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
     expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
-    obs = Scaler(torch.cat([seen.obs, expert.obs], 1), torch.cat([seen.mask, expert.mask], 1))
+    both = seen.joined(expert)
+    obs = Scaler(both.obs, both.mask)
     change = Scaler(seen.next_obs - seen.obs, seen.mask)
     model: LatentModel
     if config.model == "discrete":
@@ -151,7 +158,7 @@ def fit(
         model = VariationalModel(config.model, config.latent, config.width, signature, obs, change, draws)
     model.eval()  # but for its updates
     policy = ActionHead(model.inputs.obs_width + config.latent, config.width, signature, draws)
-    agent = DeconfoundedAgent(model, policy, config.resample)
+    agent = DeconfoundedAgent(model, policy)
 
     inferences = config.rounds * config.inference_updates
     total = inferences + config.rounds * config.imitation_updates + config.final_updates

@@ -79,9 +79,9 @@ class Progress:
             self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(n)
         elif time.monotonic() - self._last > self._every:
-            self._last = time.monotonic()
-            left = (self._last - self._start) * (self.total / self.done - 1)
-            print(f"{self._label}: {self.done / self.total:4.0%}, {left:.0f} s left {note}".rstrip(), flush=True)
+            self._last, share = time.monotonic(), self.done / self.total
+            left = f"{(self._last - self._start) * (1 / share - 1):.0f} s left" if share > 0.01 else "just begun"
+            print(f"{self._label}: {share:4.0%}, {left} {note}".rstrip(), flush=True)
 
     def line(self, text: str) -> None:
         """Print a line that stays."""

@@ -53,17 +53,6 @@ class Trials:
     def __len__(self) -> int:
         return len(self.mask)
 
-    def __getitem__(self, index: slice | NDArray[np.int64]) -> Trials:
-        return Trials(self.obs[index], self.action[index], self.mask[index], self.actions)
-
-    @staticmethod
-    def concatenate(parts: list[Trials]) -> Trials:
-        """All trials of all parts, in order."""
-        obs, action, mask = (
-            np.concatenate([getattr(part, name) for part in parts]) for name in ("obs", "action", "mask")
-        )
-        return Trials(obs, action, mask, parts[0].actions)
-
     def save(self, file: Path) -> None:
         """Write an .npz file, atomically."""
         with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:

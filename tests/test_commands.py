@@ -42,7 +42,8 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
         (("benchmarks/run.py",), "--task is missing"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
-        (("benchmarks/publish.py", "nowhere"), "holds no results.json"),
+        (("benchmarks/paper.py", "--methods", "oracle_bc"), "no method 'oracle_bc'"),
+        (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "experts.train", "--task", "bandit"), "nothing to train"),
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
@@ -79,7 +80,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert "--resume" in again.stderr
     other = command(*args[:-2], "default", "--out", str(out), "--resume")
     assert other.returncode == 2
-    assert "other settings" in other.stderr
+    assert "another preset" in other.stderr
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
     (out / "jobs" / "random-0.npz").write_bytes(b"half a file")

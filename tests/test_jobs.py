@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import envs
-from benchmarks import pool
+from benchmarks import figures, paper, pool
 from benchmarks.jobs import BenchmarkJob, CurveMonitor
 from benchmarks.paper import FigureJob
 from benchmarks.presets import preset
@@ -30,13 +30,13 @@ def settings(name: str, fresh: bool) -> Any:
         expert_trials=8,
         explore_trials=4,
         eval_trials=8,
-        fresh=fresh,
+        fresh=8 if fresh else 0,
         deconfounded=replace(model, accumulate=not fresh),
         naive=RecurrentConfig(width=16, updates=12, chunk=300, batch=4),
     )
 
 
-@pytest.mark.parametrize("share", [0.45, 0.8])
+@pytest.mark.parametrize("share", [0.45, 0.8, 0.9])
 @pytest.mark.parametrize(
     ("kind", "task", "method", "fresh"),
     [
@@ -91,6 +91,32 @@ def test_interrupted_training_goes_on(
         }
         assert len(found["meta"]["spans"]) == 2
     assert not list(broken.folder.glob(".*.pt"))
+
+
+def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From jobs to figures and table: exact curves by their closed forms, budgets by the settings."""
+    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    task, methods = envs.get("bandit"), ("naive_rnn", "deconfounded")
+    for method in methods:
+        FigureJob("bandit", settings("bandit", False), method, (0, 1), tmp_path).run()
+    like = FigureJob("bandit", settings("bandit", False), "random", (0,), tmp_path)
+    finished = [(job.method, job.seeds[0], job.load(job.seeds[0])) for job in pool.written(like, tmp_path)]
+    assert [(method, seed) for method, seed, _ in finished] == [
+        ("deconfounded", 0), ("deconfounded", 1), ("naive_rnn", 0), ("naive_rnn", 1)
+    ]  # fmt: skip
+    references = paper.exact(task, 4000)
+    assert references["interventional"]["pulls"] == pytest.approx(54.1, abs=0.6)
+    assert references["conditional"]["online"][[0, 9, 99]] == pytest.approx([0.2, 0.306, 0.333], abs=0.03)
+    assert references["expert"]["loss"] == pytest.approx(-0.6 * np.log(0.6) - 0.4 * np.log(0.1))
+    found = paper.summarise(finished, references)
+    assert found["deconfounded"]["budget"] == {"expert_trials": 8, "exploration_trials": 20}
+    assert found["naive_rnn"]["target"] == "conditional"
+    gap = np.abs(np.array(found["naive_rnn"]["online"]) - references["conditional"]["online"]).max()
+    assert found["naive_rnn"]["max_gap_online"] == pytest.approx(gap, abs=2e-4)
+    assert "20 exploration trials" in paper.table(found)
+    figures.figure_2(task, tmp_path / "2.png")
+    figures.figure_3(finished, references, tmp_path / "3.png")
+    assert (tmp_path / "3.png").stat().st_size > 10_000
 
 
 def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
