@@ -42,19 +42,24 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
 
 def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]) -> list[str]:
     """The methods asked for. Raises InputError for anything that cannot be run."""
-    if args.preset not in PRESETS:
-        raise envs.closest("preset", args.preset, list(PRESETS))
     methods = list(known) if args.methods == ["all"] else args.methods or list(default)
     for name in methods:
         if name not in known:
             raise envs.closest("method", name, list(known))
-    if args.seeds is not None and args.seeds < 1:
-        raise envs.InputError(f"--seeds was {args.seeds}; it must be at least 1")
-    try:
-        torch.zeros(1, device=args.device).item()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise envs.InputError(f"--device {args.device} cannot be used here; cpu always can") from None
+    check_run(args.preset, args.seeds, args.device)
     return list(dict.fromkeys(methods))
+
+
+def check_run(name: str, seeds: int | None, device: str) -> None:
+    """Raises InputError for a preset, a number of seeds (None: the preset's) or a device that cannot be."""
+    if name not in PRESETS:
+        raise envs.closest("preset", name, list(PRESETS))
+    if seeds is not None and seeds < 1:
+        raise envs.InputError(f"--seeds was {seeds}; it must be at least 1")
+    try:
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise envs.InputError(f"--device {device} cannot be used here; cpu always can") from None
 
 
 def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:

@@ -81,6 +81,6 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
     for panel in panels[2:]:
         panel.set(xlabel="share of training")
     panels[3].set(ylabel="best-arm pulls of 100")
-    panels[1].legend(frameon=False, fontsize=8)
+    figure.legend(*panels[1].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=8)
     figure.savefig(file, dpi=110)
     plt.close(figure)

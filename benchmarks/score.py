@@ -116,4 +116,5 @@ def table(results: dict[str, Any]) -> str:
     """The results as a plain table."""
     lines = [COLUMNS, *rows(results["methods"])]
     widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)) for line in lines)
+    cells = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
+    return "\n".join("  ".join(line).rstrip() for line in cells)

@@ -43,6 +43,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py",), "--task is missing"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
         (("benchmarks/paper.py", "--methods", "oracle_bc"), "no method 'oracle_bc'"),
+        (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "experts.train", "--task", "bandit"), "nothing to train"),

@@ -1,0 +1,86 @@
+"""What seeds cost side by side: `python benchmarks/seeds.py`
+
+Seconds an update of S seeds in one program, in one thread or on a GPU, over those of one seed. S means that stacking
+gains nothing, 1 that the other seeds come for free.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from statistics import median
+from typing import Any
+
+import torch
+
+import envs
+from benchmarks import commands
+from benchmarks.methods import METHODS, Context, Preset
+from benchmarks.presets import preset
+from deconf.agents import Monitor
+from envs.console import Parser, run_command
+from experts.demos import Agent
+
+TIMED = ("naive_rnn", "deconfounded", "deconfounded_discrete")
+UPDATES = 12  # of each kind; the first ones warm up
+
+
+class Clock(Monitor):
+    """Times the updates of each kind."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.times: dict[str, list[float]] = {}
+        self.last, self.done = time.perf_counter(), 0
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        now = time.perf_counter()  # a GPU is done by now: the loss was read
+        self.times.setdefault(next(iter(losses)), []).append((now - self.last) / (done - self.done))
+        self.last, self.done = now, done
+
+    def seconds(self) -> dict[str, float]:
+        """Of an update, by kind."""
+        return {kind: median(times[2:]) for kind, times in self.times.items()}
+
+
+def few(full: Preset) -> Preset:
+    """The preset's networks and batches, on little data and for few updates."""
+    small: dict[str, Any] = {"rounds": 1, "inference_updates": UPDATES, "imitation_updates": UPDATES, "final_updates": 0}
+    return replace(
+        full,
+        expert_trials=128,
+        explore_trials=128,
+        eval_trials=1,
+        fresh=0,
+        deconfounded=replace(full.deconfounded, **small),
+        discrete=replace(full.discrete, **small),
+        naive=replace(full.naive, updates=UPDATES, chunk=min(full.naive.chunk, 50)),
+    )
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--task", default="bandit")
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 5, 10], metavar="S", help="default: 1 2 5 10")
+    args = parser.parse_args()
+    task = envs.get(args.task)
+    for seeds in args.seeds:
+        commands.check_run(args.preset, seeds, args.device)
+    settings = few(preset(args.preset, task, args.device))
+    torch.set_num_threads(1)
+    print(f"{task.name}, {args.preset}, {args.device}, torch {torch.__version__}")
+    for method in TIMED:
+        alone: dict[str, float] = {}
+        for seeds in sorted({1, *args.seeds}):
+            clock = Clock()
+            METHODS[method](Context(task, settings, range(seeds), clock))
+            for kind, seconds in clock.seconds().items():
+                ratio = seconds / alone.setdefault(kind, seconds)
+                print(f"{method:22} {kind:10} {seeds:3} seeds {1000 * seconds:8.1f} ms an update, {ratio:5.2f} of one")
+
+
+if __name__ == "__main__":
+    run_command(main)
