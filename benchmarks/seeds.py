@@ -45,7 +45,8 @@ class Clock(Monitor):
 
 def few(full: Preset) -> Preset:
     """The preset's networks and batches, on little data and for few updates."""
-    small: dict[str, Any] = {"rounds": 1, "inference_updates": UPDATES, "imitation_updates": UPDATES, "final_updates": 0}
+    small: dict[str, Any] = {"rounds": 1, "final_updates": 0}
+    small |= {"inference_updates": UPDATES, "imitation_updates": UPDATES}
     return replace(
         full,
         expert_trials=128,

@@ -42,7 +42,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
         (("benchmarks/run.py",), "--task is missing"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
-        (("benchmarks/paper.py", "--methods", "oracle_bc"), "no method 'oracle_bc'"),
+        (("benchmarks/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
