@@ -8,7 +8,7 @@ demo: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
 
 test: lint
-	$(VENV)/bin/python -m pytest
+	$(VENV)/bin/python -m pytest -n auto
 
 lint: $(VENV)/installed
 	$(VENV)/bin/ruff check .

@@ -12,7 +12,11 @@ from envs.task import Array
 
 
 class Puck(MujocoTask):
-    """Joints `x` and `y` (m); action: the push along each, in units of the motors' gear."""
+    """Joints `x` and `y` (m); action: the push along each, in units of the motors' gear.
+
+    Noise a step: std .004 m and .05 m/s along each axis. Reward: at distance d from the goal, .8 exp(-d^2 / .18) + .2
+    exp(-d); an episode is 100 steps, and nothing ends it early.
+    """
 
     horizon = 100
     expert_noise = 0.02

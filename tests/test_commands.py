@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import certify, pool, score
+from benchmarks import certify, pool, publish, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -194,6 +194,12 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     task = space["BentCartpole"]()
     check_env(envs.GymEnv(task), skip_render_check=True)
     assert_set_in_place_equals_recompiled(task)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs").glob("*.json")), ids=lambda file: file.stem)
+def test_readme_tables_are_the_results(file: Path) -> None:
+    """README's table of a task is what publish.py prints of docs/TASK.json."""
+    assert publish.markdown(json.loads(file.read_text())) in (ROOT / "README.md").read_text()
 
 
 @pytest.mark.parametrize("number", [0, 1])
