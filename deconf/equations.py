@@ -80,7 +80,7 @@ def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
     """
     total = (log_next * mask[..., None]).sum(-2)
     marginal = torch.logsumexp(log_prior[..., None, :] + total, -1)
-    return -marginal.sum(-1) / mask.sum((-2, -1))
+    return -marginal.sum(-1) / mask.sum((-2, -1)).clamp(min=1)
 
 
 def reparametrise(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:

@@ -148,5 +148,12 @@ class DiscreteModel(LatentModel):
         return belief
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        """The same for trials of which a random share of the steps is kept, log-uniform from one step to all.
+
+        What is kept is a history under the same theta. Of whole long trials alone, whichever k happens to be best at
+        the start claims every one, and the others never learn.
+        """
         log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
-        return marginal_loss(F.log_softmax(self.logits, -1), log_next, batch.mask)
+        share = batch.mask.shape[2] ** -draws.uniform(1, 1)
+        kept = batch.mask * (draws.uniform(*batch.mask.shape[1:]) < share)
+        return marginal_loss(F.log_softmax(self.logits, -1), log_next, kept)
