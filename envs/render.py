@@ -31,6 +31,15 @@ def backend() -> str:
     raise InputError(f"no GL for pictures: tried {wanted or 'egl and osmesa'}; install libegl1 or libosmesa6")
 
 
+def _close(renderer: mujoco.Renderer) -> None:
+    # In its own context: Renderer.close frees buffers by number in whichever is current, be it another painter's.
+    if renderer._gl_context is not None and renderer._mjr_context is not None:
+        renderer._gl_context.make_current()
+        renderer._mjr_context.free()
+        renderer._mjr_context = None
+    renderer.close()
+
+
 class Painter:
     """Draws states of one model through its camera `view`. Raises InputError where no GL works."""
 
@@ -39,7 +48,7 @@ class Painter:
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         self._renderer = mujoco.Renderer(model, height, width)
-        weakref.finalize(self, self._renderer.close)  # with this painter, and before the GL library is gone
+        weakref.finalize(self, _close, self._renderer)  # with this painter, and before the GL library is gone
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
         """Full physics state [S] -> picture [H, W, 3]."""

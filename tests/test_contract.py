@@ -65,6 +65,20 @@ class TestProtocols:
         assert not batch.alive.any()
 
 
+@pytest.mark.skipif(not gl_works(), reason="no GL")
+def test_painters_do_not_touch_each_other() -> None:
+    """A painter draws the same before and after another one is gone."""
+    task = envs.get("tilted_cartpole")
+    theta, state = task.theta_grid(3)[0], task.init_state(np.random.default_rng(0))
+    other = task.painter(theta)
+    other(state, np.zeros(1))
+    paint = task.painter(theta)
+    del other
+    picture = paint(state, np.zeros(1))
+    np.testing.assert_array_equal(task.painter(theta)(state, np.zeros(1)), picture)
+    assert 100 < picture.mean() < 250
+
+
 @pytest.mark.parametrize("name", TASKS)
 class TestHiddenTheta:
     def test_no_leak(self, name: str) -> None:
