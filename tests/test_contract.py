@@ -261,6 +261,9 @@ class TestTransitions:
         ratio = np.exp(task.log_prob(drawn, q) - task.log_prob(drawn, p))
         assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(m) + 1e-9
         assert ratio.std() > 0
+        if isinstance(task, envs.MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
+            fall = task.log_prob(p, p) - task.log_prob(drawn, p)
+            assert abs(fall.mean() - noise.shape[1] / 2) < 4 * fall.std() / np.sqrt(m)
 
 
 @pytest.mark.parametrize("name", PHYSICS)
