@@ -150,11 +150,7 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
         "return_expert": float(one),
         "interventional": {"return": interventional.tolist(), "score": scored["int"].tolist()},
         "conditional": {"return": conditional.tolist(), "score": scored["cond"].tolist()},
-        "evidence_nats_per_step": {
-            "dynamics": dynamics,
-            "actions": actions,
-            "delusion_ratio": ratio,
-        },
+        "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
         "inferability": [inferability(task, belief, witness.grid.theta, truth) for belief in beliefs],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,

@@ -79,7 +79,7 @@ def code(task: envs.Task) -> str:
     """SHA-256 of the source and the MJCF that a run's numbers depend on."""
     root, digest = Path(__file__).parents[1], hashlib.sha256()
     sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
-    own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "paper"))
+    own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "score", "paper"))
     for file in (*sources, *own, envs.task.ASSETS / f"{task.name}.xml"):
         digest.update(file.read_bytes() if file.exists() else b"")
     return digest.hexdigest()
