@@ -152,7 +152,13 @@ class GruMemory(nn.Module):
 
 
 class GruBelief(Belief):
-    """The paper's belief: GruMemory, then linear to a mean and a softplus variance."""
+    """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
+
+    It starts out remembering, with inputs of unit size: He's initialisation for the observations' embedding, action
+    embeddings of about 1, a tanh's gain for what enters the GRU, and gates that keep memories for 1 to 100 steps (Tallec
+    and Ollivier, 2018). With torch's initialisation a memory lasts two steps and theta hardly shows in it; Eq. (6) then
+    stays on the plateau where the latent is ignored, for thousands of updates.
+    """
 
     def __init__(
         self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
@@ -161,6 +167,16 @@ class GruBelief(Belief):
         self.memory = GruMemory(width, signature, obs, draws)
         self.inputs = self.memory.inputs
         self.out = Linear(width, 2 * latent, draws)
+        with torch.no_grad():
+            for layer in self.inputs.embed_obs:
+                if isinstance(layer, Linear):
+                    layer.weight *= 6**0.5
+                    layer.bias.zero_()
+            self.inputs.embed_action.weight *= 3
+            self.memory.input.weight *= 3
+            keep = slice(width, 2 * width)
+            self.memory.input.bias[..., keep] = torch.log(1 + 98 * draws.uniform(1, width))
+            self.memory.recurrent.bias[..., keep] = 0
 
     def forward(self, batch: Batch) -> Tensor:
         return self.memory(batch, self.start(len(batch)))

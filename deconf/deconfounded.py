@@ -43,7 +43,7 @@ class DeconfoundedConfig:
     warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
     inference_updates: int = 300  # a round
-    inference_batch: int = 16  # trials, whose every step is evidence
+    inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
     inference_steps: int | None = 2048  # of them, whose next observation is predicted; None: all
     inference_rate: float = 1e-3
     imitation_updates: int = 500  # a round
@@ -171,7 +171,7 @@ def fit(
         optimizer.step(loss)
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
-    begin, done = 0, 0
+    begin, done, part = 0, 0, config.inference_batch
     checkpoint = Checkpoint(
         monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
     )
@@ -188,7 +188,7 @@ def fit(
                 expert = Batch.of(drawn(trials, rngs), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
-            batch = seen.trials(draws.below(len(seen), config.inference_batch))
+            batch = seen if part is None else seen.trials(draws.below(len(seen), part))
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)

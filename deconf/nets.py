@@ -134,6 +134,9 @@ class Embedding(Inputs):
         self.embed_action = Linear(signature.action_features, 32, draws)
 
     def obs(self, obs: Tensor) -> Tensor:
+        if self.signature.binary and self.signature.obs == 1:  # one bit has two embeddings: do not compute them by row
+            zero, one = self.embed_obs(self.scaler(obs.new_tensor([[0.0], [1.0]]).expand(len(obs), 2, 1))).unbind(1)
+            return torch.lerp(per_seed(zero, obs), per_seed(one, obs), obs)
         return self.embed_obs(self.scaler(obs))
 
     def action(self, action: Tensor) -> Tensor:
