@@ -21,7 +21,7 @@ PRESETS = {
     "paper": "ten seeds; on the bandit, the paper's own architecture and hyper-parameters (hours)",
 }
 EXTRA = ("deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
-DEFAULT_METHODS = tuple(name for name in METHODS if name not in EXTRA)
+EXACT = ("conditional", "interventional")
 
 _CONTROL = Preset(
     seeds=3,
@@ -123,6 +123,12 @@ def _smoke(full: Preset) -> Preset:
         dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
         cloning=replace(full.cloning, updates=400),
     )
+
+
+def default_methods(task: envs.Task) -> list[str]:
+    """The paper's comparison; exact references too, unless the task is costly to step (certify.py has them)."""
+    extra = (*EXTRA, *EXACT) if task.costly else EXTRA
+    return [name for name in METHODS if name not in extra]
 
 
 def preset(name: str, task: envs.Task, device: str) -> Preset:

@@ -25,8 +25,7 @@ COLOURS = {
     "interventional": "tab:green",
     "conditional": "tab:red",
     "deconfounded": "tab:blue",
-    "deconfounded_episode": "tab:cyan",
-    "deconfounded_gru": "navy",
+    "deconfounded_gru": "tab:cyan",
     "deconfounded_discrete": "tab:purple",
     "deconfounded_offline": "tab:olive",
     "dagger": "tab:pink",
@@ -35,7 +34,7 @@ COLOURS = {
     "blind_bc": "tab:brown",
     "random": "lightgray",
 }
-EXACT = ("expert", "interventional", "conditional", "random")  # drawn dashed
+DASHED = ("expert", "interventional", "conditional", "random")  # references
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
@@ -45,8 +44,10 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     for name, entry in results["methods"].items():
         values = entry["score"] + entry.get("score_beyond", [])
         trained = len(entry["score"])
-        style = "--" if name in EXACT else "-"
-        axes.plot(range(1, len(values) + 1), values, style, marker="o", ms=4, color=COLOURS.get(name), label=name)
+        style, base = "--" if name in DASHED else "-", name.removesuffix("_episode")
+        if base != name:  # another way to deploy the same agent
+            style = ":"
+        axes.plot(range(1, len(values) + 1), values, style, marker="o", ms=4, color=COLOURS.get(base), label=name)
     longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
     if longest > trained:
         axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)

@@ -20,7 +20,7 @@ from benchmarks import commands, report, score
 from benchmarks.jobs import CLIPPED, BenchmarkJob
 from benchmarks.methods import METHODS, REFERENCES
 from benchmarks.pool import Finished
-from benchmarks.presets import DEFAULT_METHODS
+from benchmarks.presets import default_methods
 from envs.console import run_command, write_atomically, write_json
 from experts import policy
 
@@ -71,13 +71,13 @@ def main() -> None:
         for name in envs.names():
             task = envs.get(name)
             latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
-            print(f"{name}: {', '.join(latents)}")
-        print(f"methods: {', '.join(METHODS)}\nby default: {', '.join(DEFAULT_METHODS)}")
+            print(f"{name}: {', '.join(latents)}\n    by default: {', '.join(default_methods(task))}")
+        print(f"methods: {', '.join(METHODS)}")
         return
     if args.task is None:
         raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
     task = envs.get(args.task)
-    wanted = {*commands.check(args, list(METHODS), DEFAULT_METHODS), *REFERENCES}
+    wanted = {*commands.check(args, list(METHODS), default_methods(task)), *REFERENCES}
     policy.load(task)
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, results = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)

@@ -155,9 +155,9 @@ class GruBelief(Belief):
     """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
 
     It starts out remembering, with inputs of unit size: He's initialisation for the observations' embedding, action
-    embeddings of about 1, a tanh's gain for what enters the GRU, and gates that keep memories for 1 to 100 steps (Tallec
-    and Ollivier, 2018). With torch's initialisation a memory lasts two steps and theta hardly shows in it; Eq. (6) then
-    stays on the plateau where the latent is ignored, for thousands of updates.
+    embeddings of about 1, a tanh's gain for what enters the GRU, and gates that keep memories for 1 to 100 steps
+    (Tallec and Ollivier, 2018). With torch's initialisation a memory lasts two steps and theta hardly shows in it;
+    Eq. (6) then stays on the plateau where the latent is ignored, for thousands of updates.
     """
 
     def __init__(
@@ -170,10 +170,10 @@ class GruBelief(Belief):
         with torch.no_grad():
             for layer in self.inputs.embed_obs:
                 if isinstance(layer, Linear):
-                    layer.weight *= 6**0.5
+                    layer.weight.mul_(6**0.5)
                     layer.bias.zero_()
-            self.inputs.embed_action.weight *= 3
-            self.memory.input.weight *= 3
+            self.inputs.embed_action.weight.mul_(3)
+            self.memory.input.weight.mul_(3)
             keep = slice(width, 2 * width)
             self.memory.input.bias[..., keep] = torch.log(1 + 98 * draws.uniform(1, width))
             self.memory.recurrent.bias[..., keep] = 0

@@ -21,9 +21,12 @@ from envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from envs.bandit import Bandit
 from envs.batch import BatchEnv
 from envs.forked_path import ForkedPath
+from envs.heavy_payload import HeavyPayload
 from envs.hidden_goal import HiddenGoal
+from envs.icy_road import IcyRoad
 from envs.physics import MujocoTask
 from envs.slippery_cartpole import SlipperyCartpole
+from envs.slippery_walker import SlipperyWalker
 from envs.task import InputError, Latent, Task
 from envs.tilted_cartpole import TiltedCartpole
 
@@ -43,7 +46,8 @@ __all__ = [
 ]
 
 TASKS: dict[str, type[Task]] = {
-    cls.name: cls for cls in (Bandit, TiltedCartpole, SlipperyCartpole, HiddenGoal, ForkedPath)
+    cls.name: cls
+    for cls in (Bandit, TiltedCartpole, SlipperyCartpole, HeavyPayload, IcyRoad, SlipperyWalker, HiddenGoal, ForkedPath)
 }
 
 

@@ -32,6 +32,15 @@ class Edit(Protocol):
     def body_mass(self, name: str, scale: float) -> None:
         """Scale a body's mass and inertia."""
 
+    def geom_friction(self, name: str, value: float) -> None:
+        """Sliding friction coefficient of a geom."""
+
+    def joint_damping(self, name: str, value: float) -> None:
+        """Damping of a hinge or slide joint; N m s or N s/m."""
+
+    def slope(self, angle: float) -> None:
+        """Turn gravity about the y axis, so that the world rises along x; rad."""
+
     def tendon_friction(self, name: str, value: float) -> None:
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
 
@@ -46,6 +55,10 @@ def cores() -> int:
 
 def _tilt(angle: float) -> list[float]:
     return [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+
+
+def _uphill(gravity: Array, angle: float) -> list[float]:
+    return [gravity[2] * np.sin(angle), 0.0, gravity[2] * np.cos(angle)]
 
 
 class ModelEdit:
@@ -66,6 +79,15 @@ class ModelEdit:
     def body_mass(self, name: str, scale: float) -> None:
         self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
         self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
+
+    def geom_friction(self, name: str, value: float) -> None:
+        self.model.geom(name).friction[0] = value
+
+    def joint_damping(self, name: str, value: float) -> None:
+        self.model.joint(name).damping[0] = value
+
+    def slope(self, angle: float) -> None:
+        self.model.opt.gravity[:] = _uphill(self._nominal.opt.gravity, angle)
 
     def tendon_friction(self, name: str, value: float) -> None:
         self.model.tendon_frictionloss[self.model.tendon(name).id] = value
@@ -90,6 +112,15 @@ class SpecEdit:
     def body_mass(self, name: str, scale: float) -> None:
         for geom in self.spec.body(name).geoms:
             geom.mass *= scale
+
+    def geom_friction(self, name: str, value: float) -> None:
+        self.spec.geom(name).friction[0] = value
+
+    def joint_damping(self, name: str, value: float) -> None:
+        self.spec.joint(name).damping[0] = value
+
+    def slope(self, angle: float) -> None:
+        self.spec.option.gravity = _uphill(self.spec.option.gravity, angle)
 
     def tendon_friction(self, name: str, value: float) -> None:
         self.spec.tendon(name).frictionloss = value
@@ -150,7 +181,7 @@ class MujocoTask(Task):
 
     substeps: ClassVar[int] = 8
     process_noise: ClassVar[dict[str, tuple[float, float]]]  # joint -> std of (position, velocity) a control step
-    # A coordinate without noise counts as no evidence: it must be one that is neither observed nor matters.
+    # A coordinate without noise counts as no evidence: it must be of no consequence, or one that theta does not move.
 
     @abstractmethod
     def apply_latent(self, edit: Edit, theta: Array) -> None:

@@ -40,6 +40,17 @@ def _close(renderer: mujoco.Renderer) -> None:
     renderer.close()
 
 
+def ribbon(spec: mujoco.MjSpec, name: str, left: Array, right: Array, grey: float) -> None:
+    """Add a strip on the ground between two lines [K, 2] (m), to look at only."""
+    k, i = len(left), np.arange(len(left) - 1)
+    corners = np.pad(np.concatenate([left, right]), ((0, 0), (0, 1)), constant_values=0.002)
+    faces = np.stack([i, i + k, i + 1, i + 1, i + k, i + k + 1], -1)
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.userface = corners.ravel(), faces.ravel()
+    look = {"contype": 0, "conaffinity": 0, "rgba": [grey, grey, grey, 1]}
+    spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **look)
+
+
 class Painter:
     """Draws states of one model through its camera `view`. Raises InputError where no GL works."""
 

@@ -112,6 +112,7 @@ class Task(ABC):
     horizon: ClassVar[int]
     episodes: ClassVar[int] = 5  # of one trial
     control_dt: ClassVar[float] = 1.0  # s
+    costly: ClassVar[bool] = False  # to step: runs leave out exact references, which step every theta of a grid
     expert_noise: ClassVar[float] = 0.0  # std of the expert's action around its mean; the action range is [-1, 1]
     action_space: ClassVar[spaces.Box | spaces.Discrete]
     observation: ClassVar[dict[str, tuple[float, float]]]  # name -> bounds, in the order of `observe`

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import certify, pool, publish, score
+from benchmarks import cards, certify, pool, publish, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -200,6 +200,11 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 def test_readme_tables_are_the_results(file: Path) -> None:
     """README's table of a task is what publish.py prints of docs/TASK.json."""
     assert publish.markdown(json.loads(file.read_text())) in (ROOT / "README.md").read_text()
+
+
+def test_task_cards_are_up_to_date() -> None:
+    """docs/tasks.md is what cards.py writes; every task has its latents, observations and noise in it."""
+    assert (ROOT / "docs" / "tasks.md").read_text() == cards.page()
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -310,7 +310,8 @@ class TestPhysics:
     def test_noise_covers_every_coordinate_that_matters(self, name: str) -> None:
         """Else one step could give theta away, and the grid posterior would not be exact.
 
-        A coordinate without noise is told apart by moving it: neither observations nor what follows may change.
+        A coordinate without noise must be one that theta does not move, or that is of no consequence: neither
+        observations nor what follows change if it is moved.
         """
         task = envs.get(name)
         assert isinstance(task, envs.MujocoTask)
@@ -319,7 +320,9 @@ class TestPhysics:
         action, simulator = np.ones((1, *task.action_space.shape)), task.simulator(1)
         noisy, _ = task._noisy
         quiet = set(range(1, 1 + task.model.nq + task.model.nv)) - set(noisy)
-        for i in quiet:
+        thetas = task.theta_grid(3)
+        each = task.outcome(np.repeat(start, len(thetas), 0), np.repeat(action, len(thetas), 0), thetas)
+        for i in (i for i in quiet if (each[:, i] != each[0, i]).any()):
             moved = start.copy()
             moved[:, i] += 0.7
             np.testing.assert_array_equal(task.observe(moved), task.observe(start))
@@ -339,12 +342,12 @@ class TestPhysics:
 
 
 def assert_same_model(model: mujoco.MjModel, other: mujoco.MjModel) -> None:
-    """Equal, bit for bit, in every array."""
+    """Equal in every array, but for the last bits of scaled inertia."""
     compared = 0
     for field in dir(model):
         value = getattr(model, field, None) if not field.startswith("_") else None
         if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(value, getattr(other, field), err_msg=field)
+            np.testing.assert_allclose(value, getattr(other, field), rtol=1e-14, atol=0, err_msg=field)
             compared += 1
     assert compared > 100
 

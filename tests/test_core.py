@@ -15,7 +15,7 @@ import envs
 from benchmarks import score
 from benchmarks.methods import METHODS, Context, Preset
 from deconf import cloning, deconfounded, naive_rnn, offline
-from deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconf.dagger import DaggerConfig
 from deconf.data import Batch, Draws, Signature
 from deconf.deconfounded import DeconfoundedConfig
@@ -31,7 +31,7 @@ from deconf.equations import (
 )
 from deconf.exact import ExactAgent
 from deconf.models import DiscreteModel, VariationalModel
-from deconf.nets import ActionHead, Scaler
+from deconf.nets import ActionHead, Embedding, Scaler
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from experts import policy
@@ -137,6 +137,36 @@ class TestBeliefs:
         mean_turned, _ = belief.posterior(belief(turned)[:, :, -1])
         same = torch.allclose(mean, mean_turned, atol=1e-4)
         assert same == (kind is EvidenceBelief)
+
+
+def _bandit_batch(n: int) -> tuple[Batch, Signature, Scaler, Draws]:
+    trials, _ = demonstrations("bandit", n, episodes=1)
+    batch, draws = Batch.of(trials, 1), Draws([np.random.default_rng(0)], "cpu")
+    return batch, Signature.of(trials), Scaler(batch.obs, batch.mask), draws
+
+
+def test_one_bit_is_embedded_as_any_observation() -> None:
+    """The two embeddings of a binary observation are those that the network gives row by row."""
+    batch, signature, scaler, draws = _bandit_batch(8)
+    embedding = Embedding(16, signature, scaler, draws)
+    torch.testing.assert_close(embedding.obs(batch.obs), embedding.embed_obs(scaler(batch.obs)), rtol=1e-5, atol=1e-6)
+
+
+def test_gru_belief_starts_out_remembering() -> None:
+    """Two histories that part in their first 10 steps are told apart after 30 more; with torch's gates they are not."""
+    batch, signature, scaler, draws = _bandit_batch(8)
+    other = Batch(*(x.clone() for x in batch.tensors))
+    other.action[:, :, :10] = (other.action[:, :, :10] + 1) % 5
+    left = {}
+    for name, memory in (
+        ("belief", GruBelief(5, 64, signature, scaler, scaler, draws).memory),
+        ("torch", GruMemory(64, signature, scaler, draws)),
+    ):
+        runs = [memory(x, memory.start(8)) for x in (batch, other)]
+        gap = (runs[0] - runs[1]).norm(dim=-1).mean((0, 1))
+        left[name] = (gap[40] / gap[10]).item()
+    assert left["belief"] > 0.2
+    assert left["torch"] < 0.02
 
 
 @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])

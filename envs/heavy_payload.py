@@ -1,0 +1,67 @@
+"""A hoist carries a load of hidden mass on an elastic cable, and follows a target that swings up and down.
+
+Tier 2. The cable stretches by mass x g / 10 m, 1 m to 3 m: whoever expects a lighter load lets it hang too low,
+whoever expects a heavier one throws it up. The hook acts on the load only through the cable, and the load bounces at a
+pace of its own, so that feedback is slow and the stretch must be known in advance. One control step shows the mass only
+through process noise.
+
+Latent: mass, kg, log-uniform, set with its inertia (a cube of that mass). Noise a step: std .004 m and .45 m/s of the
+load, .004 m and .05 m/s of the hook; none of the target, which theta does not touch.
+
+Action: the hook's speed, in units of 3 m/s. Reward: .8 exp(-12.5 d^2) + .2 exp(-d), d m off the target. An episode ends
+with a load dropped or thrown, 1.2 m off the target.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from envs.physics import Edit, MujocoTask
+from envs.task import Array, Latent
+
+SPEED = 3.0  # m/s
+LOST = 1.2  # m
+PACE = 2.1  # of the target, rad/s
+STRETCH = 1.7  # of the cable at the start, whatever the load, m
+
+
+class HeavyPayload(MujocoTask):
+    """Joints `hook`, `load` and `target`, all along z (m); at rest the cable is slack by nothing."""
+
+    name = "heavy_payload"
+    latents = (Latent("mass", "kg", 1.0, 3.0, "loguniform"),)
+    horizon = 150
+    expert_noise = 0.02
+    process_noise = {"load": (0.004, 0.45), "hook": (0.004, 0.05), "target": (0, 0)}
+    observation = {
+        **{"off_target": (-4, 4), "stretch": (-4, 4), "target": (-2, 2)},
+        **{"load_velocity": (-15, 15), "hook_velocity": (-15, 15), "target_velocity": (-4, 4)},
+    }
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        edit.body_mass("load", float(theta[0]))  # the MJCF's load has 1 kg
+
+    def control(self, action: Array) -> Array:
+        return SPEED * action
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        phase, swing, off, stretch = rng.uniform((0, 0.3, -0.1, -0.1), (2 * np.pi, 0.5, 0.1, 0.1))
+        target, velocity = swing * np.sin(phase), PACE * swing * np.cos(phase)
+        heights = {"target": target, "load": target + off, "hook": target + off + STRETCH + stretch}
+        return self.state(**{joint: (height, velocity) for joint, height in heights.items()})
+
+    def observe(self, state: Array) -> Array:
+        load, hook, target = (self.qpos(state, joint) for joint in ("load", "hook", "target"))
+        velocities = (self.qvel(state, joint) for joint in ("load", "hook", "target"))
+        return np.stack([load - target, hook - load, target, *velocities], -1)
+
+    def _off(self, state: Array) -> Array:
+        return np.abs(self.qpos(state, "load") - self.qpos(state, "target"))
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        off = self._off(next_state)
+        return 0.8 * np.exp(-0.5 * (off / 0.2) ** 2) + 0.2 * np.exp(-off)
+
+    def terminated(self, state: Array) -> NDArray[np.bool_]:
+        return self._off(state) > LOST

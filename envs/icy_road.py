@@ -1,0 +1,119 @@
+"""A car on a winding road of hidden grip, from dry to ice: the paper's own story.
+
+Tier 2. Who knows that it is dry takes the bends fast; who knows of the ice crawls. Told of more grip than there is, the
+car slides off the road, which ends the episode; told of less, it comes home late. Engine and brakes are weak, so that
+speed is a commitment. An icy road also rolls a little more freely: that shows everywhere, slowly, through process
+noise, and without it a careful driver would never learn what the road is like.
+
+Latent: grip, the friction coefficient of tyre on road, log-uniform: the road's, which has priority over the wheels'.
+The wheels' rolling drag rises with it. Planar chassis (x, y, z, yaw) on four driven sphere wheels, the front ones
+steered. Noise a step: std .002 m and .05 m/s along x and y, 5e-5 m and .002 m/s upwards, .004 rad and .1 rad/s in yaw,
+.002 rad and .05 rad/s in steering, 3 rad/s a wheel, whose angle is of no consequence.
+
+Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: progress along the road in
+units of 5 m/s. An episode is 10 s, and ends where the road does, .35 m from its centreline.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs import render
+from envs.physics import Edit, MujocoTask
+from envs.task import Array, Latent
+
+AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
+STEERING, TORQUE = 0.5, 0.03  # rad; N m
+CRAWL = 0.8  # m/s; driving more slowly does not pay
+RADIUS = 0.05  # of a wheel, m
+DRAG = 5e-4  # N m s of a wheel, times grip
+AHEAD = (0.3, 0.8, 1.4)  # m, where the road's curvature is seen
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+
+
+def road(x: Array) -> tuple[Array, Array, Array]:
+    """The centreline at x (m): y (m), direction (rad), and curvature (1/m, positive to the left)."""
+    k = 2 * np.pi / WAVE
+    slope = AMPLITUDE * k * np.cos(k * x)
+    y = AMPLITUDE * np.sin(k * x)
+    return y, np.arctan(slope), -(k**2) * y / (1 + slope**2) ** 1.5
+
+
+class IcyRoad(MujocoTask):
+    """Joints x, y, z, yaw of the chassis, two that steer, and one for each wheel."""
+
+    name = "icy_road"
+    latents = (Latent("grip", "", 0.1, 0.8, "loguniform"),)
+    horizon = 200
+    substeps = 5
+    costly = True
+    expert_noise = 0.02
+    process_noise = {
+        **{"x": (0.004, 0.08), "y": (0.004, 0.08), "z": (2e-4, 0.03), "yaw": (0.008, 0.15)},
+        **{joint: (0.002, 0.05) for joint in ("steer_left", "steer_right")},
+        **{wheel: (0, 8) for wheel in WHEELS},
+    }
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation = {
+        **{"lane_offset": (-2, 2), "heading_error": (-4, 4), "forward": (-10, 10), "sideways": (-10, 10)},
+        **{"yaw_rate": (-20, 20), "front_slip": (-5, 5), "rear_slip": (-5, 5)},
+        **{f"curvature_{i}": (-2, 2) for i in range(len(AHEAD))},
+    }
+
+    def spec(self) -> mujoco.MjSpec:
+        """The car of assets/icy_road.xml, and the road drawn under it: a ribbon with white edges, to look at only."""
+        spec, x = super().spec(), np.linspace(-4, 70, 297)
+        y, direction, _ = road(x)
+        middle, across = np.stack([x, y], -1), np.stack([-np.sin(direction), np.cos(direction)], -1)
+        for name, left, right, grey in (
+            ("lane", 1, -1, 0.38),
+            ("left_edge", 1.1, 1, 1.0),
+            ("right_edge", -1, -1.1, 1.0),
+        ):
+            one, other = (middle + HALF_WIDTH * side * across for side in (left, right))
+            render.ribbon(spec, name, one, other, grey)
+        return spec
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        edit.geom_friction("road", float(theta[0]))
+        for wheel in WHEELS:
+            edit.joint_damping(wheel, DRAG * float(theta[0]))
+
+    def control(self, action: Array) -> Array:
+        return np.concatenate([STEERING * action[..., [0, 0]], TORQUE * action[..., [1, 1, 1, 1]]], -1)
+
+    def init_state(self, rng: np.random.Generator) -> Array:
+        x, offset, yaw, speed = rng.uniform((0, -0.1, -0.1, 0.7), (WAVE, 0.1, 0.1, 1.0))
+        y, direction, _ = road(x)
+        yaw += direction
+        rolling = {wheel: (0.0, speed / RADIUS) for wheel in WHEELS}
+        return self.state(x=(x, speed * np.cos(yaw)), y=(y + offset, speed * np.sin(yaw)), yaw=(yaw, 0), **rolling)
+
+    def _lane(self, state: Array) -> tuple[Array, Array]:
+        """How far to the left of the centreline (m), and the road's direction there (rad)."""
+        y, direction, _ = road(self.qpos(state, "x"))
+        return (self.qpos(state, "y") - y) * np.cos(direction), direction
+
+    def observe(self, state: Array) -> Array:
+        """Slip is the speed of an axle's wheels above that of the chassis, m/s."""
+        offset, direction = self._lane(state)
+        yaw, x_velocity, y_velocity = self.qpos(state, "yaw"), self.qvel(state, "x"), self.qvel(state, "y")
+        forward = x_velocity * np.cos(yaw) + y_velocity * np.sin(yaw)
+        sideways = y_velocity * np.cos(yaw) - x_velocity * np.sin(yaw)
+        spin = [self.qvel(state, wheel) for wheel in WHEELS]
+        slips = (RADIUS * (spin[i] + spin[i + 1]) / 2 - forward for i in (0, 2))
+        error = (yaw - direction + np.pi) % (2 * np.pi) - np.pi
+        ahead = (road(self.qpos(state, "x") + d * np.cos(direction))[2] for d in AHEAD)
+        return np.stack([offset, error, forward, sideways, self.qvel(state, "yaw"), *slips, *ahead], -1)
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        _, direction = self._lane(state)
+        x, y = (self.qpos(next_state, joint) - self.qpos(state, joint) for joint in ("x", "y"))
+        speed = (x * np.cos(direction) + y * np.sin(direction)) / self.control_dt
+        return np.clip((speed - CRAWL) / 4, -1, 1)
+
+    def terminated(self, state: Array) -> NDArray[np.bool_]:
+        return np.abs(self._lane(state)[0]) > HALF_WIDTH
