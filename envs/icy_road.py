@@ -27,7 +27,7 @@ from envs.task import Array, Latent
 
 AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
 STEERING, TORQUE = 0.5, 0.03  # rad; N m
-CRAWL = 0.8  # m/s; driving more slowly does not pay
+CRAWL = 0.6  # m/s; driving more slowly does not pay
 RADIUS = 0.05  # of a wheel, m
 DRAG = 5e-4  # N m s of a wheel, times grip
 AHEAD = (0.3, 0.8, 1.4)  # m, where the road's curvature is seen
@@ -46,13 +46,13 @@ class IcyRoad(MujocoTask):
     """Joints x, y, z, yaw of the chassis, two that steer, and one for each wheel."""
 
     name = "icy_road"
-    latents = (Latent("grip", "", 0.1, 0.8, "loguniform"),)
+    latents = (Latent("grip", "", 0.1, 0.6, "loguniform"),)
     horizon = 200
     substeps = 5
     costly = True
     expert_noise = 0.02
     process_noise = {
-        **{"x": (0.004, 0.08), "y": (0.004, 0.08), "z": (2e-4, 0.03), "yaw": (0.008, 0.15)},
+        **{"x": (0.003, 0.045), "y": (0.003, 0.045), "z": (2e-4, 0.03), "yaw": (0.006, 0.12)},
         **{joint: (0.002, 0.05) for joint in ("steer_left", "steer_right")},
         **{wheel: (0, 8) for wheel in WHEELS},
     }
@@ -113,7 +113,7 @@ class IcyRoad(MujocoTask):
         _, direction = self._lane(state)
         x, y = (self.qpos(next_state, joint) - self.qpos(state, joint) for joint in ("x", "y"))
         speed = (x * np.cos(direction) + y * np.sin(direction)) / self.control_dt
-        return np.clip((speed - CRAWL) / 4, -1, 1)
+        return np.clip((speed - CRAWL) / 4, 0, 1)
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
         return np.abs(self._lane(state)[0]) > HALF_WIDTH
