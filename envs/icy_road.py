@@ -7,11 +7,11 @@ noise, and without it a careful driver would never learn what the road is like.
 
 Latent: grip, the friction coefficient of tyre on road, log-uniform: the road's, which has priority over the wheels'.
 The wheels' rolling drag rises with it. Planar chassis (x, y, z, yaw) on four driven sphere wheels, the front ones
-steered. Noise a step: std .002 m and .05 m/s along x and y, 5e-5 m and .002 m/s upwards, .004 rad and .1 rad/s in yaw,
-.002 rad and .05 rad/s in steering, 3 rad/s a wheel, whose angle is of no consequence.
+steered. Every coordinate has noise but the wheels' angles, which are of no consequence. The chassis is damped upwards:
+its bounce would tell of the grip at once.
 
-Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: progress along the road in
-units of 5 m/s. An episode is 10 s, and ends where the road does, .35 m from its centreline.
+Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: speed along the road above .6
+m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from envs.physics import Edit, MujocoTask
 from envs.task import Array, Latent
 
+CRAWL = 0.5  # m/s; walking more slowly does not pay
 HEIGHT = 1.3  # of the torso's centre, standing, m
 JOINTS = tuple(f"{side}_{joint}" for side in ("right", "left") for joint in ("hip", "knee", "ankle"))
 ROOT = ("rootz", "rootx", "rooty")
@@ -30,14 +31,14 @@ class SlipperyWalker(MujocoTask):
     """Joints rootx, rootz and rooty of the torso, and hip, knee and ankle of each leg."""
 
     name = "slippery_walker"
-    latents = (Latent("friction", "", 0.25, 1.0, "loguniform"), Latent("slope", "rad", -0.25, 0.25))
+    latents = (Latent("friction", "", 0.08, 0.5, "loguniform"), Latent("slope", "rad", -0.06, 0.06))
     horizon = 200
     substeps = 5
     costly = True
     expert_noise = 0.05
     process_noise = {
-        **{"rootz": (0.001, 0.05), "rootx": (0.004, 0.1), "rooty": (0.005, 0.15)},
-        **{joint: (0.01, 1.0) if "ankle" in joint else (0.005, 0.4) for joint in JOINTS},
+        **{"rootz": (0.001, 0.04), "rootx": (0.004, 0.08), "rooty": (0.005, 0.1)},
+        **{joint: (0.01, 0.8) if "ankle" in joint else (0.005, 0.3) for joint in JOINTS},
     }
     action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
     observation = {
@@ -73,7 +74,7 @@ class SlipperyWalker(MujocoTask):
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         speed = (self.qpos(next_state, "rootx") - self.qpos(state, "rootx")) / self.control_dt
-        return 0.1 + 0.9 * np.clip(speed / 4, -1, 1) - 0.02 * np.square(action).mean(-1)
+        return 0.05 + 0.95 * np.clip((speed - CRAWL) / 3, 0, 1) - 0.02 * np.square(action).mean(-1)
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
         fallen = HEIGHT + self.qpos(state, "rootz") < 0.8
