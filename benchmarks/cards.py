@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import envs
+from benchmarks.publish import markdown_table
 from envs.console import Parser, run_command, write_atomically
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -17,12 +18,8 @@ TIERS = {
 }
 
 
-def _table(*rows: tuple[str, ...]) -> str:
-    head, *body = (f"| {' | '.join(row)} |" for row in rows)
-    return "\n".join([head, "|---" * len(rows[0]) + "|", *body])
-
-
-def _certificate(file: Path) -> str:
+def _certificate(task: envs.Task) -> str:
+    file = DOCS / "certificates" / f"{task.name}.json"
     if not file.is_file():
         return "No certificate."
     found = json.loads(file.read_text())
@@ -34,7 +31,7 @@ def _certificate(file: Path) -> str:
     )
 
 
-def card(task: envs.Task, certificates: Path = DOCS / "certificates") -> str:
+def card(task: envs.Task) -> str:
     """Markdown: what the docstrings say, latents, observation, noise, tier, certificate."""
     latents = [(lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution) for lat in task.latents]
     parts = [f"## {task.name} (v{task.version})", inspect.getdoc(inspect.getmodule(type(task))) or ""]
@@ -44,14 +41,14 @@ def card(task: envs.Task, certificates: Path = DOCS / "certificates") -> str:
     step = f", {task.control_dt:g} s each" if isinstance(task, envs.MujocoTask) else ""
     parts.append(
         f"Tier {TIERS[task.tier]}. Trials of {task.episodes} episodes of at most {task.horizon} steps{step}; the"
-        f" expert's action noise is {task.expert_noise:g}. {_certificate(certificates / f'{task.name}.json')}"
+        f" expert's action noise is {task.expert_noise:g}. {_certificate(task)}"
     )
-    parts.append(_table(("latent", "unit", "range", "distribution"), *latents))
+    parts.append(markdown_table(("latent", "unit", "range", "distribution"), latents))
     bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())
-    parts.append(_table(("observation", "bounds"), *bounds))
+    parts.append(markdown_table(("observation", "bounds"), bounds))
     if isinstance(task, envs.MujocoTask):
         noise = ((joint, *(f"{std:g}" for std in stds)) for joint, stds in task.process_noise.items())
-        parts.append(_table(("joint", "noise a step, m or rad", "m/s or rad/s"), *noise))
+        parts.append(markdown_table(("joint", "noise a step, m or rad", "m/s or rad/s"), noise))
     return "\n\n".join(parts)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 import envs
+from benchmarks.methods import EXACT
 from benchmarks.pool import Finished, by_method
 from benchmarks.report import COLOURS
 from deconf.exact import ExactAgent
@@ -37,7 +38,7 @@ def figure_2(task: envs.Task, file: Path, rolled: int = 5) -> None:
     expert = policy.load(task)
     env = envs.BatchEnv(task, rolled)
     agents: dict[str, Agent] = {"expert": ExpertAgent(env, expert)}
-    agents |= {name: ExactAgent(env, expert, name == "conditional") for name in ("conditional", "interventional")}
+    agents |= {name: ExactAgent(env, expert, name == "conditional") for name in EXACT}
     figure, panels = plt.subplots(3, 1, figsize=(8, 4.4), layout="constrained", sharex=True)
     colours = ListedColormap(COLOURS_OF_ARMS)
     for panel, (name, agent) in zip(panels, agents.items(), strict=True):

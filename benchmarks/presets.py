@@ -8,7 +8,7 @@ from typing import Any
 from gymnasium import spaces
 
 import envs
-from benchmarks.methods import METHODS, Preset
+from benchmarks.methods import EXACT, METHODS, Preset
 from deconf.cloning import CloningConfig
 from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
@@ -21,7 +21,6 @@ PRESETS = {
     "paper": "ten seeds; on the bandit, the paper's own architecture and hyper-parameters (hours)",
 }
 EXTRA = ("deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
-EXACT = ("conditional", "interventional")
 
 _CONTROL = Preset(
     seeds=3,

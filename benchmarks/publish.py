@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +20,18 @@ from benchmarks import score
 from envs.console import Parser, check_folder, run_command
 
 
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows of cells under a head."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))
+
+
 def markdown(results: dict[str, Any]) -> str:
     """README's table of one task."""
-    lines = [(*score.COLUMNS, "after as many again"), ("---",) * (len(score.COLUMNS) + 1)]
+    rows = []
     for row in score.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
-        lines.append((*row, f"{beyond[-1]:.2f}" if beyond else ""))
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+        rows.append((*row, f"{beyond[-1]:.2f}" if beyond else ""))
+    return markdown_table((*score.COLUMNS, "after as many again"), rows)
 
 
 def gif(video: Path, file: Path) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 import envs
 from benchmarks import score
+from benchmarks.methods import EXACT, REFERENCES
 
 COLOURS = {
     "expert": "black",
@@ -34,7 +35,6 @@ COLOURS = {
     "blind_bc": "tab:brown",
     "random": "lightgray",
 }
-DASHED = ("expert", "interventional", "conditional", "random")  # references
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
@@ -44,9 +44,8 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     for name, entry in results["methods"].items():
         values = entry["score"] + entry.get("score_beyond", [])
         trained = len(entry["score"])
-        style, base = "--" if name in DASHED else "-", name.removesuffix("_episode")
-        if base != name:  # another way to deploy the same agent
-            style = ":"
+        base = name.removesuffix("_episode")  # dotted: another way to deploy the same agent
+        style = ":" if base != name else "--" if name in (*EXACT, *REFERENCES) else "-"
         axes.plot(range(1, len(values) + 1), values, style, marker="o", ms=4, color=COLOURS.get(base), label=name)
     longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
     if longest > trained:

@@ -172,6 +172,10 @@ class Batch:
             *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
         )
 
+    def draw_trials(self, k: int | None, draws: Draws) -> Batch:
+        """k trials of each seed, uniformly and with replacement; None: all, as they are."""
+        return self if k is None else self.trials(draws.below(len(self), k))
+
     def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
         """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""
         if k is None:

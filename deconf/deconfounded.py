@@ -171,7 +171,7 @@ def fit(
         optimizer.step(loss)
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
-    begin, done, part = 0, 0, config.inference_batch
+    begin, done = 0, 0
     checkpoint = Checkpoint(
         monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
     )
@@ -188,7 +188,7 @@ def fit(
                 expert = Batch.of(drawn(trials, rngs), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
-            batch = seen if part is None else seen.trials(draws.below(len(seen), part))
+            batch = seen.draw_trials(config.inference_batch, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)

@@ -30,7 +30,7 @@ def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | N
         cloner.done = before["done"]
     while cloner.done < cloner.total:
         if shown is trials:
-            batch = data.trials(draws.below(len(data), config.batch))
+            batch = data.draw_trials(config.batch, draws)
         else:
             batch = Batch.of(drawn(trials, rngs), len(rngs), config.device)
         cloner.learn(batch, batch.action)

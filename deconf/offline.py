@@ -56,7 +56,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
 
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
-        batch = data.trials(draws.below(len(data), config.offline_batch))
+        batch = data.draw_trials(config.offline_batch, draws)
         belief = offline.belief(offline.last(batch))
         mean, std = belief.chunk(2, -1)
         theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
@@ -77,7 +77,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     for update in range(config.online_updates):
         if update % config.refresh == 0:
             synthetic = synthesise(online, policy, latents, starts, trials.mask.shape[2], config, draws)
-        batch = synthetic.trials(draws.below(len(synthetic), config.online_batch))
+        batch = synthetic.draw_trials(config.online_batch, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)

@@ -27,7 +27,7 @@ STRETCH = 1.7  # of the cable at the start, whatever the load, m
 
 
 class HeavyPayload(MujocoTask):
-    """Joints `hook`, `load` and `target`, all along z (m); at rest the cable is slack by nothing."""
+    """Joints `hook`, `load` and `target`, all along z (m); all at 0, the cable is just taut."""
 
     name = "heavy_payload"
     latents = (Latent("mass", "kg", 1.0, 3.0, "loguniform"),)

@@ -10,8 +10,7 @@ The MJCF is dm_control's own, from the installed package.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from pathlib import Path
+from importlib.resources import files
 
 import mujoco
 import numpy as np
@@ -47,10 +46,7 @@ class SlipperyWalker(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        package = find_spec("dm_control")
-        assert package is not None
-        assert package.submodule_search_locations is not None
-        spec = mujoco.MjSpec.from_file(str(Path(package.submodule_search_locations[0]) / "suite" / "walker.xml"))
+        spec = mujoco.MjSpec.from_file(str(files("dm_control") / "suite" / "walker.xml"))
         spec.geom("floor").priority = 1
         spec.option.timestep = 0.005
         spec.body("torso").add_camera(
