@@ -2,7 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 
-.PHONY: demo test lint
+.PHONY: setup demo test lint
+
+setup: $(VENV)/installed
 
 demo: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume

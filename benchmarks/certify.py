@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 import envs
@@ -26,13 +27,14 @@ from benchmarks.score import normalise
 from deconf import cloning
 from deconf.equations import belief_update
 from deconf.exact import ExactAgent, Grid
-from envs.console import Parser, check_folder, run_command, write_json
+from envs.console import Parser, Progress, check_folder, run_command, write_json
 from envs.task import Array
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
 from experts.policy import Expert
 
 EPISODES = 5
+STAGES = 5  # of a certificate, for its progress
 LEVELS = 5  # of theta in the stakes matrix, for one latent
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
@@ -107,8 +109,18 @@ def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
     return far
 
 
-def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, seed: int = 0) -> dict[str, Any]:
-    """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert."""
+def certify(
+    task: envs.Task,
+    expert: Expert,
+    trials: int = 64,
+    grid: int = 21,
+    seed: int = 0,
+    done: Callable[[str], None] = lambda stage: None,
+) -> dict[str, Any]:
+    """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert.
+
+    done: is told of each stage that is over.
+    """
     env = envs.BatchEnv(task, trials)
 
     def returns(agent: Agent) -> Array:
@@ -119,15 +131,20 @@ def certify(task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, s
     if one <= zero:
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
     truth = env.theta.copy()  # the same in every run: seeds are shared
+    done("evidence")
     beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
     interventional = returns(ExactAgent(env, expert, False, grid))
+    done("exact interventional policy")
     conditional = returns(ExactAgent(env, expert, True, grid))
+    done("exact conditional policy")
     levels, matrix, raw = stakes(task, expert, max(trials // 2, 8), seed)
 
+    done("stakes")
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed))
     blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
 
+    done("blind BC")
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),
@@ -206,11 +223,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="output folder; default: results/certificates")
     args = parser.parse_args()
     task = envs.get(args.task)
+    envs.check_task(task)
     expert = policy.load(task)
     folder = args.out or Path("results") / "certificates"
     check_folder(folder)
-    start = time.time()
-    result = certify(task, expert)
+    torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
+    start, progress = time.time(), Progress(STAGES, task.name, every_s=0)
+    result = certify(task, expert, done=lambda stage: progress.update(1, stage))
+    progress.close()
     write_json(folder / f"{task.name}.json", result)
     picture(result, folder / f"{task.name}.png")
     for name, check in result["checks"].items():

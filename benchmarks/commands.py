@@ -22,7 +22,7 @@ from benchmarks.presets import PRESETS, preset
 from envs.console import Parser
 from experts import policy
 
-LIBRARIES = ("mujoco", "gymnasium", "numpy", "torch", "stable-baselines3")
+LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
 
 

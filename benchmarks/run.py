@@ -78,6 +78,7 @@ def main() -> None:
         raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
     task = envs.get(args.task)
     wanted = {*commands.check(args, list(METHODS), default_methods(task)), *REFERENCES}
+    envs.check_task(task)
     policy.load(task)
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, results = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)

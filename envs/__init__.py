@@ -1,7 +1,7 @@
 """Tasks with hidden physics, and the registry: `names`, `get`, `make`, `make_vec`, `make_dm`.
 
-A new task is one file, one MJCF and one import line here. Importing this package also registers every task with
-gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v0")` works.
+A new task is one file, one MJCF and two lines here: its import, and its class in TASKS. Importing this package also
+registers every task with gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v0")` works.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import gymnasium
 from envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from envs.bandit import Bandit
 from envs.batch import BatchEnv
+from envs.check import check_task
 from envs.forked_path import ForkedPath
 from envs.heavy_payload import HeavyPayload
 from envs.hidden_goal import HiddenGoal
@@ -38,6 +39,7 @@ __all__ = [
     "Latent",
     "MujocoTask",
     "Task",
+    "check_task",
     "get",
     "make",
     "make_dm",
@@ -47,7 +49,16 @@ __all__ = [
 
 TASKS: dict[str, type[Task]] = {
     cls.name: cls
-    for cls in (Bandit, TiltedCartpole, SlipperyCartpole, HeavyPayload, IcyRoad, SlipperyWalker, HiddenGoal, ForkedPath)
+    for cls in (
+        Bandit,
+        TiltedCartpole,
+        SlipperyCartpole,
+        HeavyPayload,
+        IcyRoad,
+        SlipperyWalker,
+        HiddenGoal,
+        ForkedPath,
+    )
 }
 
 
@@ -56,17 +67,17 @@ def names() -> list[str]:
     return list(TASKS)
 
 
-def closest(kind: str, given: str, known: list[str]) -> InputError:
-    """The error for a name that is not known: it names the nearest one."""
-    near = difflib.get_close_matches(given, known, 1, 0.3)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}")
+def closest(kind: str, given: str, known: list[str], remedy: str = "") -> InputError:
+    """The error for a name that is not known: it names the nearest one, or says what to do."""
+    near = difflib.get_close_matches(given, known, 1, 0.6)
+    hint, remedy = (f"did you mean {near[0]!r}? ", "") if near else ("", remedy)
+    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}{remedy}")
 
 
 def get(name: str) -> Task:
     """The task of that name. Raises InputError, naming the nearest, if there is none."""
     if name not in TASKS:
-        raise closest("task", name, names())
+        raise closest("task", name, names(), "; a new one must be in TASKS in envs/__init__.py")
     return TASKS[name]()
 
 

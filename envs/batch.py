@@ -102,6 +102,8 @@ class BatchEnv:
         self.state = self.task.apply_noise(outcome, noise)
         self._steps += 1
         reward = np.where(self.alive, self.task.reward(state, checked, self.state, self.theta), 0.0)
+        if not np.isfinite(reward).all():
+            raise InputError(f"reward of {self.task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
         terminated = self.alive & self.task.terminated(self.state)
         truncated = self.alive & ~terminated & (self._steps >= self.task.horizon)
         self.alive = self.alive & ~terminated & ~truncated

@@ -21,7 +21,9 @@ class Parser(argparse.ArgumentParser):
     """A command line, described by its module's docstring, whose errors are one line."""
 
     def __init__(self, description: str | None) -> None:
-        super().__init__(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+        super().__init__(
+            description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+        )
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see --help")

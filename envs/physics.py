@@ -24,7 +24,7 @@ class Edit(Protocol):
     """What a latent may change in a model, by the element's name; values are absolute or times the MJCF's own."""
 
     def body_tilt(self, name: str, angle: float) -> None:
-        """Turn a body about its parent's y axis; rad."""
+        """Set a body's angle about its parent's y axis, in place of the MJCF's; rad."""
 
     def body_shift(self, name: str, x: float) -> None:
         """Set a body's x in its parent's frame; m."""

@@ -43,6 +43,11 @@ class Latent:
     high: float
     distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
 
+    def __post_init__(self) -> None:
+        if not self.low < self.high or (self.distribution == "loguniform" and self.low <= 0):
+            right = "0 < low < high" if self.distribution == "loguniform" else "low < high"
+            raise InputError(f"latent {self.name} was {self.low:g} to {self.high:g}; it must be {right}")
+
     def ppf(self, u: Array) -> Array:
         """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""
         if self.distribution == "uniform":

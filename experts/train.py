@@ -85,6 +85,7 @@ def main() -> None:
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
     check_folder(file.parent)
+    envs.check_task(task)
     start = time.time()
     weights = train(task, args.steps, args.seed)
     partial = file.with_suffix(".partial")
@@ -112,6 +113,10 @@ def main() -> None:
         },
     }
     write_json(file.with_suffix(".json"), card)
+    if returns.mean() < random.mean() + 5 * returns.std() / np.sqrt(len(returns)):
+        print(
+            f"warning: the expert of {task.name} is hardly better than random actions: more --steps, or another reward"
+        )
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
 
 

@@ -42,6 +42,8 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
         (("benchmarks/run.py",), "--task is missing"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
+        (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
+        (("benchmarks/run.py", "--task", "leaning_beam"), "must be in TASKS in envs/__init__.py"),
         (("benchmarks/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
@@ -204,7 +206,7 @@ def test_readme_tables_are_the_results(file: Path) -> None:
 
 def test_task_cards_are_up_to_date() -> None:
     """docs/tasks.md is what cards.py writes; every task has its latents, observations and noise in it."""
-    assert (ROOT / "docs" / "tasks.md").read_text() == cards.page()
+    assert (ROOT / "docs" / "tasks.md").read_text() == cards.page(), "run `python benchmarks/cards.py`"
 
 
 @pytest.mark.parametrize("number", [0, 1])
