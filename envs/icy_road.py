@@ -7,8 +7,9 @@ noise, and without it a careful driver would never learn what the road is like.
 
 Latent: grip, the friction coefficient of tyre on road, log-uniform: the road's, which has priority over the wheels'.
 The wheels' rolling drag rises with it. Planar chassis (x, y, z, yaw) on four driven sphere wheels, the front ones
-steered. Every coordinate has noise but the wheels' angles, which are of no consequence. The chassis is damped upwards:
-its bounce would tell of the grip at once.
+steered. Friction is soft (impratio .01), as a tyre's is: force grows with slip, up to grip times load. Every coordinate
+has noise but the wheels' angles, which are of no consequence. The chassis is damped upwards: its bounce would tell of
+the grip at once.
 
 Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: speed along the road above .6
 m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
@@ -52,7 +53,7 @@ class IcyRoad(MujocoTask):
     costly = True
     expert_noise = 0.02
     process_noise = {
-        **{"x": (0.003, 0.045), "y": (0.003, 0.045), "z": (2e-4, 0.03), "yaw": (0.006, 0.12)},
+        **{"x": (0.003, 0.045), "y": (0.003, 0.045), "z": (4e-4, 0.05), "yaw": (0.006, 0.12)},
         **{joint: (0.002, 0.05) for joint in ("steer_left", "steer_right")},
         **{wheel: (0, 8) for wheel in WHEELS},
     }
@@ -61,6 +62,7 @@ class IcyRoad(MujocoTask):
         **{"lane_offset": (-2, 2), "heading_error": (-4, 4), "forward": (-10, 10), "sideways": (-10, 10)},
         **{"yaw_rate": (-20, 20), "front_slip": (-5, 5), "rear_slip": (-5, 5)},
         **{f"curvature_{i}": (-2, 2) for i in range(len(AHEAD))},
+        "steering": (-0.6, 0.6),
     }
 
     def spec(self) -> mujoco.MjSpec:
@@ -105,9 +107,10 @@ class IcyRoad(MujocoTask):
         sideways = y_velocity * np.cos(yaw) - x_velocity * np.sin(yaw)
         spin = [self.qvel(state, wheel) for wheel in WHEELS]
         slips = (RADIUS * (spin[i] + spin[i + 1]) / 2 - forward for i in (0, 2))
+        steering = (self.qpos(state, "steer_left") + self.qpos(state, "steer_right")) / 2
         error = (yaw - direction + np.pi) % (2 * np.pi) - np.pi
         ahead = (road(self.qpos(state, "x") + d * np.cos(direction))[2] for d in AHEAD)
-        return np.stack([offset, error, forward, sideways, self.qvel(state, "yaw"), *slips, *ahead], -1)
+        return np.stack([offset, error, forward, sideways, self.qvel(state, "yaw"), *slips, *ahead, steering], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         _, direction = self._lane(state)
