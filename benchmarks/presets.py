@@ -37,7 +37,6 @@ _CONTROL = Preset(
     dagger=DaggerConfig(updates=4500, learning_rate=3e-3),
     cloning=CloningConfig(),
 )
-_COSTLY = replace(_CONTROL, explore_trials=128)  # contacts: a belief fits itself to the thetas of half as many trials
 _ON_BANDIT = DeconfoundedConfig(
     rounds=2,
     inference_batch=64,
@@ -132,8 +131,8 @@ def default_methods(task: envs.Task) -> list[str]:
 
 
 def preset(name: str, task: envs.Task, device: str) -> Preset:
-    """The amounts for a task: the bandit's for discrete ones, else those of control, with more exploration if costly."""
-    amounts = _BANDIT if isinstance(task.action_space, spaces.Discrete) else _COSTLY if task.costly else _CONTROL
+    """The amounts for a task: discrete ones take the bandit's, all others those of control."""
+    amounts = _BANDIT if isinstance(task.action_space, spaces.Discrete) else _CONTROL
     if name == "smoke":
         amounts = _smoke(amounts)
     if name == "paper":

@@ -149,8 +149,8 @@ def fit(
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
     expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
     both = seen.joined(expert)
-    obs = Scaler(both.obs, both.mask)
-    change = Scaler(seen.next_obs - seen.obs, seen.mask)
+    # Experts' changes count too: those of random actions alone can be far smaller, and theta is then learned poorly.
+    obs, change = Scaler(both.obs, both.mask), Scaler(both.next_obs - both.obs, both.mask)
     model: LatentModel
     if config.model == "discrete":
         model = DiscreteModel(config.latent, config.width, signature, obs, change, draws)

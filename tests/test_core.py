@@ -366,6 +366,19 @@ class TestMethods:
             found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
         np.testing.assert_array_equal(*found)
 
+    def test_changes_are_scaled_by_all_data(self) -> None:
+        """Experts may move a hundred times as far in a step as random actions do: the model's targets stay small."""
+        rng = np.random.default_rng(0)
+        slow, fast = (
+            Trials(step * rng.standard_normal((8, 1, 21, 2)), np.zeros((8, 1, 20, 1)), np.ones((8, 1, 20), bool))
+            for step in (0.01, 1.0)
+        )
+        config = DeconfoundedConfig(rounds=1, inference_updates=1, imitation_updates=1, final_updates=1)
+        model = deconfounded.fit(fast, lambda agent, rngs: slow, config, rng).model
+        assert isinstance(model, VariationalModel)
+        data = Batch.of(fast, 1)
+        assert 0.5 < model.dynamics.change(data.next_obs - data.obs).std() < 2
+
     def test_deconfounded_learns_from_physics(self) -> None:
         """A minute's budget cut to seconds: after training, the belief tells thetas apart on expert trials."""
         trials, env = demonstrations("tilted_cartpole", 48)
