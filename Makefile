@@ -1,4 +1,4 @@
-# Everything from nothing but Python >= 3.11: `make demo` and `make test`.
+# Everything from nothing but Python >= 3.11: `make setup`, `make demo` and `make test`.
 PYTHON ?= python3
 VENV := .venv
 

@@ -34,7 +34,7 @@ from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
 from experts.policy import Expert
 
 EPISODES = 5
-STAGES = 5  # of a certificate, for its progress
+STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
@@ -131,20 +131,20 @@ def certify(
     if one <= zero:
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
     truth = env.theta.copy()  # the same in every run: seeds are shared
-    done("evidence")
+    done(STAGES[0])
     beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
     interventional = returns(ExactAgent(env, expert, False, grid))
-    done("exact interventional policy")
+    done(STAGES[1])
     conditional = returns(ExactAgent(env, expert, True, grid))
-    done("exact conditional policy")
+    done(STAGES[2])
     levels, matrix, raw = stakes(task, expert, max(trials // 2, 8), seed)
+    done(STAGES[3])
 
-    done("stakes")
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed))
     blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
 
-    done("blind BC")
+    done(STAGES[4])
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),
@@ -228,8 +228,8 @@ def main() -> None:
     folder = args.out or Path("results") / "certificates"
     check_folder(folder)
     torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
-    start, progress = time.time(), Progress(STAGES, task.name, every_s=0)
-    result = certify(task, expert, done=lambda stage: progress.update(1, stage))
+    start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
+    result = certify(task, expert, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()
     write_json(folder / f"{task.name}.json", result)
     picture(result, folder / f"{task.name}.png")

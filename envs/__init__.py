@@ -68,9 +68,9 @@ def names() -> list[str]:
 
 
 def closest(kind: str, given: str, known: list[str], remedy: str = "") -> InputError:
-    """The error for a name that is not known: it names the nearest one, or says what to do."""
+    """The error for a name that is not known: it names the nearest one, and what else may help."""
     near = difflib.get_close_matches(given, known, 1, 0.6)
-    hint, remedy = (f"did you mean {near[0]!r}? ", "") if near else ("", remedy)
+    hint = f"did you mean {near[0]!r}? " if near else ""
     return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}{remedy}")
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 
@@ -18,13 +20,15 @@ def _part(task: Task, name: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+    except Exception as error:
         text = " ".join(str(error.args[0] if error.args else error).split())
-        raise InputError(f"{name} of {task.name}: {text}") from error
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(frame.filename).name}:{frame.lineno}"
+        raise InputError(f"{name} of {task.name}: {text} ({type(error).__name__}, {where})") from error
 
 
 def check_task(task: Task) -> None:
-    """Build it and take one step. Raises InputError that names the part of the task which does not fit the others."""
+    """Build it and take one step, twice side by side. Raises InputError that names the part which does not fit."""
     if isinstance(task, MujocoTask):
         with _part(task, f"the model (assets/{task.name}.xml, or what `spec` makes)"):
             task.spec()
@@ -33,15 +37,25 @@ def check_task(task: Task) -> None:
             task._noisy  # noqa: B018
         with _part(task, "apply_latent"):
             task.simulator(1)
+    rng, n = np.random.default_rng(0), 2
+    action = np.zeros((n, *(task.action_space.shape or (1,))))
     with _part(task, "init_state"):
-        state = task.init_state(np.random.default_rng(0))[None]
-    with _part(task, "observe"):
-        width = task.observe(state).shape[-1]
-        if width != len(task.observation):
-            raise InputError(
-                f"observe of {task.name} gave {width} numbers; it must be {len(task.observation)}, as `observation`"
-            )
-    with _part(task, "a step"):
-        env = BatchEnv(task, 1)
+        state = np.stack([task.init_state(rng) for _ in range(n)])
+    theta = np.stack([task.sample_theta(rng) for _ in range(n)])
+    with _part(task, "outcome"):
+        then = task.apply_noise(task.outcome(state, action, theta), np.stack([task.sample_noise(rng)[0]] * n))
+    for name, shape, ask in (
+        ("observe", (n, len(task.observation)), lambda: task.observe(state)),
+        ("reward", (n,), lambda: task.reward(state, action, then, theta)),
+        ("terminated", (n,), lambda: task.terminated(then)),
+    ):
+        with _part(task, name):
+            given = np.asarray(ask())
+            if given.shape != shape:
+                raise InputError(f"{name} of {task.name} gave {given.shape} of {n} environments; it must be {shape}")
+            if not np.isfinite(given).all():
+                raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
+    with _part(task, "an episode"):
+        env = BatchEnv(task, n)
         env.reset(0)
-        env.step(np.zeros((1, *(task.action_space.shape or (1,)))))
+        env.step(action)

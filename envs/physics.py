@@ -15,7 +15,7 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from envs import render
-from envs.task import ASSETS, Array, Painter, Simulator, Task
+from envs.task import ASSETS, Array, InputError, Painter, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -236,12 +236,16 @@ class MujocoTask(Task):
         """Indices [Z] into the state and standard deviations [Z]."""
         index, sigma = [], []
         for joint, stds in self.process_noise.items():
+            if not min(stds) >= 0:
+                raise InputError(
+                    f"process_noise of joint {joint} was {stds}; it must be standard deviations, from 0 up"
+                )
             q, v = self._address(joint)
             for i, std in zip((1 + q, 1 + self.model.nq + v), stds, strict=True):
                 if std > 0:
                     index.append(i)
                     sigma.append(std)
-        return np.array(index), np.array(sigma)
+        return np.array(index, int), np.array(sigma, float)
 
     def simulator(self, n: int) -> Physics:
         return Physics(self, n)

@@ -34,7 +34,7 @@ class Latent:
     """One hidden physical parameter and its distribution p(theta).
 
     distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
-    low..high, equally likely.
+    low..high, equally likely. Raises InputError for bounds that do not fit it.
     """
 
     name: str
@@ -44,9 +44,18 @@ class Latent:
     distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
 
     def __post_init__(self) -> None:
-        if not self.low < self.high or (self.distribution == "loguniform" and self.low <= 0):
-            right = "0 < low < high" if self.distribution == "loguniform" else "low < high"
-            raise InputError(f"latent {self.name} was {self.low:g} to {self.high:g}; it must be {right}")
+        rules = {
+            "uniform": ("low < high", True),
+            "loguniform": ("0 < low < high", self.low > 0),
+            "categorical": ("whole numbers low < high", self.low % 1 == 0 == self.high % 1),
+        }
+        if self.distribution not in rules:
+            raise InputError(
+                f"distribution of {self.name} was {self.distribution!r}; it must be one of {', '.join(rules)}"
+            )
+        right, holds = rules[self.distribution]
+        if not (holds and -np.inf < self.low < self.high < np.inf):
+            raise InputError(f"{self.name} was {self.low:g} to {self.high:g}, {self.distribution}; it must be {right}")
 
     def ppf(self, u: Array) -> Array:
         """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""

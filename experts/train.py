@@ -84,8 +84,8 @@ def main() -> None:
     file = args.out or policy.path(task)
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
-    check_folder(file.parent)
     envs.check_task(task)
+    check_folder(file.parent)
     start = time.time()
     weights = train(task, args.steps, args.seed)
     partial = file.with_suffix(".partial")
@@ -113,7 +113,7 @@ def main() -> None:
         },
     }
     write_json(file.with_suffix(".json"), card)
-    if returns.mean() < random.mean() + 5 * returns.std() / np.sqrt(len(returns)):
+    if returns.mean() - random.mean() < 2 * random.std():
         print(
             f"warning: the expert of {task.name} is hardly better than random actions: more --steps, or another reward"
         )

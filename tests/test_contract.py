@@ -271,11 +271,13 @@ class TestPhysics:
     def test_bounds_are_wide_enough(self, name: str) -> None:
         """Observations are clipped to their bounds: random actions do not get there, in an episode that goes on."""
         task = envs.get(name)
-        batch = envs.BatchEnv(task, 32)
+        batch, steps = envs.BatchEnv(task, 32), 0
         batch.reset(0)
         for action in actions(task, 32, task.horizon):
             off = np.abs(batch.step(action)[0] - task.observe(batch.state))[batch.alive].max(0, initial=0)
+            steps += batch.alive.sum()
             assert not [name for name, clipped in zip(task.observation, off > 1e-3, strict=True) if clipped]
+        assert steps >= 32
 
     def test_set_in_place_equals_recompiled(self, name: str) -> None:
         task = envs.get(name)
@@ -334,7 +336,7 @@ class TestPhysics:
         for i in (i for i in quiet if (each[:, i] != each[0, i]).any()):
             moved = start.copy()
             moved[:, i] += 0.7
-            hint = f"theta moves coordinate {i - 1} of (qpos, qvel), which has no process noise"
+            hint = f"theta moves a coordinate without process noise: number {i - 1} of qpos and qvel"
             np.testing.assert_array_equal(task.observe(moved), task.observe(start), hint)
             after = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)))[:, noisy]
             np.testing.assert_allclose(after[0], after[1], atol=1e-9, err_msg=hint)
