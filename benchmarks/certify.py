@@ -143,8 +143,8 @@ def certify(
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed))
     blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
-
     done(STAGES[4])
+
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),

@@ -20,7 +20,7 @@ from deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
 from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconf.equations import imitation_loss
 from deconf.models import BELIEFS, DiscreteModel, LatentModel, VariationalModel
-from deconf.nets import ActionHead, Adam, Scaler
+from deconf.nets import ActionHead, Adam, scalers
 from envs.task import InputError
 from experts.demos import Agent, Trials
 
@@ -148,9 +148,8 @@ def fit(
     if Signature.of(first) != signature:
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
     expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
-    both = seen.joined(expert)
     # Experts' changes count too: those of random actions alone can be far smaller, and theta is then learned poorly.
-    obs, change = Scaler(both.obs, both.mask), Scaler(both.next_obs - both.obs, both.mask)
+    obs, change = scalers(seen.joined(expert))
     model: LatentModel
     if config.model == "discrete":
         model = DiscreteModel(config.latent, config.width, signature, obs, change, draws)

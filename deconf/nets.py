@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.data import Draws, Signature
+from deconf.data import Batch, Draws, Signature
 
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
@@ -105,6 +105,11 @@ class Scaler(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
+
+
+def scalers(data: Batch) -> tuple[Scaler, Scaler]:
+    """Of the observations, and of their changes in a step."""
+    return Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
 
 
 class Inputs(nn.Module):

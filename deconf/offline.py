@@ -18,7 +18,7 @@ from deconf.data import Batch, Draws, Rngs, Signature, listed, take
 from deconf.deconfounded import DeconfoundedAgent, final_belief
 from deconf.equations import gaussian_kl, offline_loss
 from deconf.models import VariationalModel
-from deconf.nets import ActionHead, Adam, Scaler
+from deconf.nets import ActionHead, Adam, scalers
 from experts.demos import Trials
 
 
@@ -47,7 +47,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
     rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
-    obs, change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+    obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
     offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
     online.dynamics = offline.dynamics

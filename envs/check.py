@@ -31,22 +31,21 @@ def check_task(task: Task) -> None:
     """Build it and take one step, twice side by side. Raises InputError that names the part which does not fit."""
     if isinstance(task, MujocoTask):
         with _part(task, f"the model (assets/{task.name}.xml, or what `spec` makes)"):
-            task.spec()
             task.model  # noqa: B018 (compiles it)
         with _part(task, "process_noise"):
             task._noisy  # noqa: B018
-        with _part(task, "apply_latent"):
-            task.simulator(1)
     rng, n = np.random.default_rng(0), 2
     action = np.zeros((n, *(task.action_space.shape or (1,))))
+    with _part(task, "apply_latent"):
+        env = BatchEnv(task, n)
     with _part(task, "init_state"):
         state = np.stack([task.init_state(rng) for _ in range(n)])
-    theta = np.stack([task.sample_theta(rng) for _ in range(n)])
     with _part(task, "outcome"):
-        then = task.apply_noise(task.outcome(state, action, theta), np.stack([task.sample_noise(rng)[0]] * n))
+        noise = np.stack([task.sample_noise(rng)[0] for _ in range(n)])
+        then = task.apply_noise(env.simulator.outcome(state, action), noise)
     for name, shape, ask in (
         ("observe", (n, len(task.observation)), lambda: task.observe(state)),
-        ("reward", (n,), lambda: task.reward(state, action, then, theta)),
+        ("reward", (n,), lambda: task.reward(state, action, then, env.theta)),
         ("terminated", (n,), lambda: task.terminated(then)),
     ):
         with _part(task, name):
@@ -56,6 +55,5 @@ def check_task(task: Task) -> None:
             if not np.isfinite(given).all():
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):
-        env = BatchEnv(task, n)
         env.reset(0)
         env.step(action)

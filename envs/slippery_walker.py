@@ -76,9 +76,8 @@ class SlipperyWalker(MujocoTask):
         return self.state(rootz=(0.01, 0), rootx=(x, 0), rooty=(pitch, 0), **legs)
 
     def observe(self, state: Array) -> Array:
-        places = [self.qpos(state, joint) for joint in ("rootx", "rootz", "rooty", *JOINTS)]
-        places[1] = HEIGHT + places[1]
-        return np.stack([*places, *(self.qvel(state, joint) for joint in (*ROOT, *JOINTS))], -1)
+        x, z, *angles = (self.qpos(state, joint) for joint in ("rootx", "rootz", "rooty", *JOINTS))
+        return np.stack([x, HEIGHT + z, *angles, *(self.qvel(state, joint) for joint in (*ROOT, *JOINTS))], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         x, pitch = self.qpos(next_state, "rootx"), self.qpos(next_state, "rooty")

@@ -31,7 +31,7 @@ from deconf.equations import (
 )
 from deconf.exact import ExactAgent
 from deconf.models import DiscreteModel, VariationalModel
-from deconf.nets import ActionHead, Embedding, Scaler
+from deconf.nets import ActionHead, Embedding, Scaler, scalers
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from experts import policy
@@ -174,7 +174,7 @@ def test_discrete_belief_one_step_at_a_time(name: str) -> None:
     """Bayes' rule step by step gives the posterior of the whole trial, which is not the prior."""
     trials, _ = demonstrations(name, 6)
     data, signature = Batch.of(trials, 2), Signature.of(trials)
-    obs, change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+    obs, change = scalers(data)
     model = DiscreteModel(4, 16, signature, obs, change, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
     with torch.no_grad():
         memory = model.start(len(data))
@@ -188,7 +188,7 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
     """Tier 1: two latents, dynamics that pay the same, a policy that takes the latent's arm: no correlation is left."""
     trials, _ = demonstrations("bandit", 6, 1)
     data, signature = Batch.of(trials, 1), Signature.of(trials)
-    obs, change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+    obs, change = scalers(data)
     draws = Draws([np.random.default_rng(0)], "cpu")
     model = VariationalModel("evidence", 1, 8, signature, obs, change, draws)
     policy_ = ActionHead(2, 8, signature, draws)
