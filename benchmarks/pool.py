@@ -27,6 +27,7 @@ import torch
 import envs
 from benchmarks.methods import COST, LEARNED, METHODS, Preset
 from deconf.agents import Monitor, State
+from deconf.nets import prepare_torch
 from envs.console import Progress, check_folder, write_atomically, write_json
 from envs.physics import cores
 from experts.demos import Agent
@@ -91,7 +92,7 @@ def start_worker(ticks: Queue[int]) -> None:
     global _ticks
     threading.Thread(target=_die_with_parent, daemon=True).start()
     _ticks = ticks
-    torch.set_num_threads(1)
+    prepare_torch()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

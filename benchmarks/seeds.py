@@ -18,6 +18,7 @@ from benchmarks import commands
 from benchmarks.methods import METHODS, Context, Preset
 from benchmarks.presets import preset
 from deconf.agents import Monitor
+from deconf.nets import prepare_torch
 from envs.console import Parser, run_command
 from experts.demos import Agent
 
@@ -71,7 +72,7 @@ def main() -> None:
     for seeds in args.seeds:
         commands.check_run(args.preset, seeds, args.device)
     settings = few(preset(args.preset, task, args.device))
-    torch.set_num_threads(1)
+    prepare_torch()
     print(f"{task.name}, {args.preset}, {args.device}, torch {torch.__version__}")
     for method in TIMED:
         alone: dict[str, float] = {}

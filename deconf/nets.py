@@ -16,6 +16,20 @@ from torch.nn import functional as F
 
 from deconf.data import Batch, Draws, Signature
 
+SMALL = 16**3  # multiplications; torch never gives less than that to oneDNN, but stacked seeds could add up to more
+
+
+def prepare_torch() -> None:
+    """One thread, since the networks are small; and float32 products by oneDNN where that is sure to keep float32.
+
+    MKL leaves AVX-512 unused on AMD, where oneDNN takes half its time. What asks for oneDNN also allows bfloat16, which
+    x86 has no fast products of without AMX: there, and on other processors, torch's own choice stands.
+    """
+    torch.set_num_threads(1)
+    has = torch.cpu.get_capabilities()
+    if has.get("avx512_f") and not has.get("amx_bf16"):
+        torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
+
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to go with tensors [S, ..., F]."""
@@ -33,7 +47,12 @@ class Linear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         rows = x.reshape(len(x), -1, x.shape[-1])
-        return torch.baddbmm(self.bias, rows, self.weight).reshape(*x.shape[:-1], self.weight.shape[-1])
+        if rows.shape[1] * self.weight[0].numel() <= SMALL:
+            each = zip(self.bias.split(1), rows.split(1), self.weight.split(1), strict=True)
+            out = torch.cat([torch.baddbmm(*one) for one in each])
+        else:
+            out = torch.baddbmm(self.bias, rows, self.weight)
+        return out.reshape(*x.shape[:-1], self.weight.shape[-1])
 
 
 def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:

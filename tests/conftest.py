@@ -1,5 +1,5 @@
-"""One thread for torch: networks here are small, and results then do not depend on the machine's cores."""
+"""As in the benchmark's processes: one thread, so that results do not depend on the machine's cores."""
 
-import torch
+from deconf.nets import prepare_torch
 
-torch.set_num_threads(1)
+prepare_torch()

@@ -145,6 +145,13 @@ def _bandit_batch(n: int) -> tuple[Batch, Signature, Scaler, Draws]:
     return batch, Signature.of(trials), Scaler(batch.obs, batch.mask), draws
 
 
+def test_products_keep_float32() -> None:
+    """However torch was told to multiply: bfloat16's error would be near .1."""
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(2, 100, 256, generator=generator), torch.randn(2, 256, 768, generator=generator)
+    assert (torch.bmm(a, b) - torch.bmm(a.double(), b.double())).abs().max() < 3e-4
+
+
 def test_one_bit_is_embedded_as_any_observation() -> None:
     """The two embeddings of a binary observation are those that the network gives row by row."""
     batch, signature, scaler, draws = _bandit_batch(8)
