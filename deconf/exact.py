@@ -19,10 +19,14 @@ from experts.policy import Expert, sample_rows
 
 
 class Grid:
-    """K equally likely thetas, and what one transition of each of N environments says about them."""
+    """K equally likely thetas, and what one transition of each of N environments says about them.
+
+    k: values of the latent; of several latents, each gets a third as many, since every pair of them is simulated.
+    """
 
     def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
-        self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k)
+        one = len(env.task.latents) == 1
+        self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k if one else max(2, k // 3))
         self._simulator = env.task.simulator(len(self.theta))
         for i, theta in enumerate(self.theta):
             self._simulator.set_theta(i, theta)

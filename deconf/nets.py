@@ -22,8 +22,8 @@ SMALL = 16**3  # multiplications; torch never gives less than that to oneDNN, bu
 def prepare_torch() -> None:
     """One thread, since the networks are small; and float32 products by oneDNN where that is sure to keep float32.
 
-    MKL leaves AVX-512 unused on AMD, where oneDNN takes half its time. What asks for oneDNN also allows bfloat16, which
-    x86 has no fast products of without AMX: there, and on other processors, torch's own choice stands.
+    MKL leaves AVX-512 unused on AMD, where oneDNN takes half its time. What asks for oneDNN also allows it bfloat16,
+    which it uses if there is AMX: there, and on processors without AVX-512, torch's own choice stands.
     """
     torch.set_num_threads(1)
     has = torch.cpu.get_capabilities()

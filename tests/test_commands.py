@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import cards, certify, pool, publish, score
+from benchmarks import certify, pages, pool, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -198,15 +198,18 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert_set_in_place_equals_recompiled(task)
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "docs").glob("*.json")), ids=lambda file: file.stem)
-def test_readme_tables_are_the_results(file: Path) -> None:
-    """README's table of a task is what publish.py prints of docs/TASK.json."""
-    assert publish.markdown(json.loads(file.read_text())) in (ROOT / "README.md").read_text()
-
-
-def test_task_cards_are_up_to_date() -> None:
-    """docs/tasks.md is what cards.py writes; every task has its latents, observations and noise in it."""
-    assert (ROOT / "docs" / "tasks.md").read_text() == cards.page(), "run `python benchmarks/cards.py`"
+def test_pages_are_up_to_date() -> None:
+    """What pages.py writes of tasks, certificates and results; README has a row for each of the latter two."""
+    readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
+    for text, now in (
+        ((docs / "tasks.md").read_text(), pages.tasks_page()),
+        ((docs / "results.md").read_text(), pages.results_page()),
+        (readme, pages.readme()),
+    ):
+        assert text == now, "run `python benchmarks/pages.py`"
+    rows = re.findall(r"^\| (\w+) \|", readme, re.M)
+    kept = [*docs.glob("*.json"), *(docs / "certificates").glob("*.json")]
+    assert sorted(name for name in rows if name != "task") == sorted(file.stem for file in kept)
 
 
 @pytest.mark.parametrize("number", [0, 1])

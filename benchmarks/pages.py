@@ -1,0 +1,179 @@
+"""What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
+
+Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md (of the runs that
+`publish.py` kept) and the tables in README.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import envs
+from benchmarks import score
+from benchmarks.methods import METHODS, REFERENCES
+from benchmarks.presets import default_methods
+from envs.console import Parser, run_command, write_atomically
+
+README = Path(__file__).parents[1] / "README.md"
+DOCS = README.parent / "docs"
+TIERS = {
+    None: "none: nobody can win",
+    2: "2: exploration is enough",
+    3: "3: it takes queries of the expert",
+}
+
+
+SUMMARY = (
+    *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "naive_rnn"),
+    *("oracle_bc", "blind_bc", "conditional", "interventional"),
+)  # methods in README's table
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Rows of cells under a head."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))
+
+
+def _published(folder: Path) -> Iterator[tuple[envs.Task, dict[str, Any]]]:
+    """In the registry's order, the tasks that have a file in the folder, and what it holds."""
+    for name in envs.names():
+        if (file := folder / f"{name}.json").is_file():
+            yield envs.get(name), json.loads(file.read_text())
+
+
+def command(task: envs.Task, results: dict[str, Any]) -> str:
+    """That makes the results."""
+    methods = [name for name in METHODS if name in results["methods"] and name not in REFERENCES]
+    named = "" if methods == default_methods(task) else f" --methods {' '.join(methods)}"
+    preset = "" if results["preset"] == "default" else f" --preset {results['preset']}"
+    return f"python benchmarks/run.py --task {task.name}{preset}{named}"
+
+
+def section(task: envs.Task, results: dict[str, Any], gif: bool) -> str:
+    """A task's part of docs/results.md."""
+    seeds, machine = len(results["seeds"]), results["machine"]
+    versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
+    rows = []
+    for row in score.rows(results["methods"]):
+        beyond = results["methods"][row[0]].get("score_beyond")
+        rows.append((*row, f"{beyond[-1]:.2f}" if beyond else ""))
+    parts = [
+        f"## {task.name}",
+        f"`{command(task, results)}`",
+        f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {machine}; {versions}"
+        f" ([json]({task.name}.json)).",
+        markdown_table((*score.COLUMNS, "after as many again"), rows),
+        f"![score by episode]({task.name}.png)",
+    ]
+    return "\n\n".join(parts + [f"![expert, naive and deconfounded under one theta]({task.name}.gif)"] * gif)
+
+
+def results_page() -> str:
+    """docs/results.md."""
+    head = """# Results
+
+Made by `python benchmarks/pages.py` from the json files beside it. Scores: 0 = random actions, 1 = the expert that sees
+theta. Return, Eq. (1) and theta R2 (of a linear probe, held out) are of the last episode; intervals are 95% bootstrap
+intervals over seeds (of three seeds: their range). *After as many again*: the last score in a trial twice as long as
+those of training."""
+    sections = (section(*found, gif=(DOCS / f"{found[0].name}.gif").exists()) for found in _published(DOCS))
+    return "\n\n".join([head, *sections]) + "\n"
+
+
+def summary() -> str:
+    """README's table: scores in the last episode."""
+    rows = []
+    for task, results in _published(DOCS):
+        cells = []
+        for name in SUMMARY:
+            entry = results["methods"].get(name)
+            cells.append("" if entry is None else f"{np.round(entry['score_last'], 2) + 0.0:.2f}")
+        tier = "none" if task.tier is None else str(task.tier)
+        rows.append((task.name, tier, f"**{cells[0]}**", *cells[1:], f"{results['wall_s']:,.0f}"))
+    return markdown_table(("task", "tier", *SUMMARY, "seconds"), rows)
+
+
+def certificates() -> str:
+    """README's table of certificates."""
+    rows, checks = [], {}
+    for task, found in _published(DOCS / "certificates"):
+        checks, evidence = found["checks"], found["evidence_nats_per_step"]
+        measured = (f"{check['measured']:.2f}" for check in checks.values())
+        spoken = (f"{evidence[kind]:,.2g}" if evidence[kind] < 100 else f"{evidence[kind]:,.0f}" for kind in evidence)
+        rows.append((task.name, *measured, *list(spoken)[:2], found["verdict"]))
+    asked = (f"{name} ({check['required']})" for name, check in checks.items())
+    return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
+
+
+def readme() -> str:
+    """README with its tables, each between `<!-- name -->` and `<!-- /name -->`, as docs/ has them."""
+    text = README.read_text()
+    for table in (summary, certificates):
+        marks = [f"<!-- {slash}{table.__name__} -->" for slash in ("", "/")]
+        text = re.sub(f"{marks[0]}.*{marks[1]}", f"{marks[0]}\n{table()}\n{marks[1]}", text, flags=re.S)
+    return text
+
+
+def _certificate(task: envs.Task) -> str:
+    file = DOCS / "certificates" / f"{task.name}.json"
+    if not file.is_file():
+        return "No certificate."
+    found = json.loads(file.read_text())
+    checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in found["checks"].items())
+    evidence = found["evidence_nats_per_step"]
+    return (
+        f"Certificate {found['verdict']}: {', '.join(checks)}. Evidence of theta along expert trajectories: dynamics"
+        f" {evidence['dynamics']:.2g}, actions {evidence['actions']:.2g} nats a step."
+    )
+
+
+def card(task: envs.Task) -> str:
+    """Markdown: what the docstrings say, latents, observation, noise, tier, certificate."""
+    latents = [(lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution) for lat in task.latents]
+    parts = [f"## {task.name} (v{task.version})", inspect.getdoc(inspect.getmodule(type(task))) or ""]
+    for cls in type(task).__mro__:
+        if issubclass(cls, envs.Task) and cls.__module__ not in ("envs.task", "envs.physics"):
+            parts.append(inspect.cleandoc(cls.__doc__ or ""))
+    step = f", {task.control_dt:g} s each" if isinstance(task, envs.MujocoTask) else ""
+    parts.append(
+        f"Tier {TIERS[task.tier]}. Trials of {task.episodes} episodes of at most {task.horizon} steps{step}; the"
+        f" expert's action noise is {task.expert_noise:g}. {_certificate(task)}"
+    )
+    parts.append(markdown_table(("latent", "unit", "range", "distribution"), latents))
+    bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())
+    parts.append(markdown_table(("observation", "bounds"), bounds))
+    if isinstance(task, envs.MujocoTask):
+        noise = ((joint, *(f"{std:g}" for std in stds)) for joint, stds in task.process_noise.items())
+        parts.append(markdown_table(("joint", "noise a step, m or rad", "m/s or rad/s"), noise))
+    return "\n\n".join(parts)
+
+
+def tasks_page() -> str:
+    """docs/tasks.md: all cards."""
+    head = "# Tasks\n\nMade by `python benchmarks/pages.py` from the tasks' own classes and docs/certificates."
+    return "\n\n".join([head, *(card(envs.get(name)) for name in envs.names())]) + "\n"
+
+
+def write() -> None:
+    """Bring all of them up to date."""
+    write_atomically(DOCS / "tasks.md", tasks_page())
+    write_atomically(DOCS / "results.md", results_page())
+    write_atomically(README, readme())
+
+
+def main() -> None:
+    """The command line."""
+    Parser(__doc__).parse_args()
+    write()
+    print(summary())
+
+
+if __name__ == "__main__":
+    run_command(main)
