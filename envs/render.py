@@ -51,13 +51,25 @@ def ribbon(spec: mujoco.MjSpec, name: str, left: Array, right: Array, grey: floa
     spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **look)
 
 
+def level(model: mujoco.MjModel) -> None:
+    """Roll the camera `view` so that gravity points down in its picture."""
+    view, data = model.camera("view"), mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    right, up, _ = model.opt.gravity @ data.cam_xmat[view.id].reshape(3, 3)
+    if np.hypot(right, up) < 1e-6 * np.linalg.norm(model.opt.gravity):  # seen from straight above
+        return
+    roll, before = np.arctan2(right, -up) / 2, view.quat.copy()
+    mujoco.mju_mulQuat(view.quat, before, np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
+
+
 class Painter:
-    """Draws states of one model through its camera `view`. Raises InputError where no GL works."""
+    """Draws states of one model, which it keeps, by its camera `view`. Raises InputError where no GL works."""
 
     def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
         if (name := backend()) in ("egl", "osmesa"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
+        level(model)
         self._renderer = mujoco.Renderer(model, height, width)
         weakref.finalize(self, _close, self._renderer)  # with this painter, and before the GL library is gone
 

@@ -1,17 +1,19 @@
-"""A planar walker, dm_control's, set down on a mark where it has to stay: hidden friction, hidden slope.
+"""A planar walker, dm_control's, stands upright on a mark, on a slope that only the expert feels: two hidden latents.
 
-Tier 2, two latents at once. It stands with its feet close together and has .4 of dm_control's strength, so that it has
-to lean into the slope at once; told of another slope it leans the wrong way, drifts off the mark and falls, which ends
-the episode. Friction decides how a recovery step ends. Both show in every step, through process noise: feet slip a
-little.
+Tier 2. Upright is along gravity, as a sense of balance has it: the torso has to lean into the slope, by as much. But
+pitch and joints are observed relative to the ground, which tells nobody which way is down. Who leans by a wrong slope
+still stands, and may take their own pitch for evidence. In truth the slope shows in the torso's velocity along the
+ground, a little in every step, and friction in how feet slip while the walker catches itself. Friction decides how hard
+it may push, and costs little if mistaken.
 
 Latents: friction, the ground's coefficient, log-uniform, with priority over the feet's; slope, rad, uniform, uphill if
 positive: it turns gravity, and the ground stays where it is. Slopes are not centred on 0, as the feet reach further
 forward.
 
-The MJCF is dm_control's own, from the installed package. Action: torques, in units of .4 of the MJCF's. Reward: .2
-+ .8 exp(-(x / .08 m)^2 / 2 - (pitch / .15 rad)^2 / 2), less .02 times the mean square of the action. An episode is 5 s,
-and ends with the torso below 1 m or pitched by more than .6 rad.
+The MJCF is dm_control's own, from the installed package, with joints damped by 4 N m s/rad, so that it neither twitches
+nor bounces. Action: torques, in units of the MJCF's. Reward: .1 + .9 exp(-(x / .06 m)^2 / 2 - ((pitch - slope) /
+.07 rad)^2 / 2), less .1 times the mean square of the action. An episode is 5 s, and ends with the torso below 1 m or
+pitched by more than .6 rad.
 """
 
 from __future__ import annotations
@@ -27,9 +29,9 @@ from envs.physics import Edit, MujocoTask
 from envs.task import Array, Latent
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
-STRENGTH = 0.4  # of the MJCF's motors
+DAMPING = 4.0  # of joints, N m s/rad
 JOINTS = tuple(f"{side}_{joint}" for side in ("right", "left") for joint in ("hip", "knee", "ankle"))
-STANCE = (0.1, -0.2, 0.1, 0.0, -0.2, 0.2)  # rad, of the joints
+STANCE = (0.1, -0.2, 0.1, 0.0, -0.2, 0.2)  # rad, of the joints: feet close together
 ROOT = ("rootz", "rootx", "rooty")
 
 
@@ -37,14 +39,14 @@ class SlipperyWalker(MujocoTask):
     """Joints rootx, rootz and rooty of the torso, and hip, knee and ankle of each leg."""
 
     name = "slippery_walker"
-    latents = (Latent("friction", "", 0.3, 1.0, "loguniform"), Latent("slope", "rad", -0.12, 0.24))
+    latents = (Latent("friction", "", 0.12, 0.8, "loguniform"), Latent("slope", "rad", -0.1, 0.2))
     horizon = 200
     substeps = 5
     costly = True
     expert_noise = 0.05
     process_noise = {
-        **{"rootz": (0.001, 0.03), "rootx": (0.002, 0.05), "rooty": (0.003, 0.06)},
-        **{joint: (0.005, 0.4) if "ankle" in joint else (0.003, 0.2) for joint in JOINTS},
+        **{"rootz": (0.00025, 0.01), "rootx": (0.0008, 0.02), "rooty": (0.0008, 0.02)},
+        **{joint: (0.002, 0.1) if "ankle" in joint else (0.001, 0.05) for joint in JOINTS},
     }
     action_space = spaces.Box(-1.0, 1.0, (6,), np.float32)
     observation = {
@@ -57,6 +59,8 @@ class SlipperyWalker(MujocoTask):
         spec = mujoco.MjSpec.from_file(str(files("dm_control") / "suite" / "walker.xml"))
         spec.option.timestep = 0.005
         spec.geom("floor").priority = 1
+        for joint in JOINTS:
+            spec.joint(joint).damping = np.full_like(spec.joint(joint).damping, DAMPING)
         spec.texture("skybox").width, spec.texture("skybox").height = 32, 192
         box = mujoco.mjtGeom.mjGEOM_BOX
         spec.worldbody.add_site(name="mark", type=box, size=[0.08, 0.4, 0.002], rgba=[0.9, 0.3, 0.2, 1])
@@ -66,9 +70,6 @@ class SlipperyWalker(MujocoTask):
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.geom_friction("floor", float(theta[0]))
         edit.slope(float(theta[1]))
-
-    def control(self, action: Array) -> Array:
-        return STRENGTH * action
 
     def init_state(self, rng: np.random.Generator) -> Array:
         x, pitch, *bend = rng.uniform(-0.05, 0.05, 2 + len(JOINTS))
@@ -80,9 +81,9 @@ class SlipperyWalker(MujocoTask):
         return np.stack([x, HEIGHT + z, *angles, *(self.qvel(state, joint) for joint in (*ROOT, *JOINTS))], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
-        x, pitch = self.qpos(next_state, "rootx"), self.qpos(next_state, "rooty")
-        there = np.exp(-0.5 * (x / 0.08) ** 2 - 0.5 * (pitch / 0.15) ** 2)
-        return 0.2 + 0.8 * there - 0.02 * np.square(action).mean(-1)
+        x, lean = self.qpos(next_state, "rootx"), self.qpos(next_state, "rooty") - theta[..., 1]
+        there = np.exp(-0.5 * (x / 0.06) ** 2 - 0.5 * (lean / 0.07) ** 2)
+        return 0.1 + 0.9 * there - 0.1 * np.square(action).mean(-1)
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
         fallen = HEIGHT + self.qpos(state, "rootz") < 1.0

@@ -16,6 +16,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import envs
 from envs.physics import ModelEdit, SpecEdit
+from envs.render import level
 from experts import policy
 from tests.tools import actions, far_thetas, gl_works
 
@@ -77,6 +78,22 @@ def test_painters_do_not_touch_each_other() -> None:
     picture = paint(state, np.zeros(1))
     np.testing.assert_array_equal(task.painter(theta)(state, np.zeros(1)), picture)
     assert 100 < picture.mean() < 250
+
+
+@pytest.mark.parametrize("name", PHYSICS)
+def test_down_is_down_in_pictures(name: str) -> None:
+    """Whatever theta does to gravity, it points down in the picture."""
+    task = envs.get(name)
+    for theta in far_thetas(task):
+        physics = task.simulator(1)
+        physics.set_theta(0, theta)
+        model = physics.models[0]
+        level(model)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        right, up, _ = model.opt.gravity @ data.cam_xmat[model.camera("view").id].reshape(3, 3)
+        assert abs(right) < 1e-6
+        assert up < 1e-6
 
 
 @pytest.mark.parametrize("name", TASKS)
