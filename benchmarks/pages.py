@@ -50,8 +50,9 @@ def _published(folder: Path) -> Iterator[tuple[envs.Task, dict[str, Any]]]:
 
 def command(task: envs.Task, results: dict[str, Any]) -> str:
     """That makes the results."""
-    methods = [name for name in METHODS if name in results["methods"] and name not in REFERENCES]
-    named = "" if methods == default_methods(task) else f" --methods {' '.join(methods)}"
+    methods = [name for name in METHODS if name in results["methods"]]
+    asked = " ".join(name for name in methods if name not in REFERENCES)
+    named = "" if methods == default_methods(task) else f" --methods {asked}"
     preset = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     return f"python benchmarks/run.py --task {task.name}{preset}{named}"
 
