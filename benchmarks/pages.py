@@ -8,17 +8,14 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import envs
 from benchmarks import score
 from benchmarks.methods import METHODS, REFERENCES
-from benchmarks.presets import default_methods
+from benchmarks.presets import default_methods, preset
 from envs.console import Parser, run_command, write_atomically
 
 README = Path(__file__).parents[1] / "README.md"
@@ -53,8 +50,10 @@ def command(task: envs.Task, results: dict[str, Any]) -> str:
     methods = [name for name in METHODS if name in results["methods"]]
     asked = " ".join(name for name in methods if name not in REFERENCES)
     named = "" if methods == default_methods(task) else f" --methods {asked}"
-    preset = "" if results["preset"] == "default" else f" --preset {results['preset']}"
-    return f"python benchmarks/run.py --task {task.name}{preset}{named}"
+    chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
+    seeds = len(results["seeds"])
+    counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
+    return f"python benchmarks/run.py --task {task.name}{chosen}{counted}{named}"
 
 
 def section(task: envs.Task, results: dict[str, Any], gif: bool) -> str:
@@ -73,7 +72,9 @@ def section(task: envs.Task, results: dict[str, Any], gif: bool) -> str:
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
-    return "\n\n".join(parts + [f"![expert, naive and deconfounded under one theta]({task.name}.gif)"] * gif)
+    if gif:
+        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.gif)")
+    return "\n\n".join(parts)
 
 
 def results_page() -> str:
@@ -92,12 +93,9 @@ def summary() -> str:
     """README's table: scores in the last episode."""
     rows = []
     for task, results in _published(DOCS):
-        cells = []
-        for name in SUMMARY:
-            entry = results["methods"].get(name)
-            cells.append("" if entry is None else f"{np.round(entry['score_last'], 2) + 0.0:.2f}")
+        last = {row[0]: row[3] for row in score.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
-        rows.append((task.name, tier, f"**{cells[0]}**", *cells[1:], f"{results['wall_s']:,.0f}"))
+        rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     return markdown_table(("task", "tier", *SUMMARY, "seconds"), rows)
 
 
@@ -105,10 +103,9 @@ def certificates() -> str:
     """README's table of certificates."""
     rows, checks = [], {}
     for task, found in _published(DOCS / "certificates"):
-        checks, evidence = found["checks"], found["evidence_nats_per_step"]
+        checks = found["checks"]
         measured = (f"{check['measured']:.2f}" for check in checks.values())
-        spoken = (f"{evidence[kind]:,.2g}" if evidence[kind] < 100 else f"{evidence[kind]:,.0f}" for kind in evidence)
-        rows.append((task.name, *measured, *list(spoken)[:2], found["verdict"]))
+        rows.append((task.name, *measured, *_nats(found), found["verdict"]))
     asked = (f"{name} ({check['required']})" for name, check in checks.items())
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
@@ -118,8 +115,15 @@ def readme() -> str:
     text = README.read_text()
     for table in (summary, certificates):
         marks = [f"<!-- {slash}{table.__name__} -->" for slash in ("", "/")]
-        text = re.sub(f"{marks[0]}.*{marks[1]}", f"{marks[0]}\n{table()}\n{marks[1]}", text, flags=re.S)
+        before, rest = text.split(marks[0])
+        text = "\n".join([before + marks[0], table(), marks[1] + rest.split(marks[1])[1]])
     return text
+
+
+def _nats(certificate: dict[str, Any]) -> list[str]:
+    """Evidence of theta a step, along expert trajectories: from dynamics, from actions."""
+    told = (certificate["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions"))
+    return [f"{value:,.2f}" if value < 10 else f"{value:,.0f}" for value in told]
 
 
 def _certificate(task: envs.Task) -> str:
@@ -128,10 +132,10 @@ def _certificate(task: envs.Task) -> str:
         return "No certificate."
     found = json.loads(file.read_text())
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in found["checks"].items())
-    evidence = found["evidence_nats_per_step"]
+    dynamics, actions = _nats(found)
     return (
         f"Certificate {found['verdict']}: {', '.join(checks)}. Evidence of theta along expert trajectories: dynamics"
-        f" {evidence['dynamics']:.2g}, actions {evidence['actions']:.2g} nats a step."
+        f" {dynamics}, actions {actions} nats a step."
     )
 
 

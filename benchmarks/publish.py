@@ -1,7 +1,7 @@
 """Keep a finished run in docs/: `python benchmarks/publish.py results/slippery_cartpole-default`
 
-Copies results.json and the adaptation picture, makes a small GIF of the video, and brings the pages up to date that
-show them (`pages.py`).
+Copies results.json, the adaptation picture and the task's certificate, if `certificates` beside the run's folder has one,
+makes a small GIF of the video, and brings the pages up to date that show them (`pages.py`).
 """
 
 from __future__ import annotations
@@ -36,14 +36,20 @@ def keep(run: Path) -> None:
     try:
         results = json.loads(wanted[0].read_text())
         pages.section(envs.get(results["task"]), results, gif=False)
+    except envs.InputError:  # another task's
+        raise
     except (ValueError, KeyError):
         raise envs.InputError(f"{wanted[0]} is damaged; run the benchmark again") from None
     if results["preset"] == "smoke":
         raise envs.InputError(f"{run} is a smoke run, whose figures mean nothing; give one of another preset")
+    name, certificates = results["task"], run.parent / "certificates"
     for file, suffix in zip(wanted, ("json", "png"), strict=True):
-        shutil.copy(file, DOCS / f"{results['task']}.{suffix}")
+        shutil.copy(file, DOCS / f"{name}.{suffix}")
+    (DOCS / f"{name}.gif").unlink(missing_ok=True)
     if (run / "video.mp4").exists():
-        gif(run / "video.mp4", DOCS / f"{results['task']}.gif")
+        gif(run / "video.mp4", DOCS / f"{name}.gif")
+    for file in certificates.glob(f"{name}.*"):
+        shutil.copy(file, DOCS / "certificates")
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from deconf.data import Batch, Draws, Signature
 
-SMALL = 16**3  # multiplications; torch never gives less than that to oneDNN, but stacked seeds could add up to more
+SMALL = 16**3  # multiplications; torch gives oneDNN a product of more than that
 
 
 def prepare_torch() -> None:
@@ -47,7 +47,7 @@ class Linear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         rows = x.reshape(len(x), -1, x.shape[-1])
-        if rows.shape[1] * self.weight[0].numel() <= SMALL:
+        if rows.shape[1] * self.weight[0].numel() <= SMALL:  # stacked, they could be more: another path, other bits
             each = zip(self.bias.split(1), rows.split(1), self.weight.split(1), strict=True)
             out = torch.cat([torch.baddbmm(*one) for one in each])
         else:

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 import envs.physics
-from benchmarks import certify, pages, pool, score
+from benchmarks import certify, pages, pool, publish, score
 from envs.cartpole import Cartpole
 from envs.task import Array
 from experts.policy import Expert
@@ -196,6 +196,24 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     task = space["BentCartpole"]()
     check_env(envs.GymEnv(task), skip_render_check=True)
     assert_set_in_place_equals_recompiled(task)
+
+
+def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures, picture and certificate go to docs; a clip of an older run does not stay beside them."""
+    run, docs = tmp_path / "results" / "bandit-default", tmp_path / "docs"
+    for folder in (run, docs / "certificates", run.parent / "certificates"):
+        folder.mkdir(parents=True)
+    (run / "results.json").write_text((ROOT / "docs" / "bandit.json").read_text())
+    (run / "adaptation.png").write_bytes(b"a picture")
+    (run.parent / "certificates" / "bandit.json").write_text("{}")
+    (docs / "bandit.gif").write_bytes(b"an old clip")
+    monkeypatch.setattr(publish, "DOCS", docs)
+    publish.keep(run)
+    kept = sorted(str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file())
+    assert kept == ["bandit.json", "bandit.png", "certificates/bandit.json"]
+    (run / "results.json").write_text('{"task": "bandit"}')
+    with pytest.raises(envs.InputError, match="damaged"):
+        publish.keep(run)
 
 
 def test_pages_are_up_to_date() -> None:
