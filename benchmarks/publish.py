@@ -1,7 +1,7 @@
 """Keep a finished run in docs/: `python benchmarks/publish.py results/slippery_cartpole-default`
 
-Copies results.json, the adaptation picture and the task's certificate, if `certificates` beside the run's folder has one,
-makes a small GIF of the video, and brings the pages up to date that show them (`pages.py`).
+Copies results.json, the adaptation picture and, from `certificates` beside the run's folder, the task's certificate;
+makes a small GIF of the video; and brings the pages up to date that show them (`pages.py`).
 """
 
 from __future__ import annotations

@@ -3,17 +3,17 @@
 Tier 2. Upright is along gravity, as a sense of balance has it: the torso has to lean into the slope, by as much. But
 pitch and joints are observed relative to the ground, which tells nobody which way is down. Who leans by a wrong slope
 still stands, and may take their own pitch for evidence. In truth the slope shows in the torso's velocity along the
-ground, a little in every step, and friction in how feet slip while the walker catches itself. Friction decides how hard
+ground, within a few steps, and friction in how feet slip while the walker catches itself. Friction decides how hard
 it may push, and costs little if mistaken.
 
 Latents: friction, the ground's coefficient, log-uniform, with priority over the feet's; slope, rad, uniform, uphill if
 positive: it turns gravity, and the ground stays where it is. Slopes are not centred on 0, as the feet reach further
 forward.
 
-The MJCF is dm_control's own, from the installed package, with joints damped by 4 N m s/rad, so that it neither twitches
-nor bounces. Action: torques, in units of the MJCF's. Reward: .1 + .9 exp(-(x / .06 m)^2 / 2 - ((pitch - slope) /
-.07 rad)^2 / 2), less .1 times the mean square of the action. An episode is 5 s, and ends with the torso below 1 m or
-pitched by more than .6 rad.
+The MJCF is dm_control's own, from the installed package, with joints damped so that it neither twitches nor bounces: by
+4 (v + v |v| + v^3) N m at v rad/s. Action: torques, in units of the MJCF's. Reward: .1 + .9 exp(-(x / .06 m)^2 / 2
+- ((pitch - slope) / .08 rad)^2 / 2), less .1 times the mean square of the action. An episode is 5 s, and ends with the
+torso below 1 m or pitched by more than .6 rad.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from envs.physics import Edit, MujocoTask
 from envs.task import Array, Latent
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
-DAMPING = 4.0  # of joints, N m s/rad
+DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s
 JOINTS = tuple(f"{side}_{joint}" for side in ("right", "left") for joint in ("hip", "knee", "ankle"))
 STANCE = (0.1, -0.2, 0.1, 0.0, -0.2, 0.2)  # rad, of the joints: feet close together
 ROOT = ("rootz", "rootx", "rooty")
@@ -39,7 +39,7 @@ class SlipperyWalker(MujocoTask):
     """Joints rootx, rootz and rooty of the torso, and hip, knee and ankle of each leg."""
 
     name = "slippery_walker"
-    latents = (Latent("friction", "", 0.12, 0.8, "loguniform"), Latent("slope", "rad", -0.1, 0.2))
+    latents = (Latent("friction", "", 0.2, 0.8, "loguniform"), Latent("slope", "rad", -0.1, 0.18))
     horizon = 200
     substeps = 5
     costly = True
@@ -60,7 +60,7 @@ class SlipperyWalker(MujocoTask):
         spec.option.timestep = 0.005
         spec.geom("floor").priority = 1
         for joint in JOINTS:
-            spec.joint(joint).damping = np.full_like(spec.joint(joint).damping, DAMPING)
+            spec.joint(joint).damping = np.full(3, DAMPING)
         spec.texture("skybox").width, spec.texture("skybox").height = 32, 192
         box = mujoco.mjtGeom.mjGEOM_BOX
         spec.worldbody.add_site(name="mark", type=box, size=[0.08, 0.4, 0.002], rgba=[0.9, 0.3, 0.2, 1])
@@ -82,7 +82,7 @@ class SlipperyWalker(MujocoTask):
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         x, lean = self.qpos(next_state, "rootx"), self.qpos(next_state, "rooty") - theta[..., 1]
-        there = np.exp(-0.5 * (x / 0.06) ** 2 - 0.5 * (lean / 0.07) ** 2)
+        there = np.exp(-0.5 * (x / 0.06) ** 2 - 0.5 * (lean / 0.08) ** 2)
         return 0.1 + 0.9 * there - 0.1 * np.square(action).mean(-1)
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
