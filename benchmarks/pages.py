@@ -14,6 +14,7 @@ from typing import Any
 
 import envs
 from benchmarks import score
+from benchmarks.certify import THRESHOLDS
 from benchmarks.methods import METHODS, REFERENCES
 from benchmarks.presets import default_methods, preset
 from envs.console import Parser, run_command, write_atomically
@@ -25,8 +26,6 @@ TIERS = {
     2: "2: exploration is enough",
     3: "3: it takes queries of the expert",
 }
-
-
 SUMMARY = (
     *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "naive_rnn"),
     *("oracle_bc", "blind_bc", "conditional", "interventional"),
@@ -38,11 +37,17 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))
 
 
+def _kept(folder: Path, name: str) -> dict[str, Any] | None:
+    """What the folder's file of a task holds, if there is one."""
+    file = folder / f"{name}.json"
+    return json.loads(file.read_text()) if file.is_file() else None
+
+
 def _published(folder: Path) -> Iterator[tuple[envs.Task, dict[str, Any]]]:
     """In the registry's order, the tasks that have a file in the folder, and what it holds."""
     for name in envs.names():
-        if (file := folder / f"{name}.json").is_file():
-            yield envs.get(name), json.loads(file.read_text())
+        if found := _kept(folder, name):
+            yield envs.get(name), found
 
 
 def command(task: envs.Task, results: dict[str, Any]) -> str:
@@ -56,7 +61,7 @@ def command(task: envs.Task, results: dict[str, Any]) -> str:
     return f"python benchmarks/run.py --task {task.name}{chosen}{counted}{named}"
 
 
-def section(task: envs.Task, results: dict[str, Any], gif: bool) -> str:
+def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
     seeds, machine = len(results["seeds"]), results["machine"]
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
@@ -72,7 +77,7 @@ def section(task: envs.Task, results: dict[str, Any], gif: bool) -> str:
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
-    if gif:
+    if (DOCS / f"{task.name}.gif").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.gif)")
     return "\n\n".join(parts)
 
@@ -85,15 +90,14 @@ Made by `python benchmarks/pages.py` from the json files beside it. Scores: 0 = 
 theta. Return, Eq. (1) and theta R2 (of a linear probe, held out) are of the last episode; intervals are 95% bootstrap
 intervals over seeds (of three seeds: their range). *After as many again*: the last score in a trial twice as long as
 those of training."""
-    sections = (section(*found, gif=(DOCS / f"{found[0].name}.gif").exists()) for found in _published(DOCS))
-    return "\n\n".join([head, *sections]) + "\n"
+    return "\n\n".join([head, *(section(*found) for found in _published(DOCS))]) + "\n"
 
 
 def summary() -> str:
     """README's table: scores in the last episode."""
-    rows = []
+    rows, column = [], score.COLUMNS.index("last")
     for task, results in _published(DOCS):
-        last = {row[0]: row[3] for row in score.rows(results["methods"])}
+        last = {row[0]: row[column] for row in score.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     return markdown_table(("task", "tier", *SUMMARY, "seconds"), rows)
@@ -101,12 +105,11 @@ def summary() -> str:
 
 def certificates() -> str:
     """README's table of certificates."""
-    rows, checks = [], {}
+    rows = []
     for task, found in _published(DOCS / "certificates"):
-        checks = found["checks"]
-        measured = (f"{check['measured']:.2f}" for check in checks.values())
+        measured = (f"{found['checks'][name]['measured']:.2f}" for name in THRESHOLDS)
         rows.append((task.name, *measured, *_nats(found), found["verdict"]))
-    asked = (f"{name} ({check['required']})" for name, check in checks.items())
+    asked = (f"{name} ({relation} {bound})" for name, (relation, bound) in THRESHOLDS.items())
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
 
@@ -127,10 +130,9 @@ def _nats(certificate: dict[str, Any]) -> list[str]:
 
 
 def _certificate(task: envs.Task) -> str:
-    file = DOCS / "certificates" / f"{task.name}.json"
-    if not file.is_file():
+    found = _kept(DOCS / "certificates", task.name)
+    if found is None:
         return "No certificate."
-    found = json.loads(file.read_text())
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in found["checks"].items())
     dynamics, actions = _nats(found)
     return (

@@ -35,7 +35,7 @@ def keep(run: Path) -> None:
         raise envs.InputError(f"{run} holds no results.json and adaptation.png of a finished run of run.py")
     try:
         results = json.loads(wanted[0].read_text())
-        pages.section(envs.get(results["task"]), results, gif=False)
+        pages.section(envs.get(results["task"]), results)
     except envs.InputError:  # another task's
         raise
     except (ValueError, KeyError):

@@ -47,12 +47,13 @@ class Linear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         rows = x.reshape(len(x), -1, x.shape[-1])
-        if rows.shape[1] * self.weight[0].numel() <= SMALL:  # stacked, they could be more: another path, other bits
+        seeds, inputs, outputs = self.weight.shape
+        if seeds > 1 and rows.shape[1] * inputs * outputs <= SMALL:  # stacked, they could be more: then other bits
             each = zip(self.bias.split(1), rows.split(1), self.weight.split(1), strict=True)
             out = torch.cat([torch.baddbmm(*one) for one in each])
         else:
             out = torch.baddbmm(self.bias, rows, self.weight)
-        return out.reshape(*x.shape[:-1], self.weight.shape[-1])
+        return out.reshape(*x.shape[:-1], outputs)
 
 
 def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:
