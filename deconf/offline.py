@@ -9,8 +9,10 @@ deployed as in Tier 2, by Algorithm 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deconf.agents import Monitor, ramp
@@ -70,13 +72,12 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
 
-    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).unflatten(0, (len(rngs), -1))
     online.eval()
     agent = DeconfoundedAgent(online, policy)
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
         if update % config.refresh == 0:
-            synthetic = synthesise(online, policy, latents, starts, trials.mask.shape[2], config, draws)
+            synthetic = synthesise(online, policy, latents, trials, config, draws)
         batch = synthetic.draw_trials(config.online_batch, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
@@ -86,33 +87,34 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
 
 @torch.no_grad()
 def synthesise(
-    model: VariationalModel,
-    policy: ActionHead,
-    latents: Tensor,
-    starts: Tensor,
-    horizon: int,
-    config: OfflineConfig,
-    draws: Draws,
+    model: VariationalModel, policy: ActionHead, latents: Tensor, expert: Trials, config: OfflineConfig, draws: Draws
 ) -> Batch:
     """Trials of the learned dynamics: a latent [S, B, D] a trial, and another, blind to it, for each episode's actions.
 
-    starts [S, B, E, O]: first observations of expert trials. Observations are kept within 6 standard deviations of
-    the data, where the dynamics were learned.
+    Episodes begin as the expert's did. Where one leaves the range of observations in which the expert acted, another
+    begins: the dynamics were not learned there, and what they would say of the latent is noise.
     """
-    n, scaler = config.synthetic, model.inputs.scaler
+    n, (_, episodes, horizon) = config.synthetic, expert.mask.shape
+
+    def of_seeds(array: NDArray[Any]) -> Tensor:
+        return torch.tensor(array, device=draws.device).reshape(len(draws), -1, array.shape[-1])
+
+    starts, acted = of_seeds(expert.obs[:, :, 0]), of_seeds(expert.obs[:, :, :-1])
+    padding = ~of_seeds(expert.mask[..., None])
+    low = acted.masked_fill(padding, torch.inf).amin(1, keepdim=True)
+    high = acted.masked_fill(padding, -torch.inf).amax(1, keepdim=True)
     theta_hat = take(latents, draws.below(latents.shape[1], n))
-    begin = take(starts, draws.below(starts.shape[1], n))
-    low, high = (scaler.mean + k * scaler.std for k in (-6, 6))
+    obs, other = starts[:, :1], latents[:, :1]  # replaced at once
+    over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
     steps: list[tuple[Tensor, Tensor, Tensor]] = []
-    for episode in range(starts.shape[2]):
-        obs, other = begin[:, :, episode], take(latents, draws.below(latents.shape[1], n))
-        for _ in range(horizon):
-            action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
-            action = policy.signature.randomise(action, config.random_share, draws)
-            next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
-            if not policy.signature.binary:
-                next_obs = torch.maximum(torch.minimum(next_obs, high[:, None]), low[:, None])
-            steps.append((obs, action, next_obs))
-            obs = next_obs
+    for t in range(episodes * horizon):
+        over = over | (t % horizon == 0)
+        obs = torch.where(over, take(starts, draws.below(starts.shape[1], n)), obs)
+        other = torch.where(over, take(latents, draws.below(latents.shape[1], n)), other)
+        action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
+        action = policy.signature.randomise(action, config.random_share, draws)
+        next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
+        steps.append((obs, action, next_obs))
+        obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
     obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))
     return Batch(obs, action, next_obs, torch.ones(len(draws), n, len(steps), device=draws.device))

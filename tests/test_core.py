@@ -220,10 +220,33 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
         return sample(obs, action, theta_hat, draws)
 
     model.dynamics.sample = spy  # type: ignore[method-assign]
-    offline.synthesise(model, policy_, latents, data.obs[:, :, None, 0], 2, config, draws)
+    offline.synthesise(model, policy_, latents, trials, config, draws)
     action, wanted = taken[0]
     assert set(action.tolist()) == {0.0, 1.0}  # the policy does read its latent
     assert abs(np.corrcoef(action, wanted)[0, 1]) < 4 / np.sqrt(400)
+
+
+def test_synthetic_episodes_end_where_no_expert_acted() -> None:
+    """Tier 1: what leaves the range of the expert's observations begins anew; padding is not part of that range."""
+    trials, _ = demonstrations("tilted_cartpole", 4)
+    signature, draws = Signature.of(trials), Draws([np.random.default_rng(s) for s in (0, 1)], "cpu")
+    obs = trials.obs.copy()
+    mask = trials.mask.copy()
+    mask[:, :, -2:], obs[:, :, -2:] = False, 1e3  # no one acted in these
+    trials = Trials(obs, trials.action, mask)
+    model = VariationalModel("evidence", 1, 8, signature, *scalers(Batch.of(trials, 2)), draws)
+    policy_, latents = ActionHead(signature.obs + 1, 8, signature, draws), torch.zeros(2, 2, 1)
+    synthetic = offline.synthesise(model, policy_, latents, trials, OfflineConfig(synthetic=8), draws)
+    for s, own in enumerate(np.split(trials.obs[:, :, :-3], 2)):
+        low, high = own.min((0, 1, 2)), own.max((0, 1, 2))
+        acted, then = synthetic.obs[s].numpy(), synthetic.next_obs[s].numpy()
+        left = ((then < low) | (then > high)).any(-1)[:, :-1]
+        ended = (acted[:, 1:] != then[:, :-1]).any(-1)
+        horizons = np.arange(1, acted.shape[1]) % mask.shape[2] == 0
+        assert 0.01 < left.mean() < 0.9
+        assert (ended == left | horizons).all()
+        starts = {tuple(start) for start in own[:, :, 0].reshape(-1, signature.obs)}
+        assert {tuple(start) for start in acted[:, 1:][ended]} <= starts
 
 
 class TestTrials:
