@@ -55,7 +55,7 @@ _BANDIT = Preset(
     fresh=0,
     grid=0,
     deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=6400),
-    discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=800),
+    discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=1600),
     offline=OfflineConfig(
         latent=5,
         offline_batch=64,

@@ -6,6 +6,7 @@ dynamics, and exact Bayesian inference over which one it is (footnote 4).
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 
 import torch
@@ -112,9 +113,10 @@ class VariationalModel(LatentModel):
 
 
 class DiscreteModel(LatentModel):
-    """theta_hat is one of K, one-hot; p(k) and p_psi(s' | s, a, k) are fitted to the exact marginal likelihood.
+    """theta_hat is one of K, one-hot; p_psi(s' | s, a, k) is fitted to the exact marginal likelihood.
 
     The memory is the log-belief, updated by Bayes' rule: Eq. (5) with a learned model, without encoder or bound.
+    p(k) is uniform, so that each k stands for an equal share of p(theta); fitted, whichever k is ahead takes more.
     """
 
     def __init__(
@@ -123,14 +125,14 @@ class DiscreteModel(LatentModel):
         super().__init__()
         self.latent, self.inputs = latent, Inputs(signature, obs)
         self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
-        self.logits = nn.Parameter(torch.zeros(len(draws), latent, device=draws.device))
 
     def _evidence(self, batch: Batch) -> Tensor:
         log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
         return log_next * batch.mask[..., None]
 
     def start(self, n: int) -> Tensor:
-        return F.log_softmax(self.logits, -1)[:, None].expand(-1, n, -1)
+        scale = self.dynamics.log_std
+        return scale.new_full((len(scale), n, self.latent), -math.log(self.latent))
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return F.log_softmax(memory + self._evidence(step), -1)
@@ -156,4 +158,4 @@ class DiscreteModel(LatentModel):
         log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
         share = batch.mask.shape[2] ** -draws.uniform(1, 1)
         kept = batch.mask * (draws.uniform(*batch.mask.shape[1:]) < share)
-        return marginal_loss(F.log_softmax(self.logits, -1), log_next, kept)
+        return marginal_loss(self.start(1)[:, 0], log_next, kept)
