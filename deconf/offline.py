@@ -9,10 +9,8 @@ deployed as in Tier 2, by Algorithm 2.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from deconf.agents import Monitor, ramp
@@ -72,12 +70,14 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
 
+    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
+    horizon = trials.mask.shape[2]
     online.eval()
     agent = DeconfoundedAgent(online, policy)
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
         if update % config.refresh == 0:
-            synthetic = synthesise(online, policy, latents, trials, config, draws)
+            synthetic = synthesise(online, policy, latents, data, starts, horizon, config, draws)
         batch = synthetic.draw_trials(config.online_batch, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
@@ -87,27 +87,29 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
 
 @torch.no_grad()
 def synthesise(
-    model: VariationalModel, policy: ActionHead, latents: Tensor, expert: Trials, config: OfflineConfig, draws: Draws
+    model: VariationalModel,
+    policy: ActionHead,
+    latents: Tensor,
+    expert: Batch,
+    starts: Tensor,
+    horizon: int,
+    config: OfflineConfig,
+    draws: Draws,
 ) -> Batch:
     """Trials of the learned dynamics: a latent [S, B, D] a trial, and another, blind to it, for each episode's actions.
 
-    Episodes begin as the expert's did. Where one leaves the range of observations in which the expert acted, another
-    begins: the dynamics were not learned there, and what they would say of the latent is noise.
+    They are as long as the expert's, in episodes of at most `horizon` steps from starts [S, K, O]. Where one leaves the
+    range of observations in which the expert acted, another begins: the dynamics were not learned there, and what they
+    would say of the latent is noise.
     """
-    n, (_, episodes, horizon) = config.synthetic, expert.mask.shape
-
-    def of_seeds(array: NDArray[Any]) -> Tensor:
-        return torch.tensor(array, device=draws.device).reshape(len(draws), -1, array.shape[-1])
-
-    starts, acted = of_seeds(expert.obs[:, :, 0]), of_seeds(expert.obs[:, :, :-1])
-    padding = ~of_seeds(expert.mask[..., None])
-    low = acted.masked_fill(padding, torch.inf).amin(1, keepdim=True)
-    high = acted.masked_fill(padding, -torch.inf).amax(1, keepdim=True)
+    n, padding = config.synthetic, expert.mask[..., None] == 0
+    low = expert.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
+    high = expert.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
     theta_hat = take(latents, draws.below(latents.shape[1], n))
     obs, other = starts[:, :1], latents[:, :1]  # replaced at once
     over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
     steps: list[tuple[Tensor, Tensor, Tensor]] = []
-    for t in range(episodes * horizon):
+    for t in range(expert.mask.shape[2]):
         over = over | (t % horizon == 0)
         obs = torch.where(over, take(starts, draws.below(starts.shape[1], n)), obs)
         other = torch.where(over, take(latents, draws.below(latents.shape[1], n)), other)

@@ -220,7 +220,7 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
         return sample(obs, action, theta_hat, draws)
 
     model.dynamics.sample = spy  # type: ignore[method-assign]
-    offline.synthesise(model, policy_, latents, trials, config, draws)
+    offline.synthesise(model, policy_, latents, data, data.obs[:, :, 0], 2, config, draws)
     action, wanted = taken[0]
     assert set(action.tolist()) == {0.0, 1.0}  # the policy does read its latent
     assert abs(np.corrcoef(action, wanted)[0, 1]) < 4 / np.sqrt(400)
@@ -234,9 +234,11 @@ def test_synthetic_episodes_end_where_no_expert_acted() -> None:
     mask = trials.mask.copy()
     mask[:, :, -2:], obs[:, :, -2:] = False, 1e3  # no one acted in these
     trials = Trials(obs, trials.action, mask)
-    model = VariationalModel("evidence", 1, 8, signature, *scalers(Batch.of(trials, 2)), draws)
+    data, starts = Batch.of(trials, 2), torch.tensor(obs[:, :, 0]).reshape(2, -1, signature.obs)
+    model = VariationalModel("evidence", 1, 8, signature, *scalers(data), draws)
     policy_, latents = ActionHead(signature.obs + 1, 8, signature, draws), torch.zeros(2, 2, 1)
-    synthetic = offline.synthesise(model, policy_, latents, trials, OfflineConfig(synthetic=8), draws)
+    config = OfflineConfig(synthetic=8)
+    synthetic = offline.synthesise(model, policy_, latents, data, starts, mask.shape[2], config, draws)
     for s, own in enumerate(np.split(trials.obs[:, :, :-3], 2)):
         low, high = own.min((0, 1, 2)), own.max((0, 1, 2))
         acted, then = synthetic.obs[s].numpy(), synthetic.next_obs[s].numpy()
