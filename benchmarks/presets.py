@@ -31,7 +31,9 @@ _CONTROL = Preset(
     fresh=0,
     grid=21,
     deconfounded=DeconfoundedConfig(inference_updates=800, inference_rate=2e-3),
-    discrete=DeconfoundedConfig(model="discrete", latent=16, inference_updates=400),
+    discrete=DeconfoundedConfig(
+        model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
+    ),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
     dagger=DaggerConfig(updates=4500, learning_rate=3e-3),

@@ -150,12 +150,17 @@ class DiscreteModel(LatentModel):
         return belief
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """The same for trials of which a random share of the steps is kept, log-uniform from one step to all.
+        """The mean over histories of n = 1, 2, 4, ... steps: each trial is dealt, step by step, into T / n of them.
 
-        What is kept is a history under the same theta. Of whole long trials alone, whichever k happens to be best at
+        What is dealt is a history under the same theta. Of whole long trials alone, whichever k happens to be best at
         the start claims every one, and the others never learn.
         """
-        log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
-        share = batch.mask.shape[2] ** -draws.uniform(1, 1)
-        kept = batch.mask * (draws.uniform(*batch.mask.shape[1:]) < share)
-        return marginal_loss(self.start(1)[:, 0], log_next, kept)
+        log_next, mask = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs), batch.mask
+        doublings = (mask.shape[2] - 1).bit_length()
+        padding = 2**doublings - mask.shape[2]
+        log_next, mask = F.pad(log_next, (0, 0, 0, padding)), F.pad(mask, (0, padding))
+        losses = []
+        for i in range(doublings + 1):
+            dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
+            losses.append(marginal_loss(self.start(1)[:, 0], dealt, real))
+        return torch.stack(losses).mean(0)

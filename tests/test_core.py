@@ -191,6 +191,24 @@ def test_discrete_belief_one_step_at_a_time(name: str) -> None:
         assert (memory - model.start(len(data))).abs().max() > 0.1
 
 
+def test_discrete_loss_deals_trials_into_histories() -> None:
+    """Six steps, of which the second trial has four: histories of 1, 2, 4 and 8 steps, every so many steps apart."""
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    trials, _ = demonstrations("slippery_cartpole", 2)
+    data, signature = Batch.of(trials, 1)[:, :, :6], Signature.of(trials)
+    data.mask[0, 1, 4:] = 0
+    model = DiscreteModel(3, 16, signature, *scalers(data), draws)
+    with torch.no_grad():
+        log_next = model.dynamics.log_prob(data.obs, data.action, data.next_obs)[0].double().numpy()
+        loss = model.loss(data, None, 0.0, draws).item()
+    hands = [[[0], [1], [2], [3], [4], [5]], [[0, 4], [1, 5], [2], [3]], [[0, 2, 4], [1, 3, 5]], [[0, 1, 2, 3, 4, 5]]]
+    totals = []
+    for histories in hands:
+        real = [(trial, [t for t in steps if t < (6, 4)[trial]]) for trial in (0, 1) for steps in histories]
+        totals.append(sum(np.log(np.exp(log_next[trial, steps].sum(0)).mean()) for trial, steps in real))
+    assert loss == pytest.approx(-np.mean(totals) / 10, rel=1e-5)
+
+
 def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
     """Tier 1: two latents, dynamics that pay the same, a policy that takes the latent's arm: no correlation is left."""
     trials, _ = demonstrations("bandit", 6, 1)
