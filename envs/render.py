@@ -52,11 +52,11 @@ def ribbon(spec: mujoco.MjSpec, name: str, left: Array, right: Array, grey: floa
 
 
 def level(model: mujoco.MjModel) -> None:
-    """Roll the camera `view` so that gravity points down in its picture."""
+    """Roll the camera `view` so that gravity points down in its picture, if there is any across it."""
     view, data = model.camera("view"), mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     right, up, _ = model.opt.gravity @ data.cam_xmat[view.id].reshape(3, 3)
-    if np.hypot(right, up) < 1e-6 * np.linalg.norm(model.opt.gravity):  # seen from straight above
+    if np.hypot(right, up) <= 1e-6 * np.linalg.norm(model.opt.gravity):  # none, or seen from straight above
         return
     roll, before = np.arctan2(right, -up) / 2, view.quat.copy()
     mujoco.mju_mulQuat(view.quat, before, np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))

@@ -96,6 +96,15 @@ def test_down_is_down_in_pictures(name: str) -> None:
         assert up < 1e-6
 
 
+@pytest.mark.parametrize("name", PHYSICS)
+def test_without_gravity_pictures_are_as_the_camera_stands(name: str) -> None:
+    model = envs.get(name).simulator(1).models[0]
+    model.opt.gravity[:] = 0
+    before = model.camera("view").quat.copy()
+    level(model)
+    np.testing.assert_array_equal(model.camera("view").quat, before)
+
+
 @pytest.mark.parametrize("name", TASKS)
 class TestHiddenTheta:
     def test_no_leak(self, name: str) -> None:
