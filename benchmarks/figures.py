@@ -64,7 +64,7 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
             x: Array = np.arange(1, curves.shape[1] + 1)
             if key.endswith("curve"):  # at the updates that were watched, as a share of all
                 curves = np.array(
-                    [np.interp(share, e["at"] / e["at"][-1], c) for e, c in zip(data, curves, strict=True)]
+                    [np.interp(share, e["at"] / e["at"][-1], c, left=np.nan) for e, c in zip(data, curves, strict=True)]
                 )
                 x = share
             else:

@@ -87,7 +87,7 @@ def results_page() -> str:
     head = """# Results
 
 Made by `python benchmarks/pages.py` from the json files beside it. Scores: 0 = random actions, 1 = the expert that sees
-theta. Return, Eq. (1) and theta R2 (of a linear probe, held out) are of the last episode; intervals are 95% bootstrap
+theta. Return and Eq. (1) are of the last episode; theta R2 is of a linear probe, held out; intervals are 95% bootstrap
 intervals over seeds (of three seeds: their range). *After as many again*: the last score in a trial twice as long as
 those of training."""
     return "\n\n".join([head, *(section(*found) for found in _published(DOCS))]) + "\n"

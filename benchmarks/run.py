@@ -49,15 +49,17 @@ def rows(task: envs.Task, results: dict[str, Any], finished: Finished) -> str:
     """rows.csv: one row per method, seed, latent (trial) and episode."""
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
-    out.writerow(["method", "seed", "trial", *(lat.name for lat in task.latents), "episode", "return", "score"])
+    latents = [lat.name for lat in task.latents]
+    out.writerow(["method", "seed", "trial", *latents, "episode", "return", "score", "objective"])
     zero, one = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
     for _, seed, data in finished:
         for name in data["meta"]["agents"]:
-            for trial, (theta, returns) in enumerate(zip(data["theta"], data[f"{name}/returns"], strict=True)):
-                latents = [f"{value:.6g}" for value in theta]
-                for episode, value in enumerate(returns):
-                    scored = round(float(score.normalise(value, zero, one)), 4)
-                    out.writerow([name, seed, trial, *latents, episode + 1, round(float(value), 4), scored])
+            returns, objective = data[f"{name}/returns"], data[f"{name}/objective"]
+            values = np.stack([returns, score.normalise(returns, zero, one), objective], -1).astype(float).round(4)
+            for trial, (theta, episodes) in enumerate(zip(data["theta"], values.tolist(), strict=True)):
+                drawn = [f"{value:.6g}" for value in theta]
+                for episode, row in enumerate(episodes):
+                    out.writerow([name, seed, trial, *drawn, episode + 1, *row])
     return text.getvalue()
 
 

@@ -7,6 +7,10 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
+from sklearn.linear_model import RidgeCV
+from sklearn.metrics import r2_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 
 from deconf.equations import imitation_objective
 from envs.task import Array
@@ -27,20 +31,17 @@ def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
     return imitation_objective(log_expert, trials.mask)
 
 
-def probe(features: Array, theta: Array, ridge: float = 1e-3) -> float:
-    """Held-out R^2 of a linear (ridge) probe for encoded theta [N, F'] in features [N, F], fitted to the first half.
+def probe(features: Array, theta: Array) -> float:
+    """Held-out R^2 of a linear probe for encoded theta [N, F'] in features [N, F], fitted to the first half.
 
-    1: theta can be read off; 0 or less: no better than its mean.
+    1: theta can be read off; 0 or less: no better than its mean. The probe is ridge regression, and its penalty is
+    chosen on the first half, by leave-one-out: with one for all, features as many as trials would only be memorised.
     """
-    scaled = (features - features.mean(0)) / (features.std(0) + 1e-6)
-    inputs = np.c_[scaled, np.ones(len(scaled))].astype(float)
-    half = len(inputs) // 2
-    fitted = inputs[:half]
-    penalty = ridge * half * np.eye(inputs.shape[1])
-    weights = np.linalg.solve(fitted.T @ fitted + penalty, fitted.T @ theta[:half])
-    held = theta[half:]
-    residual = held - inputs[half:] @ weights
-    return float(1 - (residual**2).sum() / ((held - held.mean(0)) ** 2).sum())
+    half = len(features) // 2
+    reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(-2, 4, 13)))
+    reader.fit(features[:half].astype(float), theta[:half])
+    read = reader.predict(features[half:].astype(float)).reshape(theta[half:].shape)
+    return float(r2_score(theta[half:], read, multioutput="variance_weighted"))
 
 
 def bootstrap(values: Array) -> list[float] | None:
@@ -95,17 +96,21 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
     return methods
 
 
-COLUMNS = ("method", "return", "score of each episode", "last", "95% interval", "Eq. (1)", "theta R2", "data, a seed")
+COLUMNS = (
+    *("method", "return", "score of each episode", "last", "95% interval"),
+    *("Eq. (1)", "theta R2 of each episode", "data, a seed"),
+)
 
 
 def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The `methods` of results.json as rows of COLUMNS, best first; return, Eq. (1) and R^2 are of the last episode."""
+    """The `methods` of results.json as rows of COLUMNS, best first; return and Eq. (1) are of the last episode."""
     found: list[tuple[str, ...]] = []
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
-        scores = " ".join(f"{value + 0.0:.2f}" for value in np.round(entry["score"], 2))
         interval = "-" if entry["ci95"] is None else "{:.2f} to {:.2f}".format(*(np.round(entry["ci95"], 2) + 0.0))
         last = f"{np.round(entry['score_last'], 2) + 0.0:.2f}"
-        known = f"{entry['theta_r2'][-1]:.2f}" if entry["theta_r2"] else ""
+        scores, known = (
+            " ".join(f"{value + 0.0:.2f}" for value in np.round(entry[key], 2)) for key in ("score", "theta_r2")
+        )
         data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
         value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
         found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data))

@@ -7,12 +7,16 @@ the bandit itself: envs/bandit.py.
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from envs.task import Array
+
+Kind = TypeVar("Kind", Array, Tensor)
 
 
 def imitation_objective(log_expert: Array, taken: NDArray[np.bool_]) -> Array:
@@ -29,13 +33,15 @@ def posterior_policy(log_belief: Array, policy: Array) -> Array:
     return (np.exp(log_belief)[..., None] * policy).sum(-2)
 
 
-def belief_update(log_belief: Array, log_dynamics: Array, log_policy: Array | None = None) -> Array:
+def belief_update(log_belief: Kind, log_dynamics: Kind, log_policy: Kind | None = None) -> Kind:
     """One step of p_int, Eq. (5) and (8), or, given the expert's log-probabilities too, of p_cond, Eq. (3) and (9).
 
-    log_belief [N, K], log p(s_{t+1} | s_t, a_t, theta) [N, K], log pi_exp(a_t | s_t, theta) [N, K] -> normalised
-    log-belief [N, K].
+    log_belief [..., K], log p(s_{t+1} | s_t, a_t, theta) [..., K], log pi_exp(a_t | s_t, theta) [..., K] ->
+    normalised log-belief [..., K]; of several steps, if those are sums over them.
     """
     joint = log_belief + log_dynamics if log_policy is None else log_belief + log_dynamics + log_policy
+    if isinstance(joint, Tensor):
+        return joint - torch.logsumexp(joint, -1, keepdim=True)
     return joint - np.logaddexp.reduce(joint, axis=-1, keepdims=True)
 
 

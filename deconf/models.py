@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief
 from deconf.data import Batch, Draws, Signature, take
-from deconf.equations import gaussian_kl, inference_loss, marginal_loss, reparametrise
+from deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
@@ -135,10 +135,10 @@ class DiscreteModel(LatentModel):
         return scale.new_full((len(scale), n, self.latent), -math.log(self.latent))
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        return F.log_softmax(memory + self._evidence(step), -1)
+        return belief_update(memory, self._evidence(step))
 
     def last(self, batch: Batch) -> Tensor:
-        return F.log_softmax(self.start(len(batch)) + self._evidence(batch).sum(2), -1)
+        return belief_update(self.start(len(batch)), self._evidence(batch).sum(2))
 
     def belief(self, memory: Tensor) -> Tensor:
         return memory.exp()
@@ -150,10 +150,10 @@ class DiscreteModel(LatentModel):
         return belief
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """The mean over histories of n = 1, 2, 4, ... steps: each trial is dealt, step by step, into T / n of them.
+        """The mean over histories of n = 1, 2, 4, ... steps: a trial of T is dealt, step by step, into T / n of them.
 
-        What is dealt is a history under the same theta. Of whole long trials alone, whichever k happens to be best at
-        the start claims every one, and the others never learn.
+        What is dealt is a history under the same theta; of a trial that ended early it is shorter. Of whole long trials
+        alone, whichever k happens to be best at the start claims every one, and the others never learn.
         """
         log_next, mask = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs), batch.mask
         doublings = (mask.shape[2] - 1).bit_length()
@@ -163,4 +163,4 @@ class DiscreteModel(LatentModel):
         for i in range(doublings + 1):
             dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
             losses.append(marginal_loss(self.start(1)[:, 0], dealt, real))
-        return torch.stack(losses).mean(0)
+        return sum(losses, torch.zeros_like(losses[0])) / len(losses)

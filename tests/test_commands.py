@@ -75,7 +75,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert results["methods"]["interventional"]["score_last"] == pytest.approx((54.1 - 20) / 40, abs=0.05)
     assert results["methods"]["conditional"]["score_last"] == pytest.approx((32.3 - 20) / 40, abs=0.05)
     header, *lines = (out / "rows.csv").read_text().splitlines()
-    assert header == "method,seed,trial,best_arm,episode,return,score"
+    assert header == "method,seed,trial,best_arm,episode,return,score,objective"
     assert len(lines) == results["eval_trials"] * 5
 
     again = command(*args, str(out))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from deconf.dagger import DaggerConfig
 from deconf.data import Batch, Draws, Signature
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.equations import (
+    belief_update,
     gaussian_kl,
     imitation_loss,
     imitation_objective,
@@ -68,6 +71,14 @@ class TestEquations:
         """Eq. (2): half of (.6, .4) and half of (.2, .8)."""
         policy_ = posterior_policy(np.log([[0.5, 0.5]]), np.array([[0.6, 0.4], [0.2, 0.8]]))
         np.testing.assert_allclose(policy_, [[0.4, 0.6]])
+
+    @pytest.mark.parametrize("kind", [np.array, torch.tensor])
+    def test_belief_update(self, kind: Callable[[Any], Any]) -> None:
+        """Eq. (5): .25 * .5 and .75 * .2 over their sum; Eq. (3): times .1 and .4 of the action as well."""
+        belief, dynamics, acted = (kind(np.log(p)) for p in ([0.25, 0.75], [0.5, 0.2], [0.1, 0.4]))
+        told, deluded = belief_update(belief, dynamics), belief_update(belief, dynamics, acted)
+        np.testing.assert_allclose(np.exp(np.asarray(told)), [0.125 / 0.275, 0.15 / 0.275])
+        np.testing.assert_allclose(np.exp(np.asarray(deluded)), [0.0125 / 0.0725, 0.06 / 0.0725])
 
     def test_offline_loss(self) -> None:
         """Eq. (7): two trajectories of (-1 - 2) + (-3 - 4) and (-1 - 1), KL 5 and 7, beta .5: (12.5 + 5.5) / 2."""
@@ -340,6 +351,14 @@ class TestExact:
         assert score.probe(agent.features(), theta) > 0.95
         assert score.probe(np.random.default_rng(0).standard_normal((64, 1)), theta) < 0.3
 
+    def test_probe_of_many_features(self) -> None:
+        """As many as trials to fit it to: of noise it reads nothing, of a few good ones among noise nearly all."""
+        rng = np.random.default_rng(0)
+        theta, noise = rng.standard_normal((128, 1)), rng.standard_normal((128, 64))
+        good = np.c_[noise[:, 16:], theta + 0.3 * rng.standard_normal((128, 16))]
+        assert -0.2 < score.probe(noise, theta) < 0.2
+        assert score.probe(good, theta) > 0.8
+
 
 class TestMethods:
     """Each method learns what it can from a little data; margins are wide, seeds fixed."""
@@ -383,7 +402,9 @@ class TestMethods:
         assert torch.equal(torch.get_rng_state(), state)
 
     @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
-    @pytest.mark.parametrize("method", ["deconfounded", "discrete", "offline", "naive_rnn", "dagger", "oracle"])
+    @pytest.mark.parametrize(
+        "method", ["deconfounded", "paper", "discrete", "offline", "naive_rnn", "dagger", "oracle"]
+    )
     def test_seeds_do_not_touch_each_other(self, name: str, method: str) -> None:
         """A seed's agent acts alike, bit for bit, whether it was trained alone or second of three."""
         settings = Preset(
@@ -407,7 +428,12 @@ class TestMethods:
             dagger=DaggerConfig(updates=2, rounds=2, batch=4),
             cloning=cloning.CloningConfig(updates=3, batch=64),
         )
+        if method == "paper":  # as in that preset: its belief, fresh trials each round
+            settings = replace(
+                settings, fresh=4, deconfounded=replace(settings.deconfounded, model="gru", accumulate=False)
+            )
         key = {"oracle": "oracle_bc", "offline": "deconfounded_offline", "discrete": "deconfounded_discrete"}
+        key["paper"] = "deconfounded"
         task, found = envs.get(name), []
         for seeds in ((5,), (4, 5, 6)):
             context = Context(task, settings, seeds)
