@@ -358,6 +358,8 @@ class TestExact:
         good = np.c_[noise[:, 16:], theta + 0.3 * rng.standard_normal((128, 16))]
         assert -0.2 < score.probe(noise, theta) < 0.2
         assert score.probe(good, theta) > 0.8
+        rare = np.r_[1e-40 * rng.random((64, 1)), rng.random((64, 1)) < 0.1]  # such as p(k) where k is seldom needed
+        assert score.probe(np.c_[good, rare], theta) > 0.8
 
 
 class TestMethods:
