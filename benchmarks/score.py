@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
-from sklearn.linear_model import RidgeCV
-from sklearn.metrics import r2_score
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
 
 from deconf.equations import imitation_objective
 from envs.task import Array
@@ -38,6 +34,12 @@ def probe(features: Array, theta: Array) -> float:
     chosen on the first half, by leave-one-out: with one for all, features as many as trials would only be memorised.
     It does not extrapolate: where a feature hardly varies in the first half, the second may be far outside.
     """
+    # Here, since most commands that import this module probe nothing:
+    from sklearn.linear_model import RidgeCV
+    from sklearn.metrics import r2_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
     half = len(features) // 2
     shown = features[:half].astype(float)
     reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 4, 9))).fit(shown, theta[:half])
