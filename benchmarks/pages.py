@@ -87,9 +87,10 @@ def results_page() -> str:
     head = """# Results
 
 Made by `python benchmarks/pages.py` from the json files beside it. Scores: 0 = random actions, 1 = the expert that sees
-theta. Return and Eq. (1) are of the last episode; theta R2 is of a linear probe, held out; intervals are 95% bootstrap
-intervals over seeds (of three seeds: their range). *After as many again*: the last score in a trial twice as long as
-those of training."""
+theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees theta (more is
+better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out. Intervals are 95%
+bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times in four. *After as
+many again*: the last score in a trial twice as long as those of training."""
     return "\n\n".join([head, *(section(*found) for found in _published(DOCS))]) + "\n"
 
 
@@ -136,8 +137,8 @@ def _certificate(task: envs.Task) -> str:
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in found["checks"].items())
     dynamics, actions = _nats(found)
     return (
-        f"Certificate {found['verdict']}: {', '.join(checks)}. Evidence of theta along expert trajectories: dynamics"
-        f" {dynamics}, actions {actions} nats a step."
+        f"Certificate ({len(found['conditional']['score'])} episodes a trial) {found['verdict']}: {', '.join(checks)}."
+        f" Evidence of theta along expert trajectories: dynamics {dynamics}, actions {actions} nats a step."
     )
 
 
@@ -148,10 +149,11 @@ def card(task: envs.Task) -> str:
     for cls in type(task).__mro__:
         if issubclass(cls, envs.Task) and cls.__module__ not in ("envs.task", "envs.physics"):
             parts.append(inspect.cleandoc(cls.__doc__ or ""))
-    step = f", {task.control_dt:g} s each" if isinstance(task, envs.MujocoTask) else ""
+    trial = "one episode" if task.episodes == 1 else f"{task.episodes} episodes"
+    physics = isinstance(task, envs.MujocoTask)
+    more = f", {task.control_dt:g} s each; the expert's action noise is {task.expert_noise:g}" if physics else ""
     parts.append(
-        f"Tier {TIERS[task.tier]}. Trials of {task.episodes} episodes of at most {task.horizon} steps{step}; the"
-        f" expert's action noise is {task.expert_noise:g}. {_certificate(task)}"
+        f"Tier {TIERS[task.tier]}. Trials of {trial} of at most {task.horizon} steps{more}. {_certificate(task)}"
     )
     parts.append(markdown_table(("latent", "unit", "range", "distribution"), latents))
     bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())

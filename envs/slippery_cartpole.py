@@ -1,12 +1,13 @@
 """A cartpole whose pole rides on a spinning axle; hidden Coulomb friction in the bearing drags the pole round.
 
-Tier 2. A motor in the cart spins the axle at a constant speed. A slippery bearing leaves the pole alone; a sticky one
-drags it with a torque of theta N m, and the pole must lean against the drag (its m g l is .49 N m). Expecting the
-wrong friction loses the mark or the pole, while one control step shows the friction only through process noise.
+Tier 2. A motor in the cart spins the axle at 10 rad/s. A slippery bearing leaves the pole alone; a sticky one drags it
+with a torque of theta N m, and the pole must lean against the drag (its m g l is .49 N m). Expecting the wrong
+friction loses the mark or the pole, while one control step shows the friction only through process noise.
 
 Latent: friction, N m, uniform: the `frictionloss` of a fixed tendon over pole and axle joints (coefficients 1, -1).
 The axle turns faster than the pole ever does in play, so the drag has one sign. Its angle is neither observed nor of
-any consequence, and has no noise. Noise otherwise and reward as in `Cartpole`.
+any consequence, and has no noise. Velocities of the pole and of the axle have noise of .2 and .1 rad/s; noise
+otherwise and reward are as in `Cartpole`.
 """
 
 from __future__ import annotations

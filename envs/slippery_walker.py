@@ -11,9 +11,9 @@ positive: it turns gravity, and the ground stays where it is. Slopes are not cen
 forward.
 
 The MJCF is dm_control's own, from the installed package, with joints damped so that it neither twitches nor bounces: by
-4 (v + v |v| + v^3) N m at v rad/s. Action: torques, in units of the MJCF's. Reward: .1 + .9 exp(-(x / .06 m)^2 / 2
-- ((pitch - slope) / .08 rad)^2 / 2), less .1 times the mean square of the action. An episode is 5 s, and ends with the
-torso below 1 m or pitched by more than .6 rad.
+4 (v + v |v| + v^3) N m at v rad/s. Action: torques, in units of the MJCF's. Reward: .1 + .9 exp(-(d^2 + a^2) / 2), with
+d = x / .06 m and a = (pitch - slope) / .08 rad, less .1 times the mean square of the action. An episode is 5 s, and
+ends with the torso below 1 m or pitched by more than .6 rad.
 """
 
 from __future__ import annotations
