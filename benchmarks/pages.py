@@ -68,7 +68,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     rows = []
     for row in score.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
-        rows.append((*row, f"{beyond[-1]:.2f}" if beyond else ""))
+        rows.append((*row, score.two_decimals(beyond[-1]) if beyond else ""))
     parts = [
         f"## {task.name}",
         f"`{command(task, results)}`",

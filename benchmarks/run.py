@@ -55,7 +55,7 @@ def rows(task: envs.Task, results: dict[str, Any], finished: Finished) -> str:
     for _, seed, data in finished:
         for name in data["meta"]["agents"]:
             returns, objective = data[f"{name}/returns"], data[f"{name}/objective"]
-            values = np.stack([returns, score.normalise(returns, zero, one), objective], -1).astype(float).round(4)
+            values = np.stack([returns, score.normalise(returns, zero, one), objective], -1).round(4)
             for trial, (theta, episodes) in enumerate(zip(data["theta"], values.tolist(), strict=True)):
                 drawn = [f"{value:.6g}" for value in theta]
                 for episode, row in enumerate(episodes):

@@ -105,15 +105,18 @@ COLUMNS = (
 )
 
 
+def two_decimals(value: float) -> str:
+    """As tables show scores: never as -0.00."""
+    return f"{np.round(value, 2):z.2f}"
+
+
 def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     """The `methods` of results.json as rows of COLUMNS, best first; return and Eq. (1) are of the last episode."""
     found: list[tuple[str, ...]] = []
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
-        interval = "-" if entry["ci95"] is None else "{:.2f} to {:.2f}".format(*(np.round(entry["ci95"], 2) + 0.0))
-        last = f"{np.round(entry['score_last'], 2) + 0.0:.2f}"
-        scores, known = (
-            " ".join(f"{value + 0.0:.2f}" for value in np.round(entry[key], 2)) for key in ("score", "theta_r2")
-        )
+        interval = "-" if entry["ci95"] is None else " to ".join(map(two_decimals, entry["ci95"]))
+        scores, known = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
+        last = two_decimals(entry["score_last"])
         data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
         value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
         found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data))

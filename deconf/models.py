@@ -159,8 +159,9 @@ class DiscreteModel(LatentModel):
         doublings = (mask.shape[2] - 1).bit_length()
         padding = 2**doublings - mask.shape[2]
         log_next, mask = F.pad(log_next, (0, 0, 0, padding)), F.pad(mask, (0, padding))
+        prior = self.start(1)[:, 0]
         losses = []
         for i in range(doublings + 1):
             dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
-            losses.append(marginal_loss(self.start(1)[:, 0], dealt, real))
+            losses.append(marginal_loss(prior, dealt, real))
         return torch.stack(losses).mean(0)
