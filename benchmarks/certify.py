@@ -84,7 +84,7 @@ def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Arr
 
     Each row is scored by its own expert and its own random actions.
     """
-    levels = task.theta_grid(max(2, round(LEVELS ** (1 / len(task.latents)))))
+    levels = task.theta_grid(LEVELS)
     j = len(levels)
     true = np.repeat(levels, j * trials, 0)
     told = np.tile(np.repeat(levels, trials, 0), (j, 1))

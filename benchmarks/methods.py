@@ -22,9 +22,9 @@ from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
-from envs.task import Array
+from envs.streams import Array, Streams
 from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, Streams, Trials, run_trials
+from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
 
 DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
 

@@ -8,7 +8,7 @@ from typing import Any
 from gymnasium import spaces
 
 import envs
-from benchmarks.methods import EXACT, METHODS, Preset
+from benchmarks.methods import METHODS, Preset
 from deconf.cloning import CloningConfig
 from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
@@ -127,9 +127,8 @@ def _smoke(full: Preset) -> Preset:
 
 
 def default_methods(task: envs.Task) -> list[str]:
-    """The paper's comparison; exact references too, unless the task is costly to step (certify.py has them)."""
-    extra = (*EXTRA, *EXACT) if task.costly else EXTRA
-    return [name for name in METHODS if name not in extra]
+    """The paper's comparison, and the exact references."""
+    return [name for name in METHODS if name not in EXTRA]
 
 
 def preset(name: str, task: envs.Task, device: str) -> Preset:

@@ -98,11 +98,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         array = np.asarray(actions)
-        done = ~self.batch.alive
-        obs, reward, terminated, truncated = self.batch.step(array[:, None] if array.ndim == 1 else array)
-        if done.any():
-            obs = self.batch.reset(where=done)
-        return obs, reward, terminated, truncated, {}
+        rows = array[:, None] if array.ndim == 1 else array
+        return *self.batch.step(rows, autoreset=True), {}
 
 
 class DmEnv(dm_env.Environment):

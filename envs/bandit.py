@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from envs.streams import Streams
 from envs.task import Array, Latent, Painter, Task
 
 ARMS = 5
@@ -25,11 +26,11 @@ class Bandit(Task):
     action_space = spaces.Discrete(ARMS)
     observation = {"payout": (0.0, 1.0)}
 
-    def init_state(self, rng: np.random.Generator) -> Array:
-        return np.zeros(1)
+    def init_state(self, rng: Streams) -> Array:
+        return np.zeros((rng.groups, 1))
 
-    def sample_noise(self, rng: np.random.Generator) -> Array:
-        return rng.random((self.horizon, 1))
+    def sample_noise(self, rng: Streams) -> Array:
+        return rng.random((rng.groups, self.horizon, 1))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
         """P(s' = 1 | a, theta) [N, 1]: 3/4 for the best arm, 1/4 for the others."""

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.task import Array, InputError, Task
+from envs.streams import Array, Streams
+from envs.task import InputError, Task
 
 
 class BatchEnv:
@@ -23,7 +24,7 @@ class BatchEnv:
         self.simulator = task.simulator(n)
         self.alive = np.zeros(n, bool)
         self.state: Array = np.zeros((n, 0))
-        self._steps = np.zeros(n, int)
+        self._steps, self._every = np.zeros(n, int), np.arange(n)
         self._noise: Array = np.zeros((n, 0, 0))
         self._streams: list[list[np.random.Generator]] = []
         self._space = task.observation_space
@@ -69,16 +70,20 @@ class BatchEnv:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
-        for i in range(self.n) if where is None else np.flatnonzero(where).tolist():
-            theta_rng, start_rng, noise_rng = self._streams[i]
-            if not keep:
-                self.simulator.set_theta(i, self.task.sample_theta(theta_rng) if forced is None else forced[i])
-            start, noise = self.task.init_state(start_rng), self.task.sample_noise(noise_rng)
-            if not self.state.size:
-                self.state = np.zeros((self.n, len(start)))
-                self._noise = np.zeros((self.n, *noise.shape))
-            self.state[i], self._noise[i] = start, noise
-            self._steps[i], self.alive[i] = 0, True
+        rows = np.arange(self.n) if where is None else np.flatnonzero(where)
+        theta_rng, start_rng, noise_rng = (
+            Streams(streams) for streams in zip(*(self._streams[i] for i in rows.tolist()), strict=True)
+        )
+        if not keep:
+            theta = self.task.sample_theta(theta_rng) if forced is None else forced[rows]
+            for i, row in zip(rows.tolist(), theta, strict=True):
+                self.simulator.set_theta(i, row)
+        start, noise = self.task.init_state(start_rng), self.task.sample_noise(noise_rng)
+        if first:
+            self.state = np.zeros((self.n, start.shape[1]))
+            self._noise = np.zeros((self.n, *noise.shape[1:]))
+        self.state[rows], self._noise[rows] = start, noise
+        self._steps[rows], self.alive[rows] = 0, True
         return self.observe()
 
     def observe(self) -> NDArray[np.float32]:
@@ -88,23 +93,35 @@ class BatchEnv:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
 
-    def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def step(
+        self, action: object, autoreset: bool = False
+    ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
+        Environments whose episode is over are not stepped; autoreset: they start the next one, with a theta of its own.
         Actions out of [-1, 1] are clipped. Raises InputError for a wrong shape or NaN, and before the first reset.
         """
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")
-        checked = self.task.check_action(action, self.n)
-        state = self.state
-        outcome = self.simulator.outcome(state, checked)
-        noise = self._noise[np.arange(self.n), np.minimum(self._steps, self.task.horizon - 1)]
-        self.state = self.task.apply_noise(outcome, noise)
-        self._steps += 1
-        reward = np.where(self.alive, self.task.reward(state, checked, self.state, self.theta), 0.0)
+        task, checked, over = self.task, self.task.check_action(action, self.n), ~self.alive
+        rows = np.flatnonzero(self.alive) if over.any() else None
+        on = slice(None) if rows is None else rows
+        before, taken, noise = self.state[on], checked[on], self._noise[self._every[on], self._steps[on]]
+        after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
+        reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)
+        reward[on] = task.reward(before, taken, after, self.theta[on])
+        terminated[on] = task.terminated(after)
+        self._steps[on] += 1
+        truncated[on] = self._steps[on] >= task.horizon
+        truncated &= ~terminated
         if not np.isfinite(reward).all():
-            raise InputError(f"reward of {self.task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
-        terminated = self.alive & self.task.terminated(self.state)
-        truncated = self.alive & ~terminated & (self._steps >= self.task.horizon)
-        self.alive = self.alive & ~terminated & ~truncated
+            raise InputError(f"reward of {task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
+        if rows is None:
+            self.state = after
+        else:
+            self.state = self.state.copy()  # what agents remember of the one before stays
+            self.state[rows] = after
+        self.alive = ~(over | terminated | truncated)
+        if autoreset and rows is not None:
+            return self.reset(where=over), reward, terminated, truncated
         return self.observe(), reward, terminated, truncated

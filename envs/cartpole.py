@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics import MujocoTask
+from envs.streams import Streams
 from envs.task import Array
 
 FALLEN = 1.2  # rad
@@ -23,8 +24,9 @@ class Cartpole(MujocoTask):
     process_noise = {"slider": (0.004, 0.1), "hinge": (0.004, 0.1)}
     observation = {"x": (-4, 4), "cos": (-1, 1), "sin": (-1, 1), "velocity": (-20, 20), "pole_velocity": (-40, 40)}
 
-    def init_state(self, rng: np.random.Generator) -> Array:
-        x, pole, velocity, pole_velocity = rng.uniform(-1, 1, 4) * (0.3, 0.05, 0.05, 0.05)
+    def init_state(self, rng: Streams) -> Array:
+        spread = np.array((0.3, 0.05, 0.05, 0.05))
+        x, pole, velocity, pole_velocity = rng.uniform(-spread, spread)
         return self.state(slider=(x, velocity), hinge=(pole, pole_velocity))
 
     def observe(self, state: Array) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 
 from envs.batch import BatchEnv
 from envs.physics import MujocoTask
+from envs.streams import Streams
 from envs.task import InputError, Task
 
 
@@ -34,14 +35,15 @@ def check_task(task: Task) -> None:
             task.model  # noqa: B018 (compiles it)
         with _part(task, "process_noise"):
             task._noisy  # noqa: B018
-    rng, n = np.random.default_rng(0), 2
+    n = 2
+    rng = Streams([np.random.default_rng(seed) for seed in range(n)])
     action = np.zeros((n, *(task.action_space.shape or (1,))))
     with _part(task, "apply_latent"):
         env = BatchEnv(task, n)
     with _part(task, "init_state"):
-        state = np.stack([task.init_state(rng) for _ in range(n)])
+        state = task.init_state(rng)
     with _part(task, "outcome"):
-        noise = np.stack([task.sample_noise(rng)[0] for _ in range(n)])
+        noise = task.sample_noise(rng)[:, 0]
         then = task.apply_noise(env.simulator.outcome(state, action), noise)
     for name, shape, ask in (
         ("observe", (n, len(task.observation)), lambda: task.observe(state)),

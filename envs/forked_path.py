@@ -21,6 +21,7 @@ class ForkedPath(Puck):
     """Goals at (-1, .8) and (1, .8) m; the bump at (.08, .8) or (-.08, .8)."""
 
     name = "forked_path"
+    version = 1
     tier = 3
     latents = (Latent("side", "", 0, 1, "categorical"),)
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.physics import Edit, MujocoTask
+from envs.streams import Streams
 from envs.task import Array, Latent
 
 SPEED = 3.0  # m/s
@@ -30,6 +31,7 @@ class HeavyPayload(MujocoTask):
     """Joints `hook`, `load` and `target`, all along z (m); all at 0, the cable is just taut."""
 
     name = "heavy_payload"
+    version = 1
     latents = (Latent("mass", "kg", 1.0, 3.0, "loguniform"),)
     horizon = 150
     expert_noise = 0.02
@@ -45,7 +47,7 @@ class HeavyPayload(MujocoTask):
     def control(self, action: Array) -> Array:
         return SPEED * action
 
-    def init_state(self, rng: np.random.Generator) -> Array:
+    def init_state(self, rng: Streams) -> Array:
         phase, swing, off, stretch = rng.uniform((0, 0.3, -0.1, -0.1), (2 * np.pi, 0.5, 0.1, 0.1))
         target, velocity = swing * np.sin(phase), PACE * swing * np.cos(phase)
         heights = {"target": target, "load": target + off, "hook": target + off + STRETCH + stretch}

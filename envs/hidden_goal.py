@@ -18,6 +18,7 @@ class HiddenGoal(Puck):
     """The goal is 1 m from the start."""
 
     name = "hidden_goal"
+    version = 1
     tier = None
     latents = (Latent("direction", "rad", -2.0, 2.0),)
 

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from envs import render
 from envs.physics import Edit, MujocoTask
+from envs.streams import Streams
 from envs.task import Array, Latent
 
 AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
@@ -50,7 +51,6 @@ class IcyRoad(MujocoTask):
     latents = (Latent("grip", "", 0.1, 0.6, "loguniform"),)
     horizon = 200
     substeps = 5
-    costly = True
     expert_noise = 0.02
     process_noise = {
         **{"x": (0.003, 0.045), "y": (0.003, 0.045), "z": (4e-4, 0.05), "yaw": (0.006, 0.12)},
@@ -65,9 +65,10 @@ class IcyRoad(MujocoTask):
         "steering": (-0.6, 0.6),
     }
 
-    def spec(self) -> mujoco.MjSpec:
-        """The car of assets/icy_road.xml, and the road drawn under it: a ribbon with white edges, to look at only."""
-        spec, x = super().spec(), np.linspace(-4, 70, 297)
+    def decorate(self, spec: mujoco.MjSpec) -> None:
+        """The road drawn under the car: a ribbon with white edges."""
+        super().decorate(spec)
+        x = np.linspace(-4, 70, 297)
         y, direction, _ = road(x)
         middle, across = np.stack([x, y], -1), np.stack([-np.sin(direction), np.cos(direction)], -1)
         for name, left, right, grey in (
@@ -77,7 +78,6 @@ class IcyRoad(MujocoTask):
         ):
             one, other = (middle + HALF_WIDTH * side * across for side in (left, right))
             render.ribbon(spec, name, one, other, grey)
-        return spec
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.geom_friction("road", float(theta[0]))
@@ -87,10 +87,10 @@ class IcyRoad(MujocoTask):
     def control(self, action: Array) -> Array:
         return np.concatenate([STEERING * action[..., [0, 0]], TORQUE * action[..., [1, 1, 1, 1]]], -1)
 
-    def init_state(self, rng: np.random.Generator) -> Array:
-        x, offset, yaw, speed = rng.uniform((0, -0.1, -0.1, 0.7), (WAVE, 0.1, 0.1, 1.0))
+    def init_state(self, rng: Streams) -> Array:
+        x, offset, turn, speed = rng.uniform((0, -0.1, -0.1, 0.7), (WAVE, 0.1, 0.1, 1.0))
         y, direction, _ = road(x)
-        yaw += direction
+        yaw = turn + direction
         rolling = {wheel: (0.0, speed / RADIUS) for wheel in WHEELS}
         return self.state(x=(x, speed * np.cos(yaw)), y=(y + offset, speed * np.sin(yaw)), yaw=(yaw, 0), **rolling)
 

@@ -12,9 +12,10 @@ import mujoco
 import numpy as np
 from gymnasium import spaces
 from mujoco import rollout
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from envs import render
+from envs.streams import Streams
 from envs.task import ASSETS, Array, InputError, Painter, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -138,6 +139,7 @@ class Physics(Simulator):
         self._pools: dict[int, rollout.Rollout] = {}
         self._datas = [mujoco.MjData(task.model) for _ in range(max(threads, 1))]
         self._edits = [ModelEdit(model, task.model, self._datas[0]) for model in self.models]
+        self._buffer: Array = np.empty(0)
         for i in range(n):
             self.set_theta(i, self.theta[i])
 
@@ -146,15 +148,23 @@ class Physics(Simulator):
         self._mujoco_task.apply_latent(self._edits[i], theta)
         self._edits[i].finish()
 
-    def outcome(self, state: Array, action: Array) -> Array:
-        return self.rollout(state, action[:, None])[:, -1]
+    def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
+        shape = (len(state), self._mujoco_task.substeps, state.shape[1])
+        if self._buffer.size < (size := int(np.prod(shape))):  # kept: large arrays are slow to get anew
+            self._buffer = np.empty(size)
+        return self._roll(state, action[:, None], rows, self._buffer[:size].reshape(shape))[:, -1].copy()
 
     def rollout(self, state: Array, action: Array) -> Array:
-        """Open loop: states [N, S] and actions [N, T, A] -> noise-free states [N, T * substeps, S]."""
-        n, steps, substeps = len(state), action.shape[1], self._mujoco_task.substeps
-        control = np.repeat(self._mujoco_task.control(action), substeps, axis=1)
-        out = np.empty((n, steps * substeps, state.shape[1]))
-        models = self.models * (n // len(self.models))
+        """Open loop: states [n, S] and actions [n, T, A] -> noise-free states [n, T * substeps, S]."""
+        steps = action.shape[1] * self._mujoco_task.substeps
+        return self._roll(state, action, None, np.empty((len(state), steps, state.shape[1])))
+
+    def _roll(self, state: Array, action: Array, rows: NDArray[np.int64] | None, out: Array) -> Array:
+        n, steps, _ = out.shape
+        if not n:
+            return out
+        control = np.repeat(self._mujoco_task.control(action), self._mujoco_task.substeps, axis=1)
+        models = self.models if rows is None else [self.models[i] for i in rows.tolist()]
         threads = self._threads if n > 1 else 0
         if threads not in self._pools:
             self._pools[threads] = rollout.Rollout(nthread=threads)
@@ -165,9 +175,9 @@ class Physics(Simulator):
             self._datas[: max(threads, 1)],
             np.ascontiguousarray(state),
             control,
-            nstep=steps * substeps,
+            nstep=steps,
             state=out,
-            sensordata=np.empty((n, steps * substeps, models[0].nsensordata)),
+            sensordata=np.empty((n, steps, models[0].nsensordata)),
             skip_checks=True,
         )
         return out
@@ -179,7 +189,7 @@ class MujocoTask(Task):
     The state [S] is MuJoCo's full physics state (time, qpos, qvel, act). Joints are read by name.
     """
 
-    substeps: ClassVar[int] = 8
+    substeps: ClassVar[int] = 2  # physics steps a control step
     process_noise: ClassVar[dict[str, tuple[float, float]]]  # joint -> std of (position, velocity) a control step
     # A coordinate without noise counts as no evidence: it must be of no consequence, or one that theta does not move.
 
@@ -192,8 +202,12 @@ class MujocoTask(Task):
         return action
 
     def spec(self) -> mujoco.MjSpec:
-        """The nominal model, from assets/<name>.xml."""
+        """The nominal model, from assets/<name>.xml. Every environment has a copy, so that it should be small."""
         return mujoco.MjSpec.from_file(str(ASSETS / f"{self.name}.xml"))
+
+    def decorate(self, spec: mujoco.MjSpec) -> None:
+        """Add what is to be looked at only, for pictures: by default, a sky."""
+        render.sky(spec)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
@@ -212,13 +226,14 @@ class MujocoTask(Task):
         """Velocity [...] of a hinge or slide joint; rad/s or m/s."""
         return state[..., 1 + self.model.nq + self._address(joint)[1]]
 
-    def state(self, **joints: tuple[float, float]) -> Array:
-        """A state [S] with the named joints' (position, velocity), all others at the MJCF's rest."""
-        state = np.zeros(mujoco.mj_stateSize(self.model, STATE.value))
-        state[1 : 1 + self.model.nq] = self.model.qpos0
+    def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
+        """States [N, S] with the named joints' (position, velocity), each [N] or a number; others at the MJCF's rest."""
+        shape = np.broadcast_shapes((1,), *(np.shape(value) for pair in joints.values() for value in pair))
+        state = np.zeros((*shape, mujoco.mj_stateSize(self.model, STATE.value)))
+        state[:, 1 : 1 + self.model.nq] = self.model.qpos0
         for joint, (position, velocity) in joints.items():
             q, v = self._address(joint)
-            state[1 + q], state[1 + self.model.nq + v] = position, velocity
+            state[:, 1 + q], state[:, 1 + self.model.nq + v] = position, velocity
         return state
 
     def _address(self, joint: str) -> tuple[int, int]:
@@ -251,12 +266,13 @@ class MujocoTask(Task):
         return Physics(self, n)
 
     def painter(self, theta: Array) -> Painter:
-        physics = self.simulator(1)
-        physics.set_theta(0, theta)
-        return render.Painter(physics.models[0])
+        spec = self.spec()
+        self.decorate(spec)
+        self.apply_latent(SpecEdit(spec), theta)
+        return render.Painter(spec.compile())
 
-    def sample_noise(self, rng: np.random.Generator) -> Array:
-        return rng.standard_normal((self.horizon, len(self._noisy[0])))
+    def sample_noise(self, rng: Streams) -> Array:
+        return rng.standard_normal((rng.groups, self.horizon, len(self._noisy[0])))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
         physics = self.simulator(len(state))

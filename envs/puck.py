@@ -8,6 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.physics import MujocoTask
+from envs.streams import Streams
 from envs.task import Array
 
 
@@ -28,8 +29,8 @@ class Puck(MujocoTask):
     def goal(self, theta: Array) -> Array:
         """Where to go [N, 2], m."""
 
-    def init_state(self, rng: np.random.Generator) -> Array:
-        x, y = rng.uniform(-0.03, 0.03, 2)
+    def init_state(self, rng: Streams) -> Array:
+        x, y = rng.uniform([-0.03, -0.03], 0.03)
         return self.state(x=(x, 0), y=(y, 0))
 
     def observe(self, state: Array) -> Array:

@@ -51,6 +51,21 @@ def ribbon(spec: mujoco.MjSpec, name: str, left: Array, right: Array, grey: floa
     spec.worldbody.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, **look)
 
 
+def sky(spec: mujoco.MjSpec) -> None:
+    """Add a plain sky."""
+    builtin, kind = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    colours = {"rgb1": [0.9, 0.94, 1], "rgb2": [0.6, 0.72, 0.85]}
+    spec.add_texture(name="sky", type=kind, builtin=builtin, width=32, height=192, **colours)
+
+
+def chequer(spec: mujoco.MjSpec, material: str) -> None:
+    """Cover a material with dark chequers."""
+    builtin, kind = mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtTexture.mjTEXTURE_2D
+    colours = {"rgb1": [0.1, 0.2, 0.3], "rgb2": [0.2, 0.3, 0.4]}
+    spec.add_texture(name=material, type=kind, builtin=builtin, width=64, height=64, **colours)
+    spec.material(material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material
+
+
 def level(model: mujoco.MjModel) -> None:
     """Roll the camera `view` so that gravity points down in its picture, if there is any across it."""
     view, data = model.camera("view"), mujoco.MjData(model)

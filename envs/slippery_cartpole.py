@@ -16,6 +16,7 @@ import numpy as np
 
 from envs.cartpole import Cartpole
 from envs.physics import Edit
+from envs.streams import Streams
 from envs.task import Array, Latent
 
 SPIN = 10.0  # rad/s
@@ -25,6 +26,7 @@ class SlipperyCartpole(Cartpole):
     """The third joint, `axle` (rad), turns at `SPIN`; its reaction force is taken by the cart's rail."""
 
     name = "slippery_cartpole"
+    version = 1
     latents = (Latent("friction", "N m", 0.0, 0.3),)
     process_noise = {"slider": (0.004, 0.1), "hinge": (0.004, 0.2), "axle": (0, 0.1)}
     observation = {**Cartpole.observation, "slip": (-10, 10)}
@@ -35,7 +37,7 @@ class SlipperyCartpole(Cartpole):
     def control(self, action: Array) -> Array:
         return np.concatenate([action, np.full_like(action, SPIN)], -1)
 
-    def init_state(self, rng: np.random.Generator) -> Array:
+    def init_state(self, rng: Streams) -> Array:
         start = super().init_state(rng)
         self.qvel(start, "axle")[...] = SPIN
         return start

@@ -25,7 +25,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from envs import render
 from envs.physics import Edit, MujocoTask
+from envs.streams import Streams
 from envs.task import Array, Latent
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
@@ -39,10 +41,10 @@ class SlipperyWalker(MujocoTask):
     """Joints rootx, rootz and rooty of the torso, and hip, knee and ankle of each leg."""
 
     name = "slippery_walker"
+    version = 1
     latents = (Latent("friction", "", 0.2, 0.8, "loguniform"), Latent("slope", "rad", -0.1, 0.18))
     horizon = 200
-    substeps = 5
-    costly = True
+    substeps = 3
     expert_noise = 0.05
     process_noise = {
         **{"rootz": (0.00025, 0.01), "rootx": (0.0008, 0.02), "rooty": (0.0008, 0.02)},
@@ -55,25 +57,32 @@ class SlipperyWalker(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """The suite's walker, with a mark, and a small sky: every environment has a model of its own."""
+        """The suite's walker, on a floor whose friction counts, without what is there only to be looked at."""
         spec = mujoco.MjSpec.from_file(str(files("dm_control") / "suite" / "walker.xml"))
-        spec.option.timestep = 0.005
+        spec.option.timestep = 1 / 120
         spec.geom("floor").priority = 1
         for joint in JOINTS:
             spec.joint(joint).damping = np.full(3, DAMPING)
-        spec.texture("skybox").width, spec.texture("skybox").height = 32, 192
-        box = mujoco.mjtGeom.mjGEOM_BOX
-        spec.worldbody.add_site(name="mark", type=box, size=[0.08, 0.4, 0.002], rgba=[0.9, 0.3, 0.2, 1])
+        spec.material("grid").textures = [""] * len(spec.material("grid").textures)
+        for texture in spec.textures:
+            spec.delete(texture)
         spec.worldbody.add_camera(name="view", pos=[0, -2.9, 0.95], quat=[0.7071, 0.7071, 0, 0])
         return spec
+
+    def decorate(self, spec: mujoco.MjSpec) -> None:
+        """A mark where it is to stand, and a chequered ground."""
+        super().decorate(spec)
+        render.chequer(spec, "grid")
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        spec.worldbody.add_site(name="mark", type=box, size=[0.08, 0.4, 0.002], rgba=[0.9, 0.3, 0.2, 1])
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.geom_friction("floor", float(theta[0]))
         edit.slope(float(theta[1]))
 
-    def init_state(self, rng: np.random.Generator) -> Array:
-        x, pitch, *bend = rng.uniform(-0.05, 0.05, 2 + len(JOINTS))
-        legs = {joint: (angle, 0.0) for joint, angle in zip(JOINTS, np.add(STANCE, bend), strict=True)}
+    def init_state(self, rng: Streams) -> Array:
+        x, pitch, *bend = rng.uniform(np.full(2 + len(JOINTS), -0.05), 0.05)
+        legs = {joint: (angle + bent, 0) for joint, angle, bent in zip(JOINTS, STANCE, bend, strict=True)}
         return self.state(rootz=(0.01, 0), rootx=(x, 0), rooty=(pitch, 0), **legs)
 
     def observe(self, state: Array) -> Array:

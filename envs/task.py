@@ -21,7 +21,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+from envs.streams import Array, Streams
+
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
@@ -98,7 +99,7 @@ class Painter(Protocol):
 
 
 class Simulator:
-    """The noise-free part of p(s'|s, a, theta) for n thetas; environment i of a batch has theta number i mod n."""
+    """The noise-free part of p(s'|s, a, theta) for n environments, each with its own theta."""
 
     def __init__(self, task: Task, n: int) -> None:
         self.task, self.theta = task, np.tile([lat.low for lat in task.latents], (n, 1)).astype(float)
@@ -107,9 +108,12 @@ class Simulator:
         """Give environment i the latents theta [L]."""
         self.theta[i] = theta
 
-    def outcome(self, state: Array, action: Array) -> Array:
-        """State [N, S], action [N, A] -> what the noise acts on [N, ...], one control step later."""
-        return self.task.outcome(state, action, np.tile(self.theta, (len(state) // len(self.theta), 1)))
+    def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
+        """State [M, S], action [M, A] -> what the noise acts on [M, ...], one control step later.
+
+        rows [M]: the environment, and so the theta, of each row; None: all, in order.
+        """
+        return self.task.outcome(state, action, self.theta if rows is None else self.theta[rows])
 
 
 class Task(ABC):
@@ -126,18 +130,17 @@ class Task(ABC):
     horizon: ClassVar[int]
     episodes: ClassVar[int] = 5  # of one trial
     control_dt: ClassVar[float] = 1.0  # s
-    costly: ClassVar[bool] = False  # to step: runs leave out exact references, which step every theta of a grid
     expert_noise: ClassVar[float] = 0.0  # std of the expert's action around its mean; the action range is [-1, 1]
     action_space: ClassVar[spaces.Box | spaces.Discrete]
     observation: ClassVar[dict[str, tuple[float, float]]]  # name -> bounds, in the order of `observe`
 
     @abstractmethod
-    def init_state(self, rng: np.random.Generator) -> Array:
-        """A start state [S] ~ p(s_0), independent of theta."""
+    def init_state(self, rng: Streams) -> Array:
+        """Start states [N, S] ~ p(s_0), independent of theta; rng has a generator for each environment."""
 
     @abstractmethod
-    def sample_noise(self, rng: np.random.Generator) -> Array:
-        """The unit noise of a whole episode [T, Z]."""
+    def sample_noise(self, rng: Streams) -> Array:
+        """The unit noise of whole episodes [N, T, Z]; rng has a generator for each environment."""
 
     @abstractmethod
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
@@ -186,13 +189,18 @@ class Task(ABC):
         """deconf/SlipperyCartpole-v0, say."""
         return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
 
-    def sample_theta(self, rng: np.random.Generator) -> Array:
-        """theta [L] ~ p(theta)."""
-        return np.array([lat.ppf(np.asarray(rng.random())) for lat in self.latents])
+    def sample_theta(self, rng: Streams) -> Array:
+        """theta [N, L] ~ p(theta); rng has a generator for each environment."""
+        u = rng.random((rng.groups, len(self.latents)))
+        return np.stack([lat.ppf(u[:, i]) for i, lat in enumerate(self.latents)], -1)
 
     def theta_grid(self, k: int) -> Array:
-        """[K, L] equally likely thetas: the product of the latents' grids, k a latent."""
-        axes = np.meshgrid(*(lat.grid(k) for lat in self.latents), indexing="ij")
+        """[K, L] equally likely thetas: k values of one latent; of L, k^(2 / (L + 1)) each, and all their combinations.
+
+        Of two latents, 21 makes 7 x 7. A categorical latent has all of its values, whatever k.
+        """
+        each = max(2, int(k ** (2 / (len(self.latents) + 1)))) if len(self.latents) > 1 else k
+        axes = np.meshgrid(*(lat.grid(each) for lat in self.latents), indexing="ij")
         return np.stack([axis.ravel() for axis in axes], -1)
 
     def encode_theta(self, theta: Array) -> Array:

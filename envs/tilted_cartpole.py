@@ -18,6 +18,7 @@ class TiltedCartpole(Cartpole):
     """Moves the rail's body."""
 
     name = "tilted_cartpole"
+    version = 1
     latents = (Latent("tilt", "rad", -0.3, 0.3),)
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:

@@ -14,7 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs import BatchEnv, InputError
-from envs.task import Array
+from envs.streams import Array, Streams
 from experts.policy import Expert
 
 
@@ -67,22 +67,6 @@ class Trials:
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
         except (OSError, KeyError, ValueError, EOFError) as error:
             raise InputError(f"no trials could be read from {file}: {error}") from None
-
-
-class Streams:
-    """Random numbers for rows in equal groups: each group draws from its own generator, whatever the others do."""
-
-    def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
-        self.rngs = list(rngs)
-        self.groups = len(self.rngs)
-
-    def random(self, size: tuple[int, ...]) -> Array:
-        """U(0, 1) of that size, whose first axis counts rows."""
-        return np.concatenate([rng.random((size[0] // self.groups, *size[1:])) for rng in self.rngs])
-
-    def standard_normal(self, size: tuple[int, ...]) -> Array:
-        """N(0, 1), likewise."""
-        return np.concatenate([rng.standard_normal((size[0] // self.groups, *size[1:])) for rng in self.rngs])
 
 
 class Agent(ABC):

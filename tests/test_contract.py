@@ -18,7 +18,7 @@ import envs
 from envs.physics import ModelEdit, SpecEdit
 from envs.render import level
 from experts import policy
-from tests.tools import actions, far_thetas, gl_works
+from tests.tools import actions, far_thetas, gl_works, streams
 
 TASKS = envs.names()
 PHYSICS = [name for name in TASKS if isinstance(envs.get(name), envs.MujocoTask)]
@@ -70,7 +70,7 @@ class TestProtocols:
 def test_painters_do_not_touch_each_other() -> None:
     """A painter draws the same before and after another one is gone."""
     task = envs.get("tilted_cartpole")
-    theta, state = task.theta_grid(3)[0], task.init_state(np.random.default_rng(0))
+    theta, state = task.theta_grid(3)[0], task.init_state(streams(0))[0]
     other = task.painter(theta)
     other(state, np.zeros(1))
     paint = task.painter(theta)
@@ -163,8 +163,7 @@ class TestHiddenTheta:
     def test_theta_follows_its_distribution(self, name: str) -> None:
         """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003)."""
         task = envs.get(name)
-        rng = np.random.default_rng(0)
-        draws = np.array([task.sample_theta(rng) for _ in range(2000)])
+        draws = task.sample_theta(streams(*range(2000)))
         for i, latent in enumerate(task.latents):
             if latent.distribution == "categorical":
                 counts = (draws[:, i, None] == latent.grid(0)).mean(0)
@@ -193,9 +192,9 @@ class TestSeeds:
         batch = envs.BatchEnv(task, 2)
         batch.reset(20)
         for i in range(2):
-            theta, start, _ = map(np.random.default_rng, np.random.SeedSequence(20 + i).spawn(3))
-            np.testing.assert_array_equal(batch.theta[i], task.sample_theta(theta))
-            np.testing.assert_array_equal(batch.state[i], task.init_state(start))
+            theta, start, _ = map(streams, np.random.SeedSequence(20 + i).spawn(3))
+            np.testing.assert_array_equal(batch.theta[i], task.sample_theta(theta)[0])
+            np.testing.assert_array_equal(batch.state[i], task.init_state(start)[0])
 
     def test_seed_kinds(self, name: str) -> None:
         batch = envs.BatchEnv(envs.get(name), 2)
@@ -270,7 +269,7 @@ class TestTransitions:
         It fails if log_prob is not normalised, or not that of the noise that apply_noise adds.
         """
         task = envs.get(name)
-        rng, m = np.random.default_rng(0), 4000
+        m = 4000
         low, high = (lat.grid(9)[[0, -1]] for lat in task.latents[:1]).__next__()
         near = high if task.latents[0].distribution == "categorical" else low + 0.03 * (high - low)
         rest = [lat.low for lat in task.latents[1:]]
@@ -285,7 +284,7 @@ class TestTransitions:
         if isinstance(task, envs.MujocoTask):  # at most one standard deviation off: the ratio's variance is finite then
             distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
             q = p + (q - p) / max(1, distance[0])
-        noise = np.concatenate([task.sample_noise(rng) for _ in range(m // task.horizon + 1)])[:m]
+        noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
         drawn = task.apply_noise(np.repeat(p, m, 0), noise)
         ratio = np.exp(task.log_prob(drawn, q) - task.log_prob(drawn, p))
         assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(m) + 1e-9
@@ -356,7 +355,7 @@ class TestPhysics:
         task = envs.get(name)
         assert isinstance(task, envs.MujocoTask)
         assert set(task.process_noise) == {joint.name for joint in task.spec().joints}
-        start = task.init_state(np.random.default_rng(0))[None]
+        start = task.init_state(streams(0))
         action, simulator = np.ones((1, *task.action_space.shape)), task.simulator(1)
         noisy, _ = task._noisy
         quiet = set(range(1, 1 + task.model.nq + task.model.nv)) - set(noisy)
@@ -367,7 +366,7 @@ class TestPhysics:
             moved[:, i] += 0.7
             hint = f"theta moves a coordinate without process noise: number {i - 1} of qpos and qvel"
             np.testing.assert_array_equal(task.observe(moved), task.observe(start), hint)
-            after = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)))[:, noisy]
+            after = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)), np.zeros(2, int))[:, noisy]
             np.testing.assert_allclose(after[0], after[1], atol=1e-9, err_msg=hint)
 
     def test_picture_shows_theta_or_state(self, name: str) -> None:

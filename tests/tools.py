@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from gymnasium import spaces
 
 import envs
 from envs import render
-from envs.task import Array
+from envs.streams import Array, Streams
 
 
 def actions(task: envs.Task, n: int, steps: int) -> Array:
@@ -19,8 +21,13 @@ def actions(task: envs.Task, n: int, steps: int) -> Array:
 
 
 def far_thetas(task: envs.Task) -> Array:
-    """[J, L] thetas that span the range."""
-    return task.theta_grid(5)[::2]
+    """[J, L] thetas that span the range of every latent."""
+    return np.array(list(product(*(lat.grid(5)[::2] for lat in task.latents))))
+
+
+def streams(*seeds: int) -> Streams:
+    """A generator for each environment."""
+    return Streams([np.random.default_rng(seed) for seed in seeds])
 
 
 def gl_works() -> bool:

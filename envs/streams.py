@@ -1,0 +1,42 @@
+"""Random numbers for many rows, each group of which has a generator of its own: what one draws moves no other's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.floating[Any]]
+
+
+class Streams:
+    """Rows in equal groups, one after another; each group draws from its own generator, whatever the others do."""
+
+    def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
+        self.rngs = list(rngs)
+        self.groups = len(self.rngs)
+
+    def _parts(self, size: tuple[int, ...]) -> tuple[Array, list[Array]]:
+        out = np.empty(size)
+        return out, list(out.reshape(self.groups, -1))
+
+    def random(self, size: tuple[int, ...]) -> Array:
+        """U(0, 1) of that size, whose first axis counts rows."""
+        out, parts = self._parts(size)
+        for rng, part in zip(self.rngs, parts, strict=True):
+            rng.random(out=part)
+        return out
+
+    def standard_normal(self, size: tuple[int, ...]) -> Array:
+        """N(0, 1), likewise."""
+        out, parts = self._parts(size)
+        for rng, part in zip(self.rngs, parts, strict=True):
+            rng.standard_normal(out=part)
+        return out
+
+    def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:
+        """U(low, high) for bounds [K], a row a generator: K columns [K, groups], to be unpacked."""
+        low, high = np.broadcast_arrays(np.asarray(low, float), high)
+        return (low + (high - low) * self.random((self.groups, len(low)))).T
