@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconf.data import Batch, Draws, Signature
+from deconf.scan import GruScan
 from deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
 
 
@@ -131,24 +132,13 @@ class GruMemory(nn.Module):
         embedded = [inputs.obs(batch.obs), inputs.action(batch.action), inputs.obs(batch.next_obs)]
         return self.input(torch.cat(embedded, -1))
 
-    def _cell(self, inputs: Tensor, memory: Tensor, mask: Tensor) -> Tensor:
-        """One step: inputs [S, N, 3 W], memory [S, N, W], mask [S, N]."""
-        recurrent = self.recurrent(memory)
-        w = self.width
-        reset, keep = torch.sigmoid(inputs[..., : 2 * w] + recurrent[..., : 2 * w]).chunk(2, -1)
-        new = torch.tanh(inputs[..., 2 * w :] + reset * recurrent[..., 2 * w :])
-        return torch.lerp(memory, new, (1 - keep) * mask[..., None])
-
     def forward(self, batch: Batch, memory: Tensor) -> Tensor:
         """Transitions [S, B, T, ...] after a memory [S, B, W] -> memories [S, B, T + 1, W]."""
-        memories = [memory]
-        for inputs, mask in zip(self._embed(batch).unbind(2), batch.mask.unbind(2), strict=True):
-            memories.append(self._cell(inputs, memories[-1], mask))
-        return torch.stack(memories, 2)
+        return GruScan.apply(self._embed(batch), memory, self.recurrent.weight, self.recurrent.bias, batch.mask)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         """Memory [S, N, W] after one more transition each; kept where its mask is 0."""
-        return self._cell(self._embed(step), memory, step.mask)
+        return self(step[:, :, None], memory)[:, :, -1]
 
 
 class GruBelief(Belief):

@@ -36,6 +36,15 @@ def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     return statistic.reshape(len(statistic), *[1] * (like.dim() - 2), -1)
 
 
+def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
+    """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O]: a seed's bits are the same whatever is stacked on it."""
+    seeds, inputs, outputs = weight.shape
+    if seeds > 1 and rows.shape[1] * inputs * outputs <= SMALL:  # stacked, they could be more: then other bits
+        each = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
+        return torch.cat([torch.baddbmm(*one) for one in each])
+    return torch.baddbmm(bias, rows, weight)
+
+
 class Linear(nn.Module):
     """S linear maps side by side: [S, ..., I] -> [S, ..., O]."""
 
@@ -46,14 +55,8 @@ class Linear(nn.Module):
         self.bias = nn.Parameter((2 * draws.uniform(1, outputs) - 1) * bound)
 
     def forward(self, x: Tensor) -> Tensor:
-        rows = x.reshape(len(x), -1, x.shape[-1])
-        seeds, inputs, outputs = self.weight.shape
-        if seeds > 1 and rows.shape[1] * inputs * outputs <= SMALL:  # stacked, they could be more: then other bits
-            each = zip(self.bias.split(1), rows.split(1), self.weight.split(1), strict=True)
-            out = torch.cat([torch.baddbmm(*one) for one in each])
-        else:
-            out = torch.baddbmm(self.bias, rows, self.weight)
-        return out.reshape(*x.shape[:-1], outputs)
+        out = affine(self.bias, x.reshape(len(x), -1, x.shape[-1]), self.weight)
+        return out.reshape(*x.shape[:-1], out.shape[-1])
 
 
 def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:
