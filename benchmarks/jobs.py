@@ -76,7 +76,7 @@ class BenchmarkJob(Job):
 
     def run(self) -> str:
         monitor = CurveMonitor(self, 0.8)
-        context = Context(envs.get(self.task), self.preset, self.seeds, monitor)
+        context = Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder)
         agents = METHODS[self.method](context)
         trained = monitor.worked()
         found = {name: evaluate(context, agent, self.method in LEARNED) for name, agent in agents.items()}

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from envs.streams import Array, Streams
 from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials
 
 DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
 
@@ -59,8 +60,17 @@ class Context:
     Seeds lie side by side: trials are in as many equal groups as there are seeds.
     """
 
-    def __init__(self, task: envs.Task, preset: Preset, seeds: Sequence[int], monitor: Monitor | None = None) -> None:
+    def __init__(
+        self,
+        task: envs.Task,
+        preset: Preset,
+        seeds: Sequence[int],
+        monitor: Monitor | None = None,
+        folder: Path | None = None,
+    ) -> None:
+        """folder: where each seed's demonstrations are kept, for all methods; None: nowhere."""
         self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
+        self.folder = folder
         self.expert = policy.load(task)
         self.env = envs.BatchEnv(task, preset.eval_trials * len(self.seeds))
 
@@ -68,24 +78,45 @@ class Context:
         """Trials, of those that agents are scored in, of the i-th seed."""
         return slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
 
-    def _expert_trials(self, n: int, seeds: list[int]) -> tuple[Trials, Array]:
+    def _expert_trials(self, n: int, seeds: Sequence[int]) -> Trials:
         env = envs.BatchEnv(self.task, n * len(seeds))
-        self.monitor.spend("expert_trials", [n] * len(seeds))
         seeds = [stream(DEMOS, seed) for seed in seeds]
-        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0], env.theta
+        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
+
+    def _demonstrated(self, seed: int) -> Trials:
+        """The demonstrations of one seed, made once: what is in the folder is taken from there."""
+        if self.folder is None:
+            return self._expert_trials(self.preset.expert_trials, [seed])
+        file = self.folder / f"demonstrations-{seed}.npz"
+        try:
+            return Trials.load(file)
+        except envs.InputError:  # not there yet, or damaged
+            trials = self._expert_trials(self.preset.expert_trials, [seed])
+            trials.save(file)
+            return trials
 
     @cached_property
-    def demonstrations(self) -> tuple[Trials, Array]:
-        """Expert trials, and beside them theta [B, L] for the oracle."""
-        return self._expert_trials(self.preset.expert_trials, self.seeds)
+    def demonstrations(self) -> Trials:
+        """Expert trials, without theta."""
+        self.monitor.spend("expert_trials", [self.preset.expert_trials] * len(self.seeds))
+        return joined([self._demonstrated(seed) for seed in self.seeds])
+
+    @property
+    def demonstrated_theta(self) -> Array:
+        """theta [B, L] of the demonstrations, drawn once more from their seeds: for the oracle alone."""
+        n = self.preset.expert_trials
+        env = envs.BatchEnv(self.task, n * len(self.seeds))
+        env.reset([stream(DEMOS, seed) + i for seed in self.seeds for i in range(n)])
+        return env.theta
 
     def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
         """Fresh expert trials."""
-        return self._expert_trials(self.preset.fresh, [int(rng.integers(2**31)) for rng in rngs])[0]
+        self.monitor.spend("expert_trials", [self.preset.fresh] * len(rngs))
+        return self._expert_trials(self.preset.fresh, [int(rng.integers(2**31)) for rng in rngs])
 
     def source(self, fresh: bool) -> Source:
         """What there is to imitate: the fixed set of trials, or what draws fresh ones."""
-        return self.demonstrate if fresh else self.demonstrations[0]
+        return self.demonstrate if fresh else self.demonstrations
 
     @property
     def rngs(self) -> list[np.random.Generator]:
@@ -128,8 +159,7 @@ def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> di
 
 
 def _offline(context: Context) -> dict[str, Agent]:
-    trials, _ = context.demonstrations
-    agent = offline.fit(trials, context.preset.offline, context.rngs, context.monitor)
+    agent = offline.fit(context.demonstrations, context.preset.offline, context.rngs, context.monitor)
     return {"deconfounded_offline": agent}
 
 
@@ -143,13 +173,12 @@ def _dagger(context: Context) -> dict[str, Agent]:
 
 
 def _oracle(context: Context) -> dict[str, Agent]:
-    trials, theta = context.demonstrations
     encode = context.task.encode_theta
     agent = cloning.fit(
-        trials,
+        context.demonstrations,
         context.preset.cloning,
         context.rngs,
-        encode(theta),
+        encode(context.demonstrated_theta),
         lambda: encode(context.env.theta),
         context.monitor,
     )
@@ -157,8 +186,9 @@ def _oracle(context: Context) -> dict[str, Agent]:
 
 
 def _blind(context: Context) -> dict[str, Agent]:
-    trials, _ = context.demonstrations
-    return {"blind_bc": cloning.fit(trials, context.preset.cloning, context.rngs, monitor=context.monitor)}
+    return {
+        "blind_bc": cloning.fit(context.demonstrations, context.preset.cloning, context.rngs, monitor=context.monitor)
+    }
 
 
 def _exact(context: Context, conditional: bool) -> dict[str, Agent]:
@@ -199,3 +229,4 @@ COST = {
 EXACT = ("conditional", "interventional")
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
 LEARNED = tuple(name for name in METHODS if name not in (*EXACT, *REFERENCES))
+IMITATORS = tuple(name for name in LEARNED if name != "dagger")  # of demonstrations

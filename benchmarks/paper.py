@@ -99,7 +99,7 @@ class FigureJob(Job):
     def run(self) -> str:
         task, n, monitor = envs.get(self.task), self.preset.eval_trials, FigureMonitor(self, 0.95)
         few = min(n, 500)
-        context = Context(task, self.preset, self.seeds, monitor)
+        context = Context(task, self.preset, self.seeds, monitor, self.folder)
         env = envs.BatchEnv(task, few * len(self.seeds))
         seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
         trials, _ = run_trials(env, ExpertAgent(env, context.expert), 1, seeds)

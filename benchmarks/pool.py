@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 import envs
-from benchmarks.methods import COST, LEARNED, METHODS, Preset
+from benchmarks.methods import COST, IMITATORS, LEARNED, METHODS, Context, Preset
 from deconf.agents import Monitor, State
 from deconf.nets import prepare_torch
 from envs.console import Progress, check_folder, write_atomically, write_json
@@ -75,6 +75,19 @@ class Job(ABC):
             return {**arrays, "meta": json.loads(str(arrays["meta"]))}
         except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
+
+
+class DemonstrationJob(Job):
+    """Makes what all methods imitate with a seed, so that no two of them do."""
+
+    def file(self, seed: int) -> Path:
+        return self.folder / f"demonstrations-{seed}.npz"
+
+    def run(self) -> str:
+        start = time.time()
+        trials = Context(envs.get(self.task), self.preset, self.seeds, folder=self.folder).demonstrations
+        _ticks.put(self.ticks)
+        return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
 
 _ticks: Queue[int]  # of this worker process, to the main one
@@ -171,6 +184,9 @@ def run_all(
         for job, missing in zip(every, left, strict=True)
         for part in groups(job.method, missing, device)
     ]
+    if shown := sorted({seed for job in parts if job.method in IMITATORS for seed in job.seeds}):
+        first = DemonstrationJob(task, preset, "demonstrations", (), folder)
+        run_jobs([job for seed in shown if not (job := replace(first, seeds=(seed,))).file(seed).exists()], label)
     run_jobs(parts, label)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconf.data import Batch, Draws, Signature
-from deconf.scan import GruScan
 from deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
+from deconf.scan import GruScan
 
 
 class Belief(nn.Module, ABC):
@@ -95,7 +95,7 @@ class EvidenceBelief(Belief):
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
         if self.training:
-            self.longest.fill_(batch.mask.shape[2])
+            self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
         return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 
     def start(self, n: int) -> Tensor:

@@ -69,6 +69,12 @@ class Trials:
             raise InputError(f"no trials could be read from {file}: {error}") from None
 
 
+def joined(parts: Sequence[Trials]) -> Trials:
+    """The trials of all parts, one after another; they are of the same kind and shape."""
+    obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
+    return Trials(obs, action, mask, parts[0].actions)
+
+
 class Agent(ABC):
     """Something that acts in N trials side by side, from its own history alone."""
 

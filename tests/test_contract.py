@@ -366,7 +366,9 @@ class TestPhysics:
             moved[:, i] += 0.7
             hint = f"theta moves a coordinate without process noise: number {i - 1} of qpos and qvel"
             np.testing.assert_array_equal(task.observe(moved), task.observe(start), hint)
-            after = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)), np.zeros(2, int))[:, noisy]
+            after = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)), np.zeros(2, int))[
+                :, noisy
+            ]
             np.testing.assert_allclose(after[0], after[1], atol=1e-9, err_msg=hint)
 
     def test_picture_shows_theta_or_state(self, name: str) -> None:
