@@ -146,7 +146,7 @@ class Batch:
         """obs, action, next_obs and mask."""
         return self.obs, self.action, self.next_obs, self.mask
 
-    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int, ...]) -> Batch:
+    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int | None, ...]) -> Batch:
         return Batch(*(x[index] for x in self.tensors))
 
     def trials(self, index: Tensor) -> Batch:

@@ -13,8 +13,9 @@ from deconf.nets import affine
 class GruScan(torch.autograd.Function):
     """From a memory [S, B, W], through what enters each step [S, B, T, 3 W], to memories [S, B, T + 1, W].
 
-    With r, z and n the thirds of a row: r, z = sigmoid(in + h U + b), n = tanh(in + r (h U + b)), and h moves to n by (1
-    - z), where mask [S, B, T] is 1, and stays where it is 0. weight U [S, W, 3 W], bias b [S, 1, 3 W].
+    A row's thirds are of the gates r and z and of the candidate n: r, z = sigmoid(in + h U + b), n = tanh(in + r (h U +
+    b)). Where mask [S, B, T] is 1, h moves towards n by 1 - z; where it is 0, h stays. weight U [S, W, 3 W], bias b [S,
+    1, 3 W].
     """
 
     @staticmethod
@@ -49,17 +50,8 @@ class GruScan(torch.autograd.Function):
         # All that does not depend on the gradient of what comes after, for every step at once:
         by_new, by_keep = moved * (1 - news.square()), (memories[:-1] - news) * open_ * keep * (1 - keep)
         by_reset = recurrents * reset * (1 - reset)
-        columns = (
-            inner,
-            *inner.chunk(3, -1),
-            entering[..., 2 * w :],
-            by_new,
-            by_keep,
-            by_reset,
-            reset,
-            1 - moved,
-            grad[:-1],
-        )
+        to = (inner, *inner.chunk(3, -1), entering[..., 2 * w :])
+        columns = (*to, by_new, by_keep, by_reset, reset, 1 - moved, grad[:-1])
         h, back = grad[-1], weight.transpose(1, 2).contiguous()
         for whole, to_reset, to_keep, to_candidate, to_new, new, keeps, resets, r, stays, then in zip(
             *(column.unbind()[::-1] for column in columns), strict=True

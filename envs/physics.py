@@ -227,7 +227,7 @@ class MujocoTask(Task):
         return state[..., 1 + self.model.nq + self._address(joint)[1]]
 
     def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
-        """States [N, S] with the named joints' (position, velocity), each [N] or a number; others at the MJCF's rest."""
+        """States [N, S] with the named joints' (position, velocity), [N] or numbers; all others at the MJCF's rest."""
         shape = np.broadcast_shapes((1,), *(np.shape(value) for pair in joints.values() for value in pair))
         state = np.zeros((*shape, mujoco.mj_stateSize(self.model, STATE.value)))
         state[:, 1 : 1 + self.model.nq] = self.model.qpos0
