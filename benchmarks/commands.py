@@ -11,16 +11,17 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 import envs
-from benchmarks.methods import Preset
-from benchmarks.pool import Finished, Job, prepare, run_all, worked
-from benchmarks.presets import PRESETS, preset
+from benchmarks import catalogue
+from benchmarks.catalogue import PRESETS
 from envs.console import Parser
 from experts import policy
+
+if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
+    from benchmarks.methods import Preset
+    from benchmarks.pool import Finished, Job
 
 LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
@@ -43,19 +44,17 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
 def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]) -> list[str]:
     """The methods asked for. Raises InputError for anything that cannot be run."""
     methods = list(known) if args.methods == ["all"] else args.methods or list(default)
-    for name in methods:
-        if name not in known:
-            raise envs.closest("method", name, list(known))
-    check_run(args.preset, args.seeds, args.device)
+    catalogue.check(args.preset, methods, args.seeds, known)
+    check_device(args.device)
     return list(dict.fromkeys(methods))
 
 
-def check_run(name: str, seeds: int | None, device: str) -> None:
-    """Raises InputError for a preset, a number of seeds (None: the preset's) or a device that cannot be."""
-    if name not in PRESETS:
-        raise envs.closest("preset", name, list(PRESETS))
-    if seeds is not None and seeds < 1:
-        raise envs.InputError(f"--seeds was {seeds}; it must be at least 1")
+def check_device(device: str) -> None:
+    """Raises InputError for a torch device that cannot be used."""
+    if device == "cpu":
+        return
+    import torch
+
     try:
         torch.zeros(1, device=device).item()
     except (RuntimeError, AssertionError, NotImplementedError):
@@ -89,6 +88,9 @@ def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
+    from benchmarks.pool import prepare, run_all, worked
+    from benchmarks.presets import preset
+
     settings = preset(args.preset, task, args.device)
     seeds = args.seeds or settings.seeds
     described = about(task, args.preset, settings)

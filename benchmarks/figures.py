@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 import envs
-from benchmarks.methods import EXACT
+from benchmarks.catalogue import EXACT
 from benchmarks.pool import Finished, by_method
 from benchmarks.report import COLOURS
 from deconf.exact import ExactAgent

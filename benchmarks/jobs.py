@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 import envs
 from benchmarks import score
-from benchmarks.methods import EVALUATION, LEARNED, METHODS, Context, stream
+from benchmarks.catalogue import METHODS
+from benchmarks.methods import EVALUATION, MAKERS, Context, stream
 from benchmarks.pool import Job, JobMonitor
 from envs.task import Array
 from experts.demos import Agent, run_trials
@@ -77,9 +78,9 @@ class BenchmarkJob(Job):
     def run(self) -> str:
         monitor = CurveMonitor(self, 0.8)
         context = Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder)
-        agents = METHODS[self.method](context)
+        agents = MAKERS[self.method](context)
         trained = monitor.worked()
-        found = {name: evaluate(context, agent, self.method in LEARNED) for name, agent in agents.items()}
+        found = {name: evaluate(context, agent, METHODS[self.method].learned) for name, agent in agents.items()}
         meta = {"agents": list(agents), "curve": monitor.kept}
         for i, seed in enumerate(self.seeds):
             rows = context.rows(i)

@@ -196,7 +196,7 @@ def _exact(context: Context, conditional: bool) -> dict[str, Agent]:
     return {"conditional" if conditional else "interventional": agent}
 
 
-METHODS: dict[str, Callable[[Context], dict[str, Agent]]] = {
+MAKERS: dict[str, Callable[[Context], dict[str, Agent]]] = {
     "deconfounded": lambda context: _deconfounded(context, "deconfounded", context.preset.deconfounded),
     "deconfounded_gru": lambda context: _deconfounded(
         context, "deconfounded_gru", replace(context.preset.deconfounded, model="gru")
@@ -212,21 +212,3 @@ METHODS: dict[str, Callable[[Context], dict[str, Agent]]] = {
     "expert": lambda context: {"expert": ExpertAgent(context.env, context.expert)},
     "random": lambda context: {"random": RandomAgent(context.task.action_space)},
 }
-"""Longest first, so that the last ones to run are short. A method may score several ways of deploying one agent."""
-
-COST = {
-    "deconfounded": 7,
-    "deconfounded_gru": 14,
-    "deconfounded_discrete": 7,
-    "deconfounded_offline": 7,
-    "dagger": 4,
-    "naive_rnn": 4,
-    "conditional": 4,
-    "interventional": 3,
-}
-"""Of a method, about, where blind BC is 1: for the ETA alone."""
-
-EXACT = ("conditional", "interventional")
-REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
-LEARNED = tuple(name for name in METHODS if name not in (*EXACT, *REFERENCES))
-IMITATORS = tuple(name for name in LEARNED if name != "dagger")  # of demonstrations

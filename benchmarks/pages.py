@@ -14,9 +14,9 @@ from typing import Any
 
 import envs
 from benchmarks import score
+from benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
 from benchmarks.certify import THRESHOLDS
-from benchmarks.methods import METHODS, REFERENCES
-from benchmarks.presets import default_methods, preset
+from benchmarks.presets import preset
 from envs.console import Parser, run_command, write_atomically
 
 README = Path(__file__).parents[1] / "README.md"
@@ -54,7 +54,7 @@ def command(task: envs.Task, results: dict[str, Any]) -> str:
     """That makes the results."""
     methods = [name for name in METHODS if name in results["methods"]]
     asked = " ".join(name for name in methods if name not in REFERENCES)
-    named = "" if methods == default_methods(task) else f" --methods {asked}"
+    named = "" if methods == list(DEFAULT) else f" --methods {asked}"
     chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     seeds = len(results["seeds"])
     counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import envs
 from benchmarks import commands, score
 from benchmarks.figures import figure_2, figure_3
-from benchmarks.methods import EVALUATION, METHODS, Context, stream
+from benchmarks.methods import EVALUATION, MAKERS, Context, stream
 from benchmarks.pool import Finished, Job, JobMonitor, by_method
 from deconf.data import Batch
 from deconf.deconfounded import DeconfoundedAgent
@@ -104,7 +104,7 @@ class FigureJob(Job):
         seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
         trials, _ = run_trials(env, ExpertAgent(env, context.expert), 1, seeds)
         monitor.watch(context, Batch.of(trials, len(seeds), self.preset.naive.device), few)
-        agent = METHODS[self.method](context)[self.method]
+        agent = MAKERS[self.method](context)[self.method]
         trained = monitor.worked()
         best, pulls = online(context, agent, n)
         onlooker = Onlooker(agent, ExpertAgent(context.env, context.expert))

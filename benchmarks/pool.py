@@ -25,7 +25,8 @@ import numpy as np
 import torch
 
 import envs
-from benchmarks.methods import COST, IMITATORS, LEARNED, METHODS, Context, Preset
+from benchmarks.catalogue import METHODS
+from benchmarks.methods import Context, Preset
 from deconf.agents import Monitor, State
 from deconf.nets import prepare_torch
 from envs.console import Progress, check_folder, write_atomically, write_json
@@ -56,7 +57,7 @@ class Job(ABC):
     @property
     def ticks(self) -> int:
         """Of progress: in proportion to how long a job takes."""
-        return 100 * COST.get(self.method, 1) * len(self.seeds)
+        return 100 * METHODS[self.method].cost * len(self.seeds)
 
     def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
         """Write the file of a seed, atomically; beside `meta` it holds the seed's budget, and when work went on."""
@@ -79,6 +80,10 @@ class Job(ABC):
 
 class DemonstrationJob(Job):
     """Makes what all methods imitate with a seed, so that no two of them do."""
+
+    @property
+    def ticks(self) -> int:
+        return 20
 
     def file(self, seed: int) -> Path:
         return self.folder / f"demonstrations-{seed}.npz"
@@ -184,7 +189,7 @@ def run_all(
         for job, missing in zip(every, left, strict=True)
         for part in groups(job.method, missing, device)
     ]
-    if shown := sorted({seed for job in parts if job.method in IMITATORS for seed in job.seeds}):
+    if shown := sorted({seed for job in parts if METHODS[job.method].imitates for seed in job.seeds}):
         first = DemonstrationJob(task, preset, "demonstrations", (), folder)
         run_jobs([job for seed in shown if not (job := replace(first, seeds=(seed,))).file(seed).exists()], label)
     run_jobs(parts, label)
@@ -216,7 +221,7 @@ def groups(method: str, left: list[int], device: str) -> list[tuple[int, ...]]:
     """Seeds to run side by side: as many groups as cores, or one on a GPU; references have nothing to share."""
     if not left:
         return []
-    n = len(left) if method not in LEARNED else min(cores(), len(left)) if device == "cpu" else 1
+    n = len(left) if not METHODS[method].learned else min(cores(), len(left)) if device == "cpu" else 1
     return [tuple(map(int, part)) for part in np.array_split(left, n)]
 
 

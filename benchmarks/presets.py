@@ -8,19 +8,12 @@ from typing import Any
 from gymnasium import spaces
 
 import envs
-from benchmarks.methods import METHODS, Preset
+from benchmarks.methods import Preset
 from deconf.cloning import CloningConfig
 from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
-
-PRESETS = {
-    "smoke": "a minute: does everything work?",
-    "default": "minutes on two cores: the figures in README",
-    "paper": "ten seeds; on the bandit, the paper's own architecture and hyper-parameters (hours)",
-}
-EXTRA = ("deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
 
 _CONTROL = Preset(
     seeds=3,
@@ -124,11 +117,6 @@ def _smoke(full: Preset) -> Preset:
         dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
         cloning=replace(full.cloning, updates=400),
     )
-
-
-def default_methods(task: envs.Task) -> list[str]:
-    """The paper's comparison, and the exact references."""
-    return [name for name in METHODS if name not in EXTRA]
 
 
 def preset(name: str, task: envs.Task, device: str) -> Preset:

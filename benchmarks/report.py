@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 import envs
 from benchmarks import score
-from benchmarks.methods import EXACT, REFERENCES
+from benchmarks.catalogue import EXACT, REFERENCES
+from benchmarks.jobs import CLIPPED
+from benchmarks.pool import Finished
 
 COLOURS = {
     "expert": "black",
@@ -35,6 +37,26 @@ COLOURS = {
     "blind_bc": "tab:brown",
     "random": "lightgray",
 }
+
+
+def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
+    """Curves, and a video where a GL works."""
+    adaptation(results, folder / "adaptation.png")
+    curves: dict[str, list[dict[str, Any]]] = {}
+    clips: dict[str, dict[str, Any]] = {}
+    for method, _, data in finished:
+        curve = data["meta"]["curve"]  # of all seeds of a group
+        if curve and curve not in curves.setdefault(method, []):
+            curves[method].append(curve)
+        for name in CLIPPED:
+            if f"{name}/state" in data:
+                theta = data["theta"][int(data[f"{name}/trial"])]
+                clips[name] = {"state": data[f"{name}/state"], "action": data[f"{name}/action"], "theta": theta}
+    learning(curves, task.name, folder / "learning.png")
+    try:
+        video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
+    except (envs.InputError, OSError, RuntimeError) as error:  # no GL, or no encoder: the run is good all the same
+        print(f"no video: {error}")
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:

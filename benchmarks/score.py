@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
+import envs
+from benchmarks.catalogue import REFERENCES
 from deconf.equations import imitation_objective
 from envs.task import Array
 from experts.demos import Trials
@@ -97,6 +101,24 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
     return methods
+
+
+def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[str, int, dict[str, Any]]]) -> str:
+    """rows.csv: one row per method, seed, latent (trial) and episode."""
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    latents = [lat.name for lat in task.latents]
+    out.writerow(["method", "seed", "trial", *latents, "episode", "return", "score", "objective"])
+    zero, one = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
+    for _, seed, data in finished:
+        for name in data["meta"]["agents"]:
+            returns, objective = data[f"{name}/returns"], data[f"{name}/objective"]
+            values = np.stack([returns, normalise(returns, zero, one), objective], -1).round(4)
+            for trial, (theta, episodes) in enumerate(zip(data["theta"], values.tolist(), strict=True)):
+                drawn = [f"{value:.6g}" for value in theta]
+                for episode, row in enumerate(episodes):
+                    out.writerow([name, seed, trial, *drawn, episode + 1, *row])
+    return text.getvalue()
 
 
 COLUMNS = (

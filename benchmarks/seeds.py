@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 import envs
-from benchmarks import commands
-from benchmarks.methods import METHODS, Context, Preset
+from benchmarks import catalogue, commands
+from benchmarks.methods import MAKERS, Context, Preset
 from benchmarks.presets import preset
 from deconf.agents import Monitor
 from deconf.nets import prepare_torch
@@ -70,7 +70,8 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     for seeds in args.seeds:
-        commands.check_run(args.preset, seeds, args.device)
+        catalogue.check(args.preset, None, seeds, TIMED)
+    commands.check_device(args.device)
     settings = few(preset(args.preset, task, args.device))
     prepare_torch()
     print(f"{task.name}, {args.preset}, {args.device}, torch {torch.__version__}")
@@ -78,7 +79,7 @@ def main() -> None:
         alone: dict[str, float] = {}
         for seeds in sorted({1, *args.seeds}):
             clock = Clock()
-            METHODS[method](Context(task, settings, range(seeds), clock))
+            MAKERS[method](Context(task, settings, range(seeds), clock))
             for kind, seconds in clock.seconds().items():
                 ratio = seconds / alone.setdefault(kind, seconds)
                 print(f"{method:22} {kind:10} {seeds:3} seeds {1000 * seconds:8.1f} ms an update, {ratio:5.2f} of one")

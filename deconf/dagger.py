@@ -30,7 +30,7 @@ Returns trials, and beside them what the expert would have done at each step [B,
 
 @dataclass(frozen=True)
 class DaggerConfig(RecurrentConfig):
-    """Updates are shared out equally over the rounds; each round queries on fresh roll-outs of the policy so far."""
+    """Each round queries on fresh roll-outs of the policy so far; later rounds, with more labels, get more updates."""
 
     rounds: int = 10
 
@@ -50,7 +50,7 @@ def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None =
             trials, labels = query(agent, rngs)
             data = data.joined(Batch.of(trials, len(rngs), config.device))
             label = torch.cat([label, _labels(trials, labels, len(rngs), config.device)], 1)
-        for _ in range(cloner.passes):
+        for _ in range(cloner.passes[i]):
             index = draws.below(len(data), config.batch)
             cloner.learn(data.trials(index), take(label, index))
     return agent

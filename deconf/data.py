@@ -172,6 +172,16 @@ class Batch:
             *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
         )
 
+    def beginnings(self, update: int, shortest: float) -> Batch:
+        """The first n steps of every trial, n log-uniform between a share of them and all, over updates 0, 1, 2, ...
+
+        What is known of theta in deployment is the beginning of a trial, and most is learned early in it: long ones are
+        needed, but not in every update, where they would take most of the time. n is the same for all seeds, so that
+        none depends on another's: it follows the golden ratio's multiples, modulo 1, and not a random number.
+        """
+        golden = (5**0.5 - 1) / 2
+        return self[:, :, : max(1, round(self.mask.shape[2] * shortest ** (golden * update % 1)))]
+
     def draw_trials(self, k: int | None, draws: Draws) -> Batch:
         """k trials of each seed, uniformly and with replacement; None: all, as they are."""
         return self if k is None else self.trials(draws.below(len(self), k))

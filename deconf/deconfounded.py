@@ -44,8 +44,8 @@ class DeconfoundedConfig:
     rounds: int = 8
     inference_updates: int = 300  # a round
     inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
-    shortest: float = 1.0
-    inference_steps: int | None = 2048  # of them, whose next observation is predicted; None: all
+    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
+    inference_steps: int | None = 1024  # of them, whose next observation is predicted; None: all
     inference_rate: float = 1e-3
     imitation_updates: int = 500  # a round
     final_updates: int = 2000  # of the policy, after the last round
@@ -188,8 +188,8 @@ def fit(
                 expert = Batch.of(drawn(trials, rngs), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
-            length = prefix(seen.mask.shape[2], i * config.inference_updates + j, config.shortest)
-            batch = seen[:, :, :length].draw_trials(config.inference_batch, draws)
+            beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
+            batch = beginnings.draw_trials(config.inference_batch, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)
@@ -207,11 +207,6 @@ def fit(
         imitate(done, final)
         done += 1
     return agent
-
-
-def prefix(steps: int, update: int, shortest: float) -> int:
-    """How much of a trial an update reads: log-uniform between a share of it and all, by a golden-ratio sequence."""
-    return max(1, round(steps * shortest ** (0.6180339887498949 * update % 1)))
 
 
 @torch.no_grad()

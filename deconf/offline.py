@@ -31,11 +31,13 @@ class OfflineConfig:
     offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
+    offline_steps: int = 128  # of each, that stand for all of them in Eq. (7)'s likelihood
     beta: float = 1e-3  # of Eq. (6), a step
     warm_up: float = 0.5  # share of online updates over which this beta rises to its value
     online_updates: int = 2000
     online_batch: int = 32  # synthetic trials
-    online_steps: int = 2048  # of them, whose next observation is predicted
+    shortest: float = 1 / 16  # share of these trials that an update reads, at least
+    online_steps: int = 1024  # of them, whose next observation is predicted
     refresh: int = 50  # updates between syntheses
     synthetic: int = 128  # trials a synthesis
     random_share: float = 0.1  # of synthetic actions that are uniformly random
@@ -59,11 +61,14 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
         batch = data.draw_trials(config.offline_batch, draws)
         belief = offline.belief(offline.last(batch))
         mean, std = belief.chunk(2, -1)
-        theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
-        log_next = offline.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, theta_hat)[..., 0]
-        log_policy = policy.log_prob(torch.cat([online.inputs.obs(batch.obs), theta_hat], -1), batch.action)
+        index, steps = draws.below(batch.mask.shape[2], config.offline_steps), batch.mask.shape[2]
+        some = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
+        theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, config.offline_steps, -1)
+        log_next = offline.dynamics.log_prob(some.obs, some.action, some.next_obs, theta_hat)[..., 0]
+        log_policy = policy.log_prob(torch.cat([online.inputs.obs(some.obs), theta_hat], -1), some.action)
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
-        loss = offline_loss(log_next, log_policy, kl, config.offline_beta, batch.mask)
+        weight = some.mask * (steps / config.offline_steps)  # so that their sum is that of all, on average
+        loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
     offline.eval()
@@ -78,7 +83,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     for update in range(config.online_updates):
         if update % config.refresh == 0:
             synthetic = synthesise(online, policy, latents, data, starts, horizon, config, draws)
-        batch = synthetic.draw_trials(config.online_batch, draws)
+        batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)

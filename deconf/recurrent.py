@@ -75,7 +75,8 @@ class RecurrentAgent(LearnedAgent):
 class Cloner:
     """Trains an agent by likelihood: passes through trials, an update a chunk, the memory passed on between chunks.
 
-    Updates are shared out equally over `rounds`; `passes` counts those of one round, `done` the updates so far.
+    Passes are shared out over `rounds`, number i (from 1) in proportion to i: `passes` counts each round's, `done`
+    counts all updates so far.
     """
 
     def __init__(
@@ -83,8 +84,9 @@ class Cloner:
     ) -> None:
         self.agent, self.chunk, self.monitor, self.done = agent, config.chunk, monitor, 0
         self.chunks = -(-steps // config.chunk)
-        self.passes = -(-config.updates // (self.chunks * rounds))
-        self.total = self.passes * self.chunks * rounds
+        share = config.updates / (self.chunks * rounds * (rounds + 1) / 2)
+        self.passes = [max(1, round(share * i)) for i in range(1, rounds + 1)]
+        self.total = sum(self.passes) * self.chunks
         cooled = self.total if config.cooled else None
         self.optimizer = Adam([agent.memory, agent.policy], config.learning_rate, cooled)
 

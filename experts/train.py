@@ -5,67 +5,16 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import stable_baselines3
-import torch
 from safetensors.numpy import save_file
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
 
 import envs
-from envs.console import Parser, Progress, check_folder, run_command, write_json
+from envs.console import Parser, check_folder, run_command, write_json
 from experts import policy
 from experts.demos import ExpertAgent, RandomAgent, run_trials
-from experts.sb3 import Sb3VecEnv
-
-PPO_SETTINGS: dict[str, Any] = {
-    "n_steps": 128,
-    "batch_size": 2048,
-    "n_epochs": 10,
-    "gamma": 0.98,
-    "gae_lambda": 0.95,
-    "learning_rate": 1e-3,  # falling linearly to zero
-}
-
-
-class _Progress(BaseCallback):
-    def __init__(self, total: int) -> None:
-        super().__init__()
-        self._bar = Progress(total, "training")
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        returns = [episode["r"] for episode in self.model.ep_info_buffer or []]
-        self._bar.update(self.num_timesteps - self._bar.done, f"return {np.mean(returns):.1f}" if returns else "")
-
-
-def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.ndarray]:
-    """PPO for `steps` control steps in n environments -> the weights of the policy's mean, layer by layer."""
-    torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
-    rate = PPO_SETTINGS["learning_rate"]
-    schedule: Callable[[float], float] = lambda left: rate * left  # noqa: E731
-    model = PPO(
-        "MlpPolicy",
-        Sb3VecEnv(task, n, seed),
-        **{**PPO_SETTINGS, "learning_rate": schedule},
-        policy_kwargs={"net_arch": [64, 64], "log_std_init": -0.5},
-        seed=seed,
-        device="cpu",
-    )
-    model.learn(steps, callback=_Progress(steps))
-    layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
-    weights = {}
-    for i, layer in enumerate(layer for layer in layers if isinstance(layer, torch.nn.Linear)):
-        weights[f"{i}.weight"] = layer.weight.detach().numpy()
-        weights[f"{i}.bias"] = layer.bias.detach().numpy()
-    return weights
 
 
 def main() -> None:
@@ -86,6 +35,8 @@ def main() -> None:
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
     envs.check_task(task)
     check_folder(file.parent)
+    from experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
+
     start = time.time()
     weights = train(task, args.steps, args.seed)
     partial = file.with_suffix(".partial")
@@ -107,8 +58,7 @@ def main() -> None:
         "wall_s": round(time.time() - start, 1),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         "versions": {
-            **{name: version(name) for name in ("mujoco", "numpy", "torch")},
-            "stable-baselines3": stable_baselines3.__version__,
+            **{name: version(name) for name in ("mujoco", "numpy", "torch", "stable-baselines3")},
             "python": platform.python_version(),
         },
     }

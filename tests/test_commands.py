@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import subprocess
@@ -16,6 +17,7 @@ import envs
 import envs.physics
 from benchmarks import certify, pages, pool, publish, score
 from envs.cartpole import Cartpole
+from envs.console import run_command
 from envs.task import Array
 from experts.policy import Expert
 from tests.test_contract import assert_set_in_place_equals_recompiled
@@ -52,12 +54,29 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
     ],
 )
-def test_bad_input_is_one_line(args: tuple[str, ...], says: str) -> None:
-    done = command(*args)
+def test_bad_input_is_one_line(
+    args: tuple[str, ...], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = args[1] if args[0] == "-m" else args[0].removesuffix(".py").replace("/", ".")
+    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
+    with pytest.raises(SystemExit) as ended:
+        run_command(importlib.import_module(name).main)
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert says in told
+    assert len(told.strip().splitlines()) == 1
+
+
+def test_bad_input_from_the_shell() -> None:
+    """As above, in a process of its own; and what only lists or checks does not import what takes seconds."""
+    done = command("benchmarks/run.py", "--task", "slipery_cartpole")
     assert done.returncode == 2
-    assert says in done.stderr
+    assert done.stderr.startswith("error: task 'slipery_cartpole' is unknown; did you mean 'slippery_cartpole'?")
     assert len(done.stderr.strip().splitlines()) == 1
-    assert "Traceback" not in done.stderr
+    code = "import sys; sys.argv = ['run.py', '--list']; from benchmarks import run; run.main(); print(*sys.modules)"
+    loaded = command("-c", code).stdout.splitlines()[-1].split()
+    assert "mujoco" in loaded
+    assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
 
 
 def test_smoke_run_resumes(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 import envs
 from benchmarks import score
-from benchmarks.methods import METHODS, Context, Preset
+from benchmarks.methods import MAKERS, Context, Preset
 from deconf import cloning, deconfounded, naive_rnn, offline
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconf.dagger import DaggerConfig
@@ -439,7 +439,7 @@ class TestMethods:
         task, found = envs.get(name), []
         for seeds in ((5,), (4, 5, 6)):
             context = Context(task, settings, seeds)
-            agent = METHODS[method](context)[method]
+            agent = MAKERS[method](context)[method]
             trials, _ = run_trials(context.env, agent, task.episodes, list(seeds))
             found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
         np.testing.assert_array_equal(*found)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import envs
-from benchmarks.methods import METHODS, Context
+from benchmarks.methods import MAKERS, Context
 from benchmarks.presets import preset
 from benchmarks.score import normalise
 from deconf import cloning
@@ -69,7 +69,7 @@ def test_exact_policies_at_the_fork() -> None:
 def trained(name: str, method: str, **amounts: Any) -> Agent:
     """A method's agent, from the default preset but for `amounts`."""
     task = envs.get(name)
-    return METHODS[method](Context(task, replace(preset("default", task, "cpu"), **amounts), [0]))[method]
+    return MAKERS[method](Context(task, replace(preset("default", task, "cpu"), **amounts), [0]))[method]
 
 
 @pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
@@ -97,7 +97,7 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
     """Best-arm pulls of 100: exact 54 and 32; with one latent a trial, which never hears of the pay-outs, 20."""
     task = envs.get("bandit")
     context = Context(task, preset("smoke", task, "cpu"), [0])
-    agents = METHODS[method](context)
+    agents = MAKERS[method](context)
     pulls, once = (run_trials(context.env, agents[name], 1, 3)[1].mean() for name in (method, f"{method}_episode"))
     assert pulls > atleast
     assert once == pytest.approx(20, abs=3)

@@ -1,0 +1,59 @@
+"""PPO (Stable-Baselines3) on the view that sees theta."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+import envs
+from envs.console import Progress
+from experts.sb3 import Sb3VecEnv
+
+PPO_SETTINGS: dict[str, Any] = {
+    "n_steps": 128,
+    "batch_size": 2048,
+    "n_epochs": 10,
+    "gamma": 0.98,
+    "gae_lambda": 0.95,
+    "learning_rate": 1e-3,  # falling linearly to zero
+}
+
+
+class _Progress(BaseCallback):
+    def __init__(self, total: int) -> None:
+        super().__init__()
+        self._bar = Progress(total, "training")
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        returns = [episode["r"] for episode in self.model.ep_info_buffer or []]
+        self._bar.update(self.num_timesteps - self._bar.done, f"return {np.mean(returns):.1f}" if returns else "")
+
+
+def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.ndarray]:
+    """PPO for `steps` control steps in n environments -> the weights of the policy's mean, layer by layer."""
+    torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
+    rate = PPO_SETTINGS["learning_rate"]
+    schedule: Callable[[float], float] = lambda left: rate * left  # noqa: E731
+    model = PPO(
+        "MlpPolicy",
+        Sb3VecEnv(task, n, seed),
+        **{**PPO_SETTINGS, "learning_rate": schedule},
+        policy_kwargs={"net_arch": [64, 64], "log_std_init": -0.5},
+        seed=seed,
+        device="cpu",
+    )
+    model.learn(steps, callback=_Progress(steps))
+    layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    weights = {}
+    for i, layer in enumerate(layer for layer in layers if isinstance(layer, torch.nn.Linear)):
+        weights[f"{i}.weight"] = layer.weight.detach().numpy()
+        weights[f"{i}.bias"] = layer.bias.detach().numpy()
+    return weights
