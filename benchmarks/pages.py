@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import envs
 from benchmarks import score
 from benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
@@ -142,20 +144,48 @@ def _certificate(task: envs.Task) -> str:
     )
 
 
+def _moved(task: envs.MujocoTask, latent: int) -> str:
+    """What of the model a latent moves, read off models that differ in it alone: arrays, and whose entries."""
+    middle = np.array([lat.grid(3)[-1 if lat.distribution == "categorical" else 1] for lat in task.latents])
+    thetas = np.repeat(middle[None], 2, 0)
+    thetas[:, latent] = task.latents[latent].grid(9)[[0, -1]]
+    simulator, found = task.simulator(2), []
+    for i, theta in enumerate(thetas):
+        simulator.set_theta(i, theta)
+    one, other = simulator.models
+    kinds = {"body": one.body, "geom": one.geom, "dof": one.joint, "jnt": one.joint, "tendon": one.tendon}
+    kinds |= {"actuator": one.actuator, "site": one.site}
+    for field in dir(one):
+        value = None if field.startswith(("cam_", "light_")) else getattr(one, field, None)
+        if isinstance(value, np.ndarray) and (differs := value != getattr(other, field)).any():
+            rows = np.flatnonzero(differs.reshape(len(differs), -1).any(1)).tolist()
+            kind = field.split("_")[0]
+            named = [kinds[kind](one.dof_jntid[i] if kind == "dof" else i).name for i in rows] if kind in kinds else []
+            found.append(f"`{field}`{' of ' + ', '.join(named) if named else ''}")
+    if (one.opt.gravity != other.opt.gravity).any():
+        found.append("gravity")
+    return "; ".join(found) or "nothing"
+
+
 def card(task: envs.Task) -> str:
     """Markdown: what the docstrings say, latents, observation, noise, tier, certificate."""
-    latents = [(lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution) for lat in task.latents]
+    physics = isinstance(task, envs.MujocoTask)
+    latents: list[tuple[str, ...]] = [
+        (lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution) for lat in task.latents
+    ]
+    if isinstance(task, envs.MujocoTask):
+        latents = [(*row, _moved(task, i)) for i, row in enumerate(latents)]
     parts = [f"## {task.name} (v{task.version})", inspect.getdoc(inspect.getmodule(type(task))) or ""]
     for cls in type(task).__mro__:
         if issubclass(cls, envs.Task) and cls.__module__ not in ("envs.task", "envs.physics"):
             parts.append(inspect.cleandoc(cls.__doc__ or ""))
     trial = "one episode" if task.episodes == 1 else f"{task.episodes} episodes"
-    physics = isinstance(task, envs.MujocoTask)
     more = f", {task.control_dt:g} s each; the expert's action noise is {task.expert_noise:g}" if physics else ""
     parts.append(
         f"Tier {TIERS[task.tier]}. Trials of {trial} of at most {task.horizon} steps{more}. {_certificate(task)}"
     )
-    parts.append(markdown_table(("latent", "unit", "range", "distribution"), latents))
+    moves = ("what it moves in the model",) if physics else ()
+    parts.append(markdown_table(("latent", "unit", "range", "distribution", *moves), latents))
     bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())
     parts.append(markdown_table(("observation", "bounds"), bounds))
     if isinstance(task, envs.MujocoTask):

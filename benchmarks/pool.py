@@ -64,7 +64,8 @@ class Job(ABC):
         buffer = io.BytesIO()
         i = self.seeds.index(seed)
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
-        whole = {**meta, "budget": budget, "spans": monitor.spans()}
+        cpu = round(monitor.cpu() / len(self.seeds), 2)
+        whole = {**meta, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
@@ -127,11 +128,16 @@ class JobMonitor(Monitor):
         self.file = job.folder / f".{job.method}-{'-'.join(map(str, job.seeds))}.pt"
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []
+        self.cpu_start, self.cpu_before = time.process_time(), 0.0
         self.kept: State = {}
 
     def spans(self) -> list[tuple[float, float]]:
         """When the job was at work: from, to."""
         return [*self.before, (self.start, time.time())]
+
+    def cpu(self) -> float:
+        """CPU seconds of this process, for all seeds, so far."""
+        return self.cpu_before + time.process_time() - self.cpu_start
 
     def worked(self) -> float:
         """Seconds of work so far."""
@@ -148,7 +154,8 @@ class JobMonitor(Monitor):
     def save(self, state: Callable[[], State]) -> None:
         if time.monotonic() - self.saved >= SAVE_EVERY_S:
             buffer = io.BytesIO()
-            torch.save({"training": state(), "kept": self.kept, "budget": self.budget, "spans": self.spans()}, buffer)
+            known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
+            torch.save({"training": state(), **known}, buffer)
             write_atomically(self.file, buffer.getvalue())
             self.saved = time.monotonic()
 
@@ -158,6 +165,7 @@ class JobMonitor(Monitor):
         except Exception:  # missing, or damaged, which torch tells in many ways: begin again
             return None
         self.kept, self.before, self.budget = state["kept"], state["spans"], state["budget"]
+        self.cpu_before = state["cpu"]
         return state["training"]
 
     def close(self) -> float:

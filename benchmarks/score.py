@@ -97,6 +97,7 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": probes[:, :episodes].mean(0).round(4).tolist(),
             "budget": mean_budget([data for _, data in jobs]),
+            "cpu_s": round(float(np.mean([data["meta"]["cpu_s"] for _, data in jobs])), 1),
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
@@ -123,7 +124,7 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
 
 COLUMNS = (
     *("method", "return", "score of each episode", "last", "95% interval"),
-    *("Eq. (1)", "theta R2 of each episode", "data, a seed"),
+    *("Eq. (1)", "theta R2 of each episode", "data, a seed", "CPU s, a seed"),
 )
 
 
@@ -141,7 +142,8 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
         last = two_decimals(entry["score_last"])
         data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
         value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
-        found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data))
+        cost = f"{entry['cpu_s']:.0f}" if "cpu_s" in entry else ""  # not noted by older runs
+        found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data, cost))
     return found
 
 

@@ -136,7 +136,7 @@ class TestScore:
             for seed, value in enumerate(by_seed):
                 arrays = {"returns": np.full((4, 2), value), "objective": np.full((4, 2), -value), "probe": np.ones(2)}
                 wrote = {f"{name}/{key}": array for key, array in arrays.items()}
-                finished.append((name, seed, {**wrote, "meta": {"agents": [name], "budget": {}}}))
+                finished.append((name, seed, {**wrote, "meta": {"agents": [name], "budget": {}, "cpu_s": 1.5}}))
         methods = score.summarise(finished, 2)
         assert methods["other"]["objective"] == [-25, -25]
         assert methods["other"]["score"] == [0.75, 0.75]

@@ -15,10 +15,9 @@ from torch import Tensor
 
 import envs
 from benchmarks import score
-from benchmarks.methods import MAKERS, Context, Preset
+from benchmarks.methods import MAKERS, Context
 from deconf import cloning, deconfounded, naive_rnn, offline
 from deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
-from deconf.dagger import DaggerConfig
 from deconf.data import Batch, Draws, Signature
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.equations import (
@@ -39,6 +38,7 @@ from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from tests.tools import tiny_preset
 
 
 def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.BatchEnv]:
@@ -410,27 +410,7 @@ class TestMethods:
     )
     def test_seeds_do_not_touch_each_other(self, name: str, method: str) -> None:
         """A seed's agent acts alike, bit for bit, whether it was trained alone or second of three."""
-        settings = Preset(
-            seeds=3,
-            expert_trials=4,
-            explore_trials=4,
-            eval_trials=4,
-            query_trials=4,
-            fresh=0,
-            grid=3,
-            deconfounded=DeconfoundedConfig(
-                rounds=2, inference_updates=2, inference_batch=4, imitation_updates=2, final_updates=2
-            ),
-            discrete=DeconfoundedConfig(
-                model="discrete", rounds=2, inference_updates=2, inference_batch=4, imitation_updates=2, final_updates=2
-            ),
-            offline=OfflineConfig(
-                offline_updates=2, online_updates=2, online_batch=4, offline_batch=4, synthetic=4, online_steps=64
-            ),
-            naive=RecurrentConfig(updates=2, batch=4),
-            dagger=DaggerConfig(updates=2, rounds=2, batch=4),
-            cloning=cloning.CloningConfig(updates=3, batch=64),
-        )
+        settings = tiny_preset()
         if method == "paper":  # deconfounded as in that preset: its belief, fresh trials each round
             method = "deconfounded"
             settings = replace(
