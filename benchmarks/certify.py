@@ -26,7 +26,6 @@ from benchmarks.score import normalise
 from deconf import cloning
 from deconf.equations import belief_update
 from deconf.exact import ExactAgent, Grid
-from deconf.nets import prepare_torch
 from envs.console import Parser, Progress, check_folder, run_command, write_json
 from envs.task import Array
 from experts import policy
@@ -227,7 +226,6 @@ def main() -> None:
     expert = policy.load(task)
     folder = args.out or Path("results") / "certificates"
     check_folder(folder)
-    prepare_torch()
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
     result = certify(task, expert, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()

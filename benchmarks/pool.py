@@ -28,7 +28,6 @@ import envs
 from benchmarks.catalogue import METHODS
 from benchmarks.methods import Context, Preset
 from deconf.agents import Monitor, State
-from deconf.nets import prepare_torch
 from envs.console import Progress, check_folder, write_atomically, write_json
 from envs.physics import cores
 from experts.demos import Agent
@@ -107,11 +106,10 @@ def _die_with_parent() -> None:
 
 
 def start_worker(ticks: Queue[int]) -> None:
-    """Prepare a worker process: one thread, progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
+    """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
     global _ticks
     threading.Thread(target=_die_with_parent, daemon=True).start()
     _ticks = ticks
-    prepare_torch()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

@@ -15,6 +15,14 @@ from deconf.deconfounded import DeconfoundedConfig
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 
+_ON_CONTROL = DeconfoundedConfig(
+    inference_updates=500,
+    inference_batch=8,
+    inference_rate=2e-3,
+    imitation_updates=250,
+    final_updates=2000,
+    imitation_rate=2e-3,
+)
 _CONTROL = Preset(
     seeds=3,
     expert_trials=256,
@@ -23,21 +31,20 @@ _CONTROL = Preset(
     query_trials=32,
     fresh=0,
     grid=21,
-    deconfounded=DeconfoundedConfig(inference_updates=800, inference_rate=2e-3),
-    discrete=DeconfoundedConfig(
-        model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
-    ),
+    deconfounded=_ON_CONTROL,
+    discrete=replace(_ON_CONTROL, model="discrete", latent=16, inference_updates=800, inference_rate=1e-2),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
-    dagger=DaggerConfig(updates=4500, learning_rate=3e-3),
-    cloning=CloningConfig(),
+    dagger=DaggerConfig(updates=4500),
+    cloning=CloningConfig(updates=2000, learning_rate=2e-3),
 )
 _ON_BANDIT = DeconfoundedConfig(
     rounds=2,
     inference_batch=64,
     inference_rate=3e-3,
-    imitation_updates=800,
-    final_updates=3200,
+    shortest=1.0,  # its trials are short, and on the beginnings of few the latent is ignored for too long
+    imitation_updates=400,
+    final_updates=1600,
     imitation_rate=3e-3,
     random_share=1.0,
 )
@@ -49,7 +56,7 @@ _BANDIT = Preset(
     query_trials=2000,
     fresh=0,
     grid=0,
-    deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=6400),
+    deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=3200),
     discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=1600),
     offline=OfflineConfig(
         latent=5,
@@ -64,7 +71,7 @@ _BANDIT = Preset(
     ),
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
     dagger=DaggerConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    cloning=CloningConfig(updates=1000),
+    cloning=CloningConfig(updates=500, learning_rate=2e-3),
 )
 
 

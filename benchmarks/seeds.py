@@ -18,7 +18,6 @@ from benchmarks import catalogue, commands
 from benchmarks.methods import MAKERS, Context, Preset
 from benchmarks.presets import preset
 from deconf.agents import Monitor
-from deconf.nets import prepare_torch
 from envs.console import Parser, run_command
 from experts.demos import Agent
 
@@ -73,7 +72,6 @@ def main() -> None:
         catalogue.check(args.preset, None, seeds, TIMED)
     commands.check_device(args.device)
     settings = few(preset(args.preset, task, args.device))
-    prepare_torch()
     print(f"{task.name}, {args.preset}, {args.device}, torch {torch.__version__}")
     for method in TIMED:
         alone: dict[str, float] = {}

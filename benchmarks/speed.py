@@ -1,92 +1,191 @@
-"""How fast environments step: `python benchmarks/speed.py`
+"""How fast environments step: `python benchmarks/speed.py` (all tasks, some minutes), or `--task slippery_cartpole`
 
-Side by side in one run: our vector env in closed loop (observations and rewards included), gymnasium's SyncVectorEnv
-over our single env, the open-loop rate of mujoco.rollout, and raw mj_step. In control steps a second, and as ratios.
+Side by side in one run, in control steps a second: our vector env in closed loop (observations, rewards and resets
+included), mujoco.rollout in open loop, gymnasium's SyncVectorEnv over our single env, and raw mj_step in one thread
+times the threads; and memory an environment. If `envpool` is installed (a peer: C++ threads), both engines in closed
+loop, on a cartpole each, as shares of raw mj_step on their own model. Writes speed.json and speed.png.
 """
 
 from __future__ import annotations
 
+import os
+import platform
 import time
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 import envs
-from envs.console import Parser, run_command
+from envs.console import Parser, Progress, check_folder, run_command, write_json
+from envs.physics import Physics, cores
+
+SIZES = (1, 4, 16, 64, 256, 1024, 4096)
+SYNC = 64  # environments, at most, that SyncVectorEnv is timed with
+LOOKS = 7  # at each way of stepping, in turn
 
 
-def rate(steps: int, run: Callable[[], None], repeats: int = 5) -> float:
-    """Steps a second: the median of several runs, after one to warm up."""
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return steps / float(np.median(times))
+def rates(ways: dict[str, tuple[int, Callable[[], object]]]) -> dict[str, float]:
+    """Steps a second by way (steps, run): the median of some looks at each, in turn, after one to warm up."""
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for look in range(LOOKS + 1):
+        for name, (_, run) in ways.items():
+            start = time.perf_counter()
+            run()
+            if look:
+                times[name].append(time.perf_counter() - start)
+    return {name: steps / float(np.median(times[name])) for name, (steps, _) in ways.items()}
+
+
+def resident() -> int:
+    """Bytes of memory that this process holds."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
+    """So many physics steps of one environment in one thread, from its start, without control."""
+    data = mujoco.MjData(model)
+
+    def run() -> None:
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_step(model, data, nstep=steps)
+
+    return run
 
 
 def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
-    """Control steps a second, by way of stepping; the same actions and the same thetas for all."""
-    horizon = task.horizon
-    width = task.action_space.shape[0]
-    actions = np.random.default_rng(0).uniform(-1, 1, (horizon, n, width)).astype(np.float32)
+    """Control steps a second, by way of stepping; KiB an environment. The same actions and the same thetas for all."""
+    steps = max(8, min(task.horizon, 40_000 // n))
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, *task.action_space.shape)).astype(np.float32)
+    before = resident()
     ours = envs.make_vec(task.name, n)
-    theirs = SyncVectorEnv([lambda: envs.make(task.name) for _ in range(n)])
     ours.reset(seed=0)
-    theirs.reset(seed=0)
+    memory = (resident() - before) / 1024 / n
     start, simulator = ours.batch.state.copy(), ours.batch.simulator
-    assert isinstance(simulator, envs.physics.Physics)
+    assert isinstance(simulator, Physics)
     controls = np.ascontiguousarray(actions.transpose(1, 0, 2), float)
-    model = simulator.models[0]
-    data = mujoco.MjData(model)
 
     def closed_loop() -> None:
         for action in actions:
             ours.step(action)
 
-    def sync_vector_env() -> None:
-        for action in actions[:20]:
-            theirs.step(action)
-
-    def open_loop() -> None:
-        simulator.rollout(start, controls)
-
-    def mj_step() -> None:
-        mujoco.mj_resetData(model, data)
-        for action in controls[0]:
-            data.ctrl[:] = task.control(action)
-            for _ in range(task.substeps):
-                mujoco.mj_step(model, data)
-
-    return {
-        "vector env, closed loop": rate(n * horizon, closed_loop),
-        "SyncVectorEnv over the single env": rate(n * 20, sync_vector_env),
-        "mujoco.rollout, open loop": rate(n * horizon, open_loop),
-        "raw mj_step, one environment": rate(horizon, mj_step),
+    physics = 4000
+    ways: dict[str, tuple[int, Callable[[], object]]] = {
+        "closed_loop": (n * steps, closed_loop),
+        "open_loop": (n * steps, lambda: simulator.rollout(start, controls)),
+        "mj_step": (physics, raw(simulator.models[0], physics)),
     }
+    if n <= SYNC:
+        theirs = SyncVectorEnv([lambda: envs.make(task.name) for _ in range(n)])
+        theirs.reset(seed=0)
+        few = actions[: max(4, 600 // n)]
+
+        def sync_vector_env() -> None:
+            for action in few:
+                theirs.step(action)
+
+        ways["sync_vector_env"] = (n * len(few), sync_vector_env)
+    found = rates(ways)
+    found["mj_step"] *= cores() / task.substeps
+    return {**found, "kib": memory}
+
+
+def against_envpool(n: int = 64) -> dict[str, Any] | None:
+    """Physics steps a second in closed loop over raw mj_step times threads, of ours and of envpool's cartpole."""
+    try:
+        import envpool  # type: ignore[import-not-found]
+        from dm_control import suite
+    except ImportError:
+        return None
+    theirs = envpool.make("CartpoleBalance-v1", env_type="gymnasium", num_envs=n, num_threads=cores())
+    theirs.reset()
+    task, ours = envs.get("tilted_cartpole"), envs.make_vec("tilted_cartpole", n)
+    assert isinstance(task, envs.MujocoTask)
+    ours.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1, 1, (200, n, 1))
+    model = suite.load("cartpole", "balance").physics.model.ptr
+    found = rates(
+        {
+            "ours": (n * 200 * task.substeps, lambda: [ours.step(action) for action in actions]),
+            "envpool": (n * 200, lambda: [theirs.step(action) for action in actions]),
+            "our mj_step": (8000, raw(task.model, 8000)),
+            "its mj_step": (8000, raw(model, 8000)),
+        }
+    )
+    return {
+        "environments": n,
+        "version": version("envpool"),
+        "physics_steps_a_second": found,
+        "share_of_mj_step": {
+            "ours": found["ours"] / found["our mj_step"] / cores(),
+            "envpool": found["envpool"] / found["its mj_step"] / cores(),
+        },
+    }
+
+
+def picture(found: dict[str, dict[str, dict[str, float]]], file: Path) -> None:
+    """Closed loop as a share of open loop, and microseconds a step of one environment, by number of environments."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    for name, by_size in found.items():
+        sizes = [int(n) for n in by_size]
+        left.plot(sizes, [row["closed_loop"] / row["open_loop"] for row in by_size.values()], "o-", ms=4, label=name)
+        right.plot(sizes, [1e6 / row["closed_loop"] for row in by_size.values()], "o-", ms=4, label=name)
+    left.set(xscale="log", ylim=(0, 1.1), xlabel="environments", title="closed loop / open loop")
+    right.set(xscale="log", yscale="log", xlabel="environments", title="microseconds a control step of one")
+    right.legend(frameon=False, bbox_to_anchor=(1, 0.5), loc="center left")
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
 
 
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
-    parser.add_argument("--task", default="slippery_cartpole")
-    parser.add_argument("--n", type=int, default=64, help="environments")
+    parser.add_argument("--task", nargs="+", metavar="NAME", help="default: all that have physics")
+    parser.add_argument("--n", type=int, nargs="+", default=SIZES, help="environments; default: 1 to 4096")
+    parser.add_argument("--out", type=Path, default=Path("results") / "speed", help="output folder")
     args = parser.parse_args()
-    task = envs.get(args.task)
-    if not isinstance(task, envs.MujocoTask):
-        raise envs.InputError(f"{task.name} has no physics to time; give a MuJoCo task")
-    if args.n < 1:
-        raise envs.InputError(f"--n was {args.n}; it must be at least 1")
-    rates = measure(task, args.n)
-    ours = rates["vector env, closed loop"]
-    print(
-        f"{task.name}, {args.n} environments, {task.substeps} physics steps a control step, mujoco {mujoco.__version__}"
-    )
-    for name, value in rates.items():
-        print(f"{name:36} {value:10,.0f} control steps/s   vector env / this: {ours / value:6.2f}")
+    physics = [name for name in envs.names() if isinstance(envs.get(name), envs.MujocoTask)]
+    tasks = [envs.get(name) for name in args.task or physics]
+    for task in tasks:
+        if not isinstance(task, envs.MujocoTask):
+            raise envs.InputError(f"{task.name} has no physics to time; give a MuJoCo task")
+    if min(args.n) < 1:
+        raise envs.InputError(f"--n was {min(args.n)}; it must be at least 1")
+    check_folder(args.out)
+    progress = Progress(len(tasks) * len(args.n), "timing")
+    found: dict[str, dict[str, dict[str, float]]] = {}
+    for task in tasks:
+        assert isinstance(task, envs.MujocoTask)
+        found[task.name] = {str(n): {} for n in args.n}
+        for n in args.n:
+            row = found[task.name][str(n)] = measure(task, n)
+            sync = f"{row['sync_vector_env']:9,.0f}" if "sync_vector_env" in row else ""
+            progress.line(
+                f"{task.name:18} {n:5} environments: closed loop {row['closed_loop']:9,.0f} steps/s, open loop"
+                f" {row['open_loop']:9,.0f} (ratio {row['closed_loop'] / row['open_loop']:.2f}), raw mj_step"
+                f" {row['mj_step']:9,.0f}, {row['kib']:5.0f} KiB each{', SyncVectorEnv ' + sync if sync else ''}"
+            )
+            progress.update(1)
+    progress.close()
+    try:
+        peer = against_envpool()
+    except PackageNotFoundError:
+        peer = None
+    print("envpool is not installed" if peer is None else f"share of raw mj_step: {peer['share_of_mj_step']}")
+    about = {"machine": f"{platform.machine()}, {cores()} threads", "python": platform.python_version()}
+    versions = {name: version(name) for name in ("mujoco", "numpy", "gymnasium")}
+    write_json(args.out / "speed.json", {**about, "versions": versions, "tasks": found, "envpool": peer})
+    picture(found, args.out / "speed.png")
+    print(f"-> {args.out}")
 
 
 if __name__ == "__main__":

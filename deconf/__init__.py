@@ -1,1 +1,9 @@
-"""Deconfounded imitation learning: beliefs, methods, exact references."""
+"""Deconfounded imitation learning: beliefs, methods, exact references.
+
+Importing it sets torch to one thread, since the networks are small and more threads make them many times slower; call
+`torch.set_num_threads` afterwards for networks of your own that are not.
+"""
+
+from deconf.nets import prepare_torch
+
+prepare_torch()

@@ -39,7 +39,8 @@ def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O]: a seed's bits are the same whatever is stacked on it."""
     seeds, inputs, outputs = weight.shape
-    if seeds > 1 and rows.shape[1] * inputs * outputs <= SMALL:  # stacked, they could be more: then other bits
+    # Stacked, small products could be more than that, and those of vectors go another way in MKL: then other bits.
+    if seeds > 1 and (rows.shape[1] * inputs * outputs <= SMALL or min(inputs, outputs) == 1):
         each = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
         return torch.cat([torch.baddbmm(*one) for one in each])
     return torch.baddbmm(bias, rows, weight)

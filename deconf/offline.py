@@ -31,11 +31,11 @@ class OfflineConfig:
     offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
-    offline_steps: int = 128  # of each, that stand for all of them in Eq. (7)'s likelihood
+    offline_steps: int = 256  # of each, that stand for all of them in Eq. (7)'s likelihood
     beta: float = 1e-3  # of Eq. (6), a step
     warm_up: float = 0.5  # share of online updates over which this beta rises to its value
     online_updates: int = 2000
-    online_batch: int = 32  # synthetic trials
+    online_batch: int = 16  # synthetic trials
     shortest: float = 1 / 16  # share of these trials that an update reads, at least
     online_steps: int = 1024  # of them, whose next observation is predicted
     refresh: int = 50  # updates between syntheses

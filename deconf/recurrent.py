@@ -21,10 +21,10 @@ class RecurrentConfig:
     """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
 
     width: int = 64
-    updates: int = 2000
-    batch: int = 64
+    updates: int = 1000
+    batch: int = 32
     chunk: int = 50
-    learning_rate: float = 1e-3
+    learning_rate: float = 3e-3
     cooled: bool = True  # the learning rate falls to 0 along a cosine
     device: str = "cpu"
 

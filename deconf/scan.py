@@ -9,6 +9,8 @@ from torch import Tensor
 
 from deconf.nets import affine
 
+tanh_backward, sigmoid_backward = torch.ops.aten.tanh_backward, torch.ops.aten.sigmoid_backward  # fused
+
 
 class GruScan(torch.autograd.Function):
     """From a memory [S, B, W], through what enters each step [S, B, T, 3 W], to memories [S, B, T + 1, W].
@@ -36,32 +38,33 @@ class GruScan(torch.autograd.Function):
             torch.addcmul(enters, reset, candidate, out=new).tanh_()
             torch.lerp(before, new, (1 - keep) * goes, out=after)
         ctx.save_for_backward(memories, gates, news, recurrents, open_, weight)
-        return memories.permute(1, 2, 0, 3)
+        return memories.permute(1, 2, 0, 3).contiguous()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
         memories, gates, news, recurrents, open_, weight = ctx.saved_tensors
         w = news.shape[-1]
         grad = grads[0].permute(2, 0, 1, 3).contiguous()
-        reset, keep = gates.chunk(2, -1)
-        moved = (1 - keep) * open_
         inner = gates.new_empty(*news.shape[:-1], 3 * w)  # gradient of h U + b
         entering = torch.empty_like(inner)  # gradient of what enters
-        # All that does not depend on the gradient of what comes after, for every step at once:
-        by_new, by_keep = moved * (1 - news.square()), (memories[:-1] - news) * open_ * keep * (1 - keep)
-        by_reset = recurrents * reset * (1 - reset)
-        to = (inner, *inner.chunk(3, -1), entering[..., 2 * w :])
-        columns = (*to, by_new, by_keep, by_reset, reset, 1 - moved, grad[:-1])
+        by_gate = torch.empty_like(gates[0])
+        by_reset, by_keep = by_gate.split(w, -1)
+        to_gates, to_candidate = inner.split((2 * w, w), -1)
+        given = (memories[:-1], gates, *gates.chunk(2, -1), news, recurrents, open_, grad[:-1])
+        columns = (*given, inner, to_gates, to_candidate, entering[..., 2 * w :])
         h, back = grad[-1], weight.transpose(1, 2).contiguous()
-        for whole, to_reset, to_keep, to_candidate, to_new, new, keeps, resets, r, stays, then in zip(
-            *(column.unbind()[::-1] for column in columns), strict=True
-        ):
-            torch.mul(h, new, out=to_new)
-            torch.mul(h, keeps, out=to_keep)
-            torch.mul(to_new, resets, out=to_reset)
-            torch.mul(to_new, r, out=to_candidate)
-            h = affine(torch.addcmul(then, h, stays), whole, back)
-        entering[..., : 2 * w] = inner[..., : 2 * w]
+        each = zip(*(column.unbind()[::-1] for column in columns), strict=True)
+        for before, gate, reset, keep, new, candidate, goes, then, whole, gated, inside, enters in each:
+            moved = (1 - keep).mul_(goes)
+            tanh_backward(h * moved, new, grad_input=enters)
+            torch.mul(enters, reset, out=inside)
+            torch.mul(enters, candidate, out=by_reset)
+            torch.mul(torch.sub(before, new).mul_(goes), h, out=by_keep)
+            sigmoid_backward(by_gate, gate, grad_input=gated)
+            h = affine(torch.addcmul(then, h, 1 - moved), whole, back)
+        entering[..., : 2 * w] = to_gates
         rows, out = (x.transpose(0, 1).flatten(1, 2) for x in (memories[:-1], inner))
+        # Seed by seed: a product or a sum over a stack takes another order for one seed than for several.
         by_weight = torch.cat([a.transpose(1, 2) @ b for a, b in zip(rows.split(1), out.split(1), strict=True)])
-        return entering.permute(1, 2, 0, 3), h, by_weight, out.sum(1, keepdim=True), None
+        by_bias = torch.cat([one.sum(1, keepdim=True) for one in out.split(1)])
+        return entering.permute(1, 2, 0, 3).contiguous(), h, by_weight, by_bias, None

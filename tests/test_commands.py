@@ -109,6 +109,8 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     resumed = command(*args, str(out), "--resume", "--methods", "blind_bc", "conditional", "interventional")
     assert resumed.returncode == 0, resumed.stderr
     repeated = json.loads((out / "results.json").read_text())
+    for entry in (*repeated["methods"].values(), *results["methods"].values()):
+        assert entry.pop("cpu_s") >= 0
     assert repeated["methods"] == results["methods"]
     assert repeated["resumed"] == 3
 

@@ -13,7 +13,7 @@ from torch.distributions import Normal, kl_divergence
 
 import envs
 from benchmarks.methods import DEMOS, EVALUATION, MAKERS, Context, stream
-from deconf import deconfounded, models, naive_rnn, offline
+from deconf import dagger, deconfounded, models, naive_rnn, offline
 from deconf.agents import LearnedAgent
 from deconf.cloning import CloningConfig
 from deconf.data import Batch, Draws, Signature
@@ -128,10 +128,11 @@ class TestData:
     def test_methods_are_handed_no_theta(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """Demonstrations are the context's, explorations a plain environment's: again from their seeds, bit for bit."""
         task = envs.get(name)
-        module = {
+        modules = {
             "deconfounded": deconfounded,
             "deconfounded_offline": offline,
             "naive_rnn": naive_rnn,
+            "dagger": dagger,
         }
         handed: list[Any] = []
 
@@ -139,7 +140,7 @@ class TestData:
             handed.extend((given, *rest))
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(module[method], "fit", spy)
+        monkeypatch.setattr(modules[method], "fit", spy)
         context = Context(task, tiny_preset(), [0])
         with pytest.raises(KeyboardInterrupt):
             MAKERS[method](context)

@@ -14,6 +14,7 @@ from benchmarks.presets import preset
 from benchmarks.score import normalise
 from deconf import cloning
 from deconf.cloning import CloningConfig
+from deconf.dagger import DaggerConfig
 from deconf.deconfounded import DeconfoundedConfig
 from deconf.exact import ExactAgent, Grid
 from envs.task import Array
@@ -107,5 +108,5 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
 
 def test_tier_3_works_at_the_fork() -> None:
     """forked_path: who is told what the expert would do at the bump learns to go where its push points."""
-    agent = trained("forked_path", "dagger")
+    agent = trained("forked_path", "dagger", dagger=DaggerConfig(updates=1500, rounds=6))
     assert scores(envs.BatchEnv(envs.get("forked_path"), N), agent)[-1] > 0.7
