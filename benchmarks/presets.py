@@ -17,7 +17,6 @@ from deconf.recurrent import RecurrentConfig
 
 _ON_CONTROL = DeconfoundedConfig(
     inference_updates=500,
-    inference_batch=8,
     inference_rate=2e-3,
     imitation_updates=250,
     final_updates=2000,
@@ -32,7 +31,9 @@ _CONTROL = Preset(
     fresh=0,
     grid=21,
     deconfounded=_ON_CONTROL,
-    discrete=replace(_ON_CONTROL, model="discrete", latent=16, inference_updates=800, inference_rate=1e-2),
+    discrete=replace(
+        _ON_CONTROL, model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
+    ),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
     dagger=DaggerConfig(updates=4500),
@@ -43,8 +44,8 @@ _ON_BANDIT = DeconfoundedConfig(
     inference_batch=64,
     inference_rate=3e-3,
     shortest=1.0,  # its trials are short, and on the beginnings of few the latent is ignored for too long
-    imitation_updates=400,
-    final_updates=1600,
+    imitation_updates=800,
+    final_updates=3200,
     imitation_rate=3e-3,
     random_share=1.0,
 )
