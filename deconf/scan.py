@@ -9,7 +9,8 @@ from torch import Tensor
 
 from deconf.nets import affine
 
-tanh_backward, sigmoid_backward = torch.ops.aten.tanh_backward, torch.ops.aten.sigmoid_backward  # fused
+tanh_backward = torch.ops.aten.tanh_backward.grad_input  # fused
+sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
 
 
 class GruScan(torch.autograd.Function):

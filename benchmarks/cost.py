@@ -1,0 +1,98 @@
+"""What learning costs: `python benchmarks/cost.py --task slippery_cartpole`
+
+Score in the last episode against CPU seconds, for each learned method, with shares of the default preset's updates. How
+its amounts were chosen: where the curve is flat, a smaller share does. Points of older code, in docs/speed/before.json,
+are drawn beside.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import envs
+from benchmarks import catalogue, commands
+from benchmarks.catalogue import METHODS, REFERENCES
+from envs.console import check_folder, run_command, write_json
+from experts import policy
+
+SHARES = (0.25, 0.5, 1.0)
+BEFORE = Path(__file__).parents[1] / "docs" / "speed" / "before.json"
+LEARNED = tuple(name for name, method in METHODS.items() if method.learned and name != "deconfounded_gru")
+
+
+def scaled(config: Any, share: float) -> Any:
+    """A method's configuration with so much of its updates."""
+    counts = [field.name for field in fields(config) if field.name.endswith("updates")]
+    return replace(config, **{name: max(1, round(getattr(config, name) * share)) for name in counts})
+
+
+def picture(task: str, found: dict[str, Any], before: dict[str, Any], file: Path) -> None:
+    """A panel a method: score against CPU seconds, a dot a share; older code's as a cross."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(2, -(-len(found) // 2), figsize=(13, 6), layout="constrained", squeeze=False)
+    for axes in panels.flat[len(found) :]:
+        axes.axis("off")
+    for axes, (method, points) in zip(panels.flat, found.items(), strict=False):
+        cpu, scores = [[point[key] for point in points.values()] for key in ("cpu_s", "scores")]
+        axes.plot(
+            cpu, [np.mean(one) for one in scores], "o-", color="tab:blue", label="1/4, 1/2 and all of the updates"
+        )
+        axes.vlines(cpu, [min(one) for one in scores], [max(one) for one in scores], color="tab:blue", alpha=0.4)
+        if method in before:
+            axes.plot(before[method]["cpu_s"], before[method]["score"], "x", ms=9, color="black", label="f112891")
+        axes.set(title=method, xlabel="CPU seconds a seed", xlim=(0, None), ylim=(-0.05, 1.1))
+    panels.flat[0].set_ylabel("score, last episode")
+    panels.flat[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(task)
+    figure.savefig(file, dpi=100)
+    plt.close(figure)
+
+
+def main() -> None:
+    """The command line."""
+    parser = commands.parser(__doc__, f"some of {', '.join(LEARNED)}; default: all", seeds=1)
+    parser.add_argument("--task", required=True)
+    args = parser.parse_args()
+    task, methods = envs.get(args.task), args.methods or LEARNED
+    catalogue.check(args.preset, methods, args.seeds, LEARNED)
+    envs.check_task(task)
+    policy.load(task)
+    from benchmarks import score
+    from benchmarks.jobs import BenchmarkJob
+    from benchmarks.pool import prepare, run_all
+    from benchmarks.presets import preset
+
+    folder, full = args.out or Path("results") / f"cost-{task.name}", preset(args.preset, task, args.device)
+    check_folder(folder)
+    parts = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")
+    found: dict[str, Any] = {method: {} for method in methods}
+    for share in SHARES:
+        settings = replace(full, **{part: scaled(getattr(full, part), share) for part in parts})
+        own = folder / f"{share:g}"
+        prepare(own, commands.about(task, args.preset, settings), args.resume)
+        label = f"{task.name}, {share:g} of the updates"
+        wanted = [*REFERENCES, *methods]
+        finished, _ = run_all(BenchmarkJob, task.name, settings, wanted, args.seeds, args.device, own / "jobs", label)
+        results = score.summarise(finished, task.episodes)
+        zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
+        for method in methods:
+            last = score.normalise(np.array(results[method]["return"])[:, -1], zero, one)
+            found[method][f"{share:g}"] = {"cpu_s": results[method]["cpu_s"], "scores": last.round(4).tolist()}
+            print(f"{method:22} {share:5g} of the updates: {results[method]['cpu_s']:6.1f} CPU s, {last.mean():.3f}")
+    write_json(folder / "cost.json", {"task": task.name, "seeds": args.seeds, "methods": found})
+    before = json.loads(BEFORE.read_text()).get(task.name, {}) if BEFORE.is_file() else {}
+    picture(task.name, found, before, folder / "cost.png")
+    print(f"-> {folder / 'cost.png'}")
+
+
+if __name__ == "__main__":
+    run_command(main, commands.KEPT)
