@@ -31,11 +31,12 @@ from deconf.equations import (
     posterior_policy,
     reparametrise,
 )
-from deconf.exact import ExactAgent
+from deconf.exact import LEFT_OUT, ExactAgent, Grid
 from deconf.models import DiscreteModel, VariationalModel
 from deconf.nets import ActionHead, Embedding, Scaler, scalers
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
+from envs.streams import Array
 from experts import policy
 from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
@@ -340,6 +341,63 @@ class TestExact:
         near = np.abs(latent.cdf(agent.grid.theta[:, 0])[None] - latent.cdf(env.theta)) < 0.1
         assert belief.max(-1).mean() > 0.8
         assert (belief * near).sum(-1).mean() < 0.6
+
+    @pytest.mark.parametrize("conditional", [False, True])
+    def test_left_out_values(self, conditional: bool) -> None:
+        """Along the agent's own trials its belief is that of the full grid, to .01 in total variation on average.
+
+        And what it simulates is less than a third of the grid. Bit for bit the full grid's, where nothing is left out.
+        """
+        env = envs.BatchEnv(envs.get("tilted_cartpole"), 24)
+        agent = ExactAgent(env, policy.load(env.task), conditional, k=21)
+        grid, gaps, simulated = agent.grid, [], []
+        some, outcome = grid.log_dynamics, grid._simulator.outcome
+
+        def spy(state: Array, action: Array, next_state: Array, log_belief: Array | None = None) -> Array:
+            whole = some(state, action, next_state)
+            simulated.clear()
+            found = some(state, action, next_state, log_belief)
+            assert log_belief is not None
+            told.append(simulated[0] / whole.size)
+            if (log_belief == log_belief[:1, :1]).all():
+                np.testing.assert_array_equal(found, whole)
+            one, other = (np.exp(belief_update(log_belief, x)) for x in (found, whole))
+            gaps.append(np.abs(one - other).sum(-1).mean() / 2)
+            return found
+
+        def count(state: Array, action: Array, rows: Any = None) -> Array:
+            simulated.append(len(state))
+            return outcome(state, action, rows)
+
+        told: list[float] = []
+        grid.log_dynamics = spy  # type: ignore[method-assign]
+        grid._simulator.outcome = count  # type: ignore[method-assign]
+        run_trials(env, agent, 2, seed=0)
+        assert np.mean(gaps) < 0.01
+        assert told[0] == 1
+        assert np.mean(told) < (0.15 if conditional else 0.4)
+
+    def test_values_left_out_come_back(self) -> None:
+        """Thirty steps of one theta, then many of another, which had been left out: in the end it has the mass."""
+        task = envs.get("tilted_cartpole")
+        env = envs.BatchEnv(task, 16)
+        grid = Grid(env, policy.load(task), 21)
+        env.reset(0, {"theta": task.theta_grid(21)[4]})
+        belief = grid.prior(16)
+        agent = RandomAgent(task.action_space)
+        agent.reset([np.random.default_rng(0)])
+        for t in range(400):
+            if t == 30:
+                for i in range(16):
+                    env.simulator.set_theta(i, task.theta_grid(21)[14])
+            if not env.alive.all():
+                env.reset(options={"keep_theta": True}, where=~env.alive)
+            state, action = env.state.copy(), agent.act(env.observe())
+            env.step(action)
+            belief = belief_update(belief, grid.log_dynamics(state, action, env.state, belief))
+            if t == 29:
+                assert np.median(np.exp(belief)[:, 14]) < LEFT_OUT
+        assert np.exp(belief)[:, 13:16].sum(-1).mean() > 0.9
 
     def test_probe_reads_the_posterior(self) -> None:
         """R^2 of theta in what the exact interventional policy knows after an episode is near 1; in noise it is not."""
