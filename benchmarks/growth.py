@@ -1,6 +1,6 @@
 """How cost grows: `python benchmarks/growth.py`
 
-CPU seconds by the steps of a trial (an update of the belief, a pass of the RNN) and by the number of values in the exact
+CPU seconds by the steps of a trial (an update of the belief, a pass of the RNN) and by the values of the exact
 policies' grid; each with the power of n that fits best. Seeds: `seeds.py`; environments: `speed.py`. Writes growth.json
 and growth.png.
 """
