@@ -12,7 +12,8 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 import envs
-from benchmarks.methods import DEMOS, EVALUATION, MAKERS, Context, stream
+from benchmarks.jobs import evaluate
+from benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Context, stream
 from deconf import dagger, deconfounded, models, naive_rnn, offline
 from deconf.agents import LearnedAgent
 from deconf.cloning import CloningConfig
@@ -153,7 +154,7 @@ class TestData:
         given = roll_out(None, [np.random.default_rng(7)])
         trials = given[0] if method == "dagger" else given
         env = envs.BatchEnv(task, 4)
-        seed = stream(2, int(np.random.default_rng(7).integers(2**31)))
+        seed = stream(EXPLORATION, int(np.random.default_rng(7).integers(2**31)))
         plain, _ = run_trials(env, RandomAgent(task.action_space), task.episodes, [seed])
         np.testing.assert_array_equal(trials.obs, plain.obs)
 
@@ -179,10 +180,12 @@ class TestData:
         monkeypatch.setattr(envs.BatchEnv, "reset", watch)
         for _ in range(2):
             context.explore(None, [np.random.default_rng(seed) for seed in (0, 1)])
-        run_trials(context.env, RandomAgent(task.action_space), 1, [stream(EVALUATION, seed) for seed in (0, 1)])
+        evaluate(context, RandomAgent(task.action_space), False)
         thetas = np.concatenate([*made[:1], *made[2:], context.demonstrated_theta])[:, 0]
         np.testing.assert_array_equal(made[0], made[1])  # the same generators
         assert len(np.unique(thetas)) == len(thetas) == 3 * 8
+        same = {stream(purpose, seed) for purpose in (DEMOS, EXPLORATION, EVALUATION) for seed in range(100)}
+        assert len(same) == 300
 
     def test_the_oracle_is_told_the_truth(self) -> None:
         """On the bandit it pulls the best arm as the expert does, 60 of 100, with four standard errors."""
