@@ -37,7 +37,7 @@ _CONTROL = Preset(
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
     dagger=DaggerConfig(updates=4500),
-    cloning=CloningConfig(updates=2000, learning_rate=2e-3),
+    cloning=CloningConfig(),
 )
 _ON_BANDIT = DeconfoundedConfig(
     rounds=2,
@@ -72,7 +72,7 @@ _BANDIT = Preset(
     ),
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
     dagger=DaggerConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    cloning=CloningConfig(updates=500, learning_rate=2e-3),
+    cloning=CloningConfig(updates=500),
 )
 
 

@@ -21,9 +21,9 @@ class CloningConfig:
     """Widths and amounts, for each seed; batch counts steps."""
 
     width: int = 64
-    updates: int = 4000
+    updates: int = 2000
     batch: int = 1024
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     device: str = "cpu"
 
 

@@ -436,7 +436,7 @@ class TestMethods:
     def test_naive_rnn_is_deluded(self) -> None:
         """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
         trials, env = demonstrations("bandit", 1000, 1)
-        config = RecurrentConfig(updates=250, batch=100, chunk=100, learning_rate=3e-3)
+        config = RecurrentConfig(updates=250, batch=50, chunk=50, learning_rate=5e-3)
         agent = naive_rnn.fit(trials, config, np.random.default_rng(0))
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3)[1].mean() < 42
 

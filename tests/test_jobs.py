@@ -56,6 +56,7 @@ def test_interrupted_training_goes_on(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A job that was killed and begun again writes, bit for bit, what it would have written."""
+    monkeypatch.setattr(paper, "POINTS", 8)
     monkeypatch.setattr(pool, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
     whole, broken = (kind(task, settings(task, fresh), method, (0, 1), tmp_path / name) for name in ("whole", "broken"))
