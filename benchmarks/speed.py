@@ -26,7 +26,7 @@ from envs.physics import Physics, cores
 
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)
 SYNC = 64  # environments, at most, that SyncVectorEnv is timed with
-LOOKS = 7  # at each way of stepping, in turn
+LOOKS = 5  # at each way of stepping, in turn
 
 
 def rates(ways: dict[str, tuple[int, Callable[[], object]]]) -> dict[str, float]:
@@ -59,7 +59,7 @@ def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
 
 def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
     """Control steps a second, by way of stepping; KiB an environment. The same actions and the same thetas for all."""
-    steps = max(8, min(task.horizon, 40_000 // n))
+    steps = max(8, min(task.horizon, 20_000 // n))
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, *task.action_space.shape)).astype(np.float32)
     before = resident()
     ours = envs.make_vec(task.name, n)

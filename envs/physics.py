@@ -69,15 +69,18 @@ class ModelEdit:
     """
 
     def __init__(self, model: mujoco.MjModel, nominal: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self.model, self._nominal, self._data = model, nominal, data
+        self.model, self._nominal, self._data, self._stale = model, nominal, data, False
 
     def body_tilt(self, name: str, angle: float) -> None:
+        self._stale = True
         self.model.body(name).quat[:] = _tilt(angle)
 
     def body_shift(self, name: str, x: float) -> None:
+        self._stale = True
         self.model.body(name).pos[0] = x
 
     def body_mass(self, name: str, scale: float) -> None:
+        self._stale = True
         self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
         self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
 
@@ -94,8 +97,10 @@ class ModelEdit:
         self.model.tendon_frictionloss[self.model.tendon(name).id] = value
 
     def finish(self) -> None:
-        """Recompute what MuJoCo derives from the edited fields (subtree masses, invweight0, ...)."""
-        mujoco.mj_setConst(self.model, self._data)
+        """Recompute what MuJoCo derives from bodies' places and masses (subtree masses, invweight0, ...), if edited."""
+        if self._stale:
+            mujoco.mj_setConst(self.model, self._data)
+            self._stale = False
 
 
 class SpecEdit:
@@ -179,6 +184,7 @@ class Physics(Simulator):
             state=out,
             sensordata=np.empty((n, steps, models[0].nsensordata)),
             skip_checks=True,
+            chunk_size=max(1, n // (2 * max(threads, 1))),  # two for each thread: handing one over takes its time
         )
         return out
 
