@@ -258,13 +258,18 @@ def run_jobs(jobs: list[Job], label: str) -> None:
         return
     context = multiprocessing.get_context("spawn")
     workers = min(cores(), len(jobs))
-    os.environ["OMP_NUM_THREADS"] = "1"  # the networks are small: jobs side by side beat threads within one
     progress = Progress(sum(job.ticks for job in jobs), label)
     ticks = context.Queue()
     with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
-        heard = signal.signal(signal.SIGINT, signal.SIG_IGN)  # for workers, which are made now, to inherit
+        # For workers, which are made now, to inherit. The networks are small: jobs side by side beat threads within one.
+        heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
+        os.environ["OMP_NUM_THREADS"] = "1"
         futures = {pool.submit(job.run): job for job in jobs}
         signal.signal(signal.SIGINT, heard)
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
         try:
             waiting = set(futures)
             while waiting:
