@@ -261,7 +261,7 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     progress = Progress(sum(job.ticks for job in jobs), label)
     ticks = context.Queue()
     with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
-        # For workers, which are made now, to inherit. The networks are small: jobs side by side beat threads within one.
+        # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
         heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"
         futures = {pool.submit(job.run): job for job in jobs}
