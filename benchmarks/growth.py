@@ -74,6 +74,25 @@ def power(by: dict[int, float]) -> float:
     return float(np.polyfit(np.log(list(by)), np.log(list(by.values())), 1)[0])
 
 
+def picture(found: dict[str, dict[str, dict[int, float]]], file: Path) -> None:
+    """Cost over n, both on logarithmic scales."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    for axes, (what, curves) in zip(panels, found.items(), strict=True):
+        for name, by in curves.items():
+            axes.plot(list(by), list(by.values()), "o-", label=f"{name}: n^{power(by):.2f}")
+        axes.set(xscale="log", yscale="log", xlabel=what, ylabel="CPU seconds")
+        axes.set_xticks(list(by), list(by))
+        axes.set_xticks([], minor=True)
+        axes.legend(frameon=False)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -82,11 +101,6 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     check_folder(args.out)
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     found: dict[str, dict[str, dict[int, float]]] = {"steps of a trial": {}, "values of the grid": {}}
     for what, sizes, measure in (
         ("steps of a trial", STEPS, by_steps),
@@ -99,13 +113,7 @@ def main() -> None:
             costs = ", ".join(f"{n}: {1000 * seconds:,.0f}" for n, seconds in by.items())
             print(f"{name}, by {what}: ms {costs}; grows as n^{power(by):.2f}")
     write_json(args.out / "growth.json", found)
-    figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for axes, (what, curves) in zip(panels, found.items(), strict=True):
-        for name, by in curves.items():
-            axes.plot(list(by), list(by.values()), "o-", label=f"{name}: n^{power(by):.2f}")
-        axes.set(xscale="log", yscale="log", xlabel=what, ylabel="CPU seconds")
-        axes.legend(frameon=False)
-    figure.savefig(args.out / "growth.png", dpi=110)
+    picture(found, args.out / "growth.png")
     print(f"-> {args.out}")
 
 
