@@ -1,14 +1,14 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md (of the runs that
-`publish.py` kept) and the tables in README.
+`publish.py` kept) and the tables in README and docs/speed.md.
 """
 
 from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -116,10 +116,36 @@ def certificates() -> str:
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
 
+def costs() -> str:
+    """The table of docs/speed.md: CPU seconds a seed, before and now, of the tasks that were timed before."""
+    before = json.loads((DOCS / "speed" / "before.json").read_text())
+    shown = [(task.name, results["methods"]) for task, results in _published(DOCS) if task.name in before]
+    head, rows = ["method"], []
+    for name, _ in shown:
+        head += [f"{name}, before", "now"]
+    for method in METHODS:
+        cells: list[str] = []
+        for name, methods in shown:
+            was, now = before[name].get(method, {}).get("cpu_s"), methods.get(method, {}).get("cpu_s")
+            cells += ["" if seconds is None else f"{seconds:,.1f}" for seconds in (was, now)]
+        if any(cells):
+            rows.append((method, *cells))
+    return markdown_table(head, rows)
+
+
+def speed() -> str:
+    """docs/speed.md with its table."""
+    return _filled((DOCS / "speed.md").read_text(), costs)
+
+
 def readme() -> str:
-    """README with its tables, each between `<!-- name -->` and `<!-- /name -->`, as docs/ has them."""
-    text = README.read_text()
-    for table in (summary, certificates):
+    """README with its tables, as docs/ has them."""
+    return _filled(README.read_text(), summary, certificates)
+
+
+def _filled(text: str, *tables: Callable[[], str]) -> str:
+    """The text with each table between `<!-- name -->` and `<!-- /name -->`."""
+    for table in tables:
         marks = [f"<!-- {slash}{table.__name__} -->" for slash in ("", "/")]
         before, rest = text.split(marks[0])
         text = "\n".join([before + marks[0], table(), marks[1] + rest.split(marks[1])[1]])
@@ -204,6 +230,7 @@ def write() -> None:
     """Bring all of them up to date."""
     write_atomically(DOCS / "tasks.md", tasks_page())
     write_atomically(DOCS / "results.md", results_page())
+    write_atomically(DOCS / "speed.md", speed())
     write_atomically(README, readme())
 
 
