@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 import envs
-from benchmarks import catalogue, commands
+from benchmarks import commands
 from benchmarks.catalogue import METHODS, REFERENCES
-from envs.console import check_folder, run_command, write_json
+from envs.console import run_command, write_json
 from experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
@@ -62,21 +62,18 @@ def main() -> None:
     parser = commands.parser(__doc__, f"some of {', '.join(LEARNED)}; default: all", seeds=1)
     parser.add_argument("--task", required=True)
     args = parser.parse_args()
-    task, methods = envs.get(args.task), args.methods or LEARNED
-    catalogue.check(args.preset, methods, args.seeds, LEARNED)
+    task, methods = envs.get(args.task), commands.check(args, LEARNED, LEARNED)
     envs.check_task(task)
     policy.load(task)
     from benchmarks import score
     from benchmarks.jobs import BenchmarkJob
     from benchmarks.pool import prepare, run_all
-    from benchmarks.presets import preset
+    from benchmarks.presets import CONFIGS, preset
 
     folder, full = args.out or Path("results") / f"cost-{task.name}", preset(args.preset, task, args.device)
-    check_folder(folder)
-    parts = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")
     found: dict[str, Any] = {method: {} for method in methods}
     for share in SHARES:
-        settings = replace(full, **{part: scaled(getattr(full, part), share) for part in parts})
+        settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})
         own = folder / f"{share:g}"
         prepare(own, commands.about(task, args.preset, settings), args.resume)
         label = f"{task.name}, {share:g} of the updates"

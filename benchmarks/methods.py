@@ -72,7 +72,11 @@ class Context:
         self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
         self.folder = folder
         self.expert = policy.load(task)
-        self.env = envs.BatchEnv(task, preset.eval_trials * len(self.seeds))
+
+    @cached_property
+    def env(self) -> envs.BatchEnv:
+        """The environments that agents are scored in."""
+        return envs.BatchEnv(self.task, self.preset.eval_trials * len(self.seeds))
 
     def rows(self, i: int) -> slice:
         """Trials, of those that agents are scored in, of the i-th seed."""

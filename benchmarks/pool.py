@@ -195,9 +195,9 @@ def run_all(
         for job, missing in zip(every, left, strict=True)
         for part in groups(job.method, missing, device)
     ]
-    if shown := sorted({seed for job in parts if METHODS[job.method].imitates for seed in job.seeds}):
-        first = DemonstrationJob(task, preset, "demonstrations", (), folder)
-        run_jobs([job for seed in shown if not (job := replace(first, seeds=(seed,))).file(seed).exists()], label)
+    shown = sorted({seed for job in parts if METHODS[job.method].imitates for seed in job.seeds})
+    first: list[Job] = [DemonstrationJob(task, preset, "demonstrations", (seed,), folder) for seed in shown]
+    run_jobs([job for job in first if not job.file(job.seeds[0]).exists()], label)
     run_jobs(parts, label)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()

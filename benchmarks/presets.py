@@ -15,6 +15,8 @@ from deconf.deconfounded import DeconfoundedConfig
 from deconf.offline import OfflineConfig
 from deconf.recurrent import RecurrentConfig
 
+CONFIGS = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")  # of a preset's fields
+
 _ON_CONTROL = DeconfoundedConfig(
     inference_updates=500,
     inference_rate=2e-3,
@@ -137,5 +139,4 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
         amounts = _smoke(amounts)
     if name == "paper":
         amounts = _PAPER if amounts is _BANDIT else replace(amounts, seeds=10)
-    configs = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")
-    return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in configs})
+    return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in CONFIGS})

@@ -12,7 +12,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -165,7 +165,7 @@ def main() -> None:
     found: dict[str, dict[str, dict[str, float]]] = {}
     for task in tasks:
         assert isinstance(task, envs.MujocoTask)
-        found[task.name] = {str(n): {} for n in args.n}
+        found[task.name] = {}
         for n in args.n:
             row = found[task.name][str(n)] = measure(task, n)
             sync = f"{row['sync_vector_env']:9,.0f}" if "sync_vector_env" in row else ""
@@ -176,10 +176,7 @@ def main() -> None:
             )
             progress.update(1)
     progress.close()
-    try:
-        peer = against_envpool()
-    except PackageNotFoundError:
-        peer = None
+    peer = against_envpool()
     print("envpool is not installed" if peer is None else f"share of raw mj_step: {peer['share_of_mj_step']}")
     about = {"machine": f"{platform.machine()}, {cores()} threads", "python": platform.python_version()}
     versions = {name: version(name) for name in ("mujoco", "numpy", "gymnasium")}

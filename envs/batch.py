@@ -70,7 +70,7 @@ class BatchEnv:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
-        rows = np.arange(self.n) if where is None else np.flatnonzero(where)
+        rows = self._every if where is None else np.flatnonzero(where)
         theta_rng, start_rng, noise_rng = (
             Streams(streams) for streams in zip(*(self._streams[i] for i in rows.tolist()), strict=True)
         )

@@ -295,8 +295,8 @@ def test_offline_kl_is_of_the_posterior_from_the_prior(monkeypatch: pytest.Monke
     assert len(seen) == 2
 
 
-def fitted(config: DeconfoundedConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentModel, list[float]]:
-    """A model trained on next to nothing, and the beta of each of its updates."""
+def watch_betas(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Grows by the beta of each update of a model."""
     betas: list[float] = []
     learn = models.LatentModel.learn
 
@@ -305,6 +305,12 @@ def fitted(config: DeconfoundedConfig, monkeypatch: pytest.MonkeyPatch) -> tuple
         return learn(self, optimizer, batch, steps, beta, draws)
 
     monkeypatch.setattr(models.LatentModel, "learn", spy)
+    return betas
+
+
+def fitted(config: DeconfoundedConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentModel, list[float]]:
+    """A model trained on next to nothing, and the beta of each of its updates."""
+    betas = watch_betas(monkeypatch)
     context = Context(envs.get(CONTROL), replace(tiny_preset(), deconfounded=config), [0])
     agent = MAKERS["deconfounded"](context)["deconfounded"]
     assert isinstance(agent, DeconfoundedAgent)
@@ -321,14 +327,7 @@ def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_offline_beta_rises(monkeypatch: pytest.MonkeyPatch) -> None:
-    betas: list[float] = []
-    learn = models.LatentModel.learn
-
-    def spy(self: Any, optimizer: Any, batch: Any, steps: Any, beta: float, draws: Any) -> float:
-        betas.append(beta)
-        return learn(self, optimizer, batch, steps, beta, draws)
-
-    monkeypatch.setattr(models.LatentModel, "learn", spy)
+    betas = watch_betas(monkeypatch)
     config = OfflineConfig(offline_updates=1, online_updates=8, online_batch=4, synthetic=4, online_steps=64, beta=0.1)
     MAKERS["deconfounded_offline"](Context(envs.get(CONTROL), replace(tiny_preset(), offline=config), [0]))
     assert betas == pytest.approx([0, 0.025, 0.05, 0.075, 0.1, 0.1, 0.1, 0.1])
