@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import envs
+from deconfounded import envs
 
 
 @dataclass(frozen=True)

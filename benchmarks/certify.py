@@ -20,17 +20,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
-import envs
-from benchmarks.methods import DEMOS, stream
-from benchmarks.score import normalise
-from deconf import cloning
-from deconf.equations import belief_update
-from deconf.exact import ExactAgent, Grid
-from envs.console import Parser, Progress, check_folder, run_command, write_json
-from envs.task import Array
-from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
-from experts.policy import Expert
+from deconfounded import envs
+from deconfounded.benchmarks.methods import DEMOS, stream
+from deconfounded.benchmarks.score import normalise
+from deconfounded.deconf import cloning
+from deconfounded.deconf.equations import belief_update
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.envs.console import Parser, Progress, check_folder, run_command, write_json
+from deconfounded.envs.task import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.policy import Expert
 
 EPISODES = 5
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")

@@ -13,15 +13,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import envs
-from benchmarks import catalogue
-from benchmarks.catalogue import PRESETS
-from envs.console import Parser
-from experts import policy
+from deconfounded import envs
+from deconfounded.benchmarks import catalogue
+from deconfounded.benchmarks.catalogue import PRESETS
+from deconfounded.envs.console import Parser
+from deconfounded.experts import policy
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
-    from benchmarks.methods import Preset
-    from benchmarks.pool import Finished, Job
+    from deconfounded.benchmarks.methods import Preset
+    from deconfounded.benchmarks.pool import Finished, Job
 
 LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
@@ -76,7 +76,7 @@ def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
 
 def code(task: envs.Task) -> str:
     """SHA-256 of the source and the MJCF that a run's numbers depend on."""
-    root, digest = Path(__file__).parents[1], hashlib.sha256()
+    root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
     own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "score", "paper"))
     for file in (*sources, *own, envs.task.ASSETS / f"{task.name}.xml"):
@@ -88,8 +88,8 @@ def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
-    from benchmarks.pool import prepare, run_all, worked
-    from benchmarks.presets import preset
+    from deconfounded.benchmarks.pool import prepare, run_all, worked
+    from deconfounded.benchmarks.presets import preset
 
     settings = preset(args.preset, task, args.device)
     seeds = args.seeds or settings.seeds

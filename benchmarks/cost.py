@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-import envs
-from benchmarks import commands
-from benchmarks.catalogue import METHODS, REFERENCES
-from envs.console import run_command, write_json
-from experts import policy
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.catalogue import METHODS, REFERENCES
+from deconfounded.envs.console import run_command, write_json
+from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
-BEFORE = Path(__file__).parents[1] / "docs" / "speed" / "before.json"
+BEFORE = Path(__file__).resolve().parents[1] / "docs" / "speed" / "before.json"
 LEARNED = tuple(name for name, method in METHODS.items() if method.learned and name != "deconfounded_gru")
 
 
@@ -65,10 +65,10 @@ def main() -> None:
     task, methods = envs.get(args.task), commands.check(args, LEARNED, LEARNED)
     envs.check_task(task)
     policy.load(task)
-    from benchmarks import score
-    from benchmarks.jobs import BenchmarkJob
-    from benchmarks.pool import prepare, run_all
-    from benchmarks.presets import CONFIGS, preset
+    from deconfounded.benchmarks import score
+    from deconfounded.benchmarks.jobs import BenchmarkJob
+    from deconfounded.benchmarks.pool import prepare, run_all
+    from deconfounded.benchmarks.presets import CONFIGS, preset
 
     folder, full = args.out or Path("results") / f"cost-{task.name}", preset(args.preset, task, args.device)
     found: dict[str, Any] = {method: {} for method in methods}

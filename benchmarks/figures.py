@@ -12,14 +12,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import ListedColormap
 
-import envs
-from benchmarks.catalogue import EXACT
-from benchmarks.pool import Finished, by_method
-from benchmarks.report import COLOURS
-from deconf.exact import ExactAgent
-from envs.task import Array
-from experts import policy
-from experts.demos import Agent, ExpertAgent, run_trials
+from deconfounded import envs
+from deconfounded.benchmarks.catalogue import EXACT
+from deconfounded.benchmarks.pool import Finished, by_method
+from deconfounded.benchmarks.report import COLOURS
+from deconfounded.deconf.exact import ExactAgent
+from deconfounded.envs.task import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, run_trials
 
 WINDOW = 20  # steps of a smoothed curve, as in the paper
 COLOURS_OF_ARMS = ["#2ca02c", "#d62728", "#ff7f0e", "#9467bd", "#8c564b"]  # the first is the best arm

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-import envs
-from envs.console import Parser, check_folder, run_command, write_json
+from deconfounded import envs
+from deconfounded.envs.console import Parser, check_folder, run_command, write_json
 
 STEPS = (200, 400, 800, 1600, 3200)
 VALUES = (5, 11, 21, 41, 81)
@@ -33,12 +33,12 @@ def cpu(run: Callable[[], object], looks: int = 5) -> float:
 
 def by_steps(steps: int) -> dict[str, float]:
     """An update of the evidence belief, and a pass of the RNN, on 16 trials of so many steps of a cartpole's size."""
-    from deconf.agents import Monitor
-    from deconf.data import Batch, Draws, Signature
-    from deconf.models import VariationalModel
-    from deconf.nets import Adam, scalers
-    from deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
-    from experts.demos import Trials
+    from deconfounded.deconf.agents import Monitor
+    from deconfounded.deconf.data import Batch, Draws, Signature
+    from deconfounded.deconf.models import VariationalModel
+    from deconfounded.deconf.nets import Adam, scalers
+    from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+    from deconfounded.experts.demos import Trials
 
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((16, 1, steps + 1, 6), np.float32)
@@ -57,9 +57,9 @@ def by_steps(steps: int) -> dict[str, float]:
 
 def by_values(task: envs.Task, values: int) -> dict[str, float]:
     """Two episodes of 32 trials of each exact policy, with a grid of so many values."""
-    from deconf.exact import ExactAgent
-    from experts import policy
-    from experts.demos import run_trials
+    from deconfounded.deconf.exact import ExactAgent
+    from deconfounded.experts import policy
+    from deconfounded.experts.demos import run_trials
 
     env, expert = envs.BatchEnv(task, 32), policy.load(task)
     found = {}

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import envs
-from benchmarks import score
-from benchmarks.catalogue import METHODS
-from benchmarks.methods import EVALUATION, MAKERS, Context, stream
-from benchmarks.pool import Job, JobMonitor
-from envs.task import Array
-from experts.demos import Agent, run_trials
+from deconfounded import envs
+from deconfounded.benchmarks import score
+from deconfounded.benchmarks.catalogue import METHODS
+from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Context, stream
+from deconfounded.benchmarks.pool import Job, JobMonitor
+from deconfounded.envs.task import Array
+from deconfounded.experts.demos import Agent, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 

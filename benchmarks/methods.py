@@ -13,19 +13,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-import envs
-from deconf import cloning, dagger, deconfounded, naive_rnn, offline
-from deconf.agents import Monitor
-from deconf.cloning import CloningConfig
-from deconf.dagger import DaggerConfig
-from deconf.data import Source
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.exact import ExactAgent
-from deconf.offline import OfflineConfig
-from deconf.recurrent import RecurrentConfig
-from envs.streams import Array, Streams
-from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials
+from deconfounded import envs
+from deconfounded.deconf import cloning, dagger, deconfounded, naive_rnn, offline
+from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.dagger import DaggerConfig
+from deconfounded.deconf.data import Source
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials
 
 DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
 

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-import envs
-from benchmarks import score
-from benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
-from benchmarks.certify import THRESHOLDS
-from benchmarks.presets import preset
-from envs.console import Parser, run_command, write_atomically
+from deconfounded import envs
+from deconfounded.benchmarks import score
+from deconfounded.benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.certify import THRESHOLDS
+from deconfounded.benchmarks.presets import preset
+from deconfounded.envs.console import Parser, run_command, write_atomically
 
-README = Path(__file__).parents[1] / "README.md"
+README = Path(__file__).resolve().parents[1] / "README.md"
 DOCS = README.parent / "docs"
 TIERS = {
     None: "none: nobody can win",
@@ -203,7 +203,7 @@ def card(task: envs.Task) -> str:
         latents = [(*row, _moved(task, i)) for i, row in enumerate(latents)]
     parts = [f"## {task.name} (v{task.version})", inspect.getdoc(inspect.getmodule(type(task))) or ""]
     for cls in type(task).__mro__:
-        if issubclass(cls, envs.Task) and cls.__module__ not in ("envs.task", "envs.physics"):
+        if issubclass(cls, envs.Task) and cls.__module__ not in ("deconfounded.envs.task", "deconfounded.envs.physics"):
             parts.append(inspect.cleandoc(cls.__doc__ or ""))
     trial = "one episode" if task.episodes == 1 else f"{task.episodes} episodes"
     more = f", {task.control_dt:g} s each; the expert's action noise is {task.expert_noise:g}" if physics else ""

@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import envs
-from benchmarks import commands, score
-from benchmarks.figures import figure_2, figure_3
-from benchmarks.methods import EVALUATION, MAKERS, Context, stream
-from benchmarks.pool import Finished, Job, JobMonitor, by_method
-from deconf.data import Batch
-from deconf.deconfounded import DeconfoundedAgent
-from deconf.equations import posterior_policy
-from deconf.exact import ExactAgent
-from deconf.recurrent import RecurrentAgent
-from envs.console import run_command, write_atomically, write_json
-from envs.task import Array
-from experts import policy
-from experts.demos import Agent, ExpertAgent, run_trials
+from deconfounded import envs
+from deconfounded.benchmarks import commands, score
+from deconfounded.benchmarks.figures import figure_2, figure_3
+from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Context, stream
+from deconfounded.benchmarks.pool import Finished, Job, JobMonitor, by_method
+from deconfounded.deconf.data import Batch
+from deconfounded.deconf.deconfounded import DeconfoundedAgent
+from deconfounded.deconf.equations import posterior_policy
+from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.recurrent import RecurrentAgent
+from deconfounded.envs.console import run_command, write_atomically, write_json
+from deconfounded.envs.task import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, run_trials
 
 SHOWN = ("naive_rnn", "deconfounded")  # in Figure 3
 LEARNERS = (*SHOWN, "deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")

@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 import torch
 
-import envs
-from benchmarks.catalogue import METHODS
-from benchmarks.methods import Context, Preset
-from deconf.agents import Monitor, State
-from envs.console import Progress, check_folder, write_atomically, write_json
-from envs.physics import cores
-from experts.demos import Agent
+from deconfounded import envs
+from deconfounded.benchmarks.catalogue import METHODS
+from deconfounded.benchmarks.methods import Context, Preset
+from deconfounded.deconf.agents import Monitor, State
+from deconfounded.envs.console import Progress, check_folder, write_atomically, write_json
+from deconfounded.envs.physics import cores
+from deconfounded.experts.demos import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
 

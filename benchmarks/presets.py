@@ -7,13 +7,13 @@ from typing import Any
 
 from gymnasium import spaces
 
-import envs
-from benchmarks.methods import Preset
-from deconf.cloning import CloningConfig
-from deconf.dagger import DaggerConfig
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.offline import OfflineConfig
-from deconf.recurrent import RecurrentConfig
+from deconfounded import envs
+from deconfounded.benchmarks.methods import Preset
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.dagger import DaggerConfig
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
 
 CONFIGS = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")  # of a preset's fields
 

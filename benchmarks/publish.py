@@ -14,10 +14,10 @@ import imageio.v3 as imageio
 import numpy as np
 from PIL import Image
 
-import envs
-from benchmarks import pages
-from benchmarks.pages import DOCS
-from envs.console import Parser, run_command
+from deconfounded import envs
+from deconfounded.benchmarks import pages
+from deconfounded.benchmarks.pages import DOCS
+from deconfounded.envs.console import Parser, run_command
 
 
 def gif(video: Path, file: Path) -> None:

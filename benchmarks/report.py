@@ -17,11 +17,11 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-import envs
-from benchmarks import score
-from benchmarks.catalogue import EXACT, REFERENCES
-from benchmarks.jobs import CLIPPED
-from benchmarks.pool import Finished
+from deconfounded import envs
+from deconfounded.benchmarks import score
+from deconfounded.benchmarks.catalogue import EXACT, REFERENCES
+from deconfounded.benchmarks.jobs import CLIPPED
+from deconfounded.benchmarks.pool import Finished
 
 COLOURS = {
     "expert": "black",

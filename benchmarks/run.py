@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import envs
-from benchmarks import commands
-from benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
-from envs.console import run_command, write_atomically, write_json
-from experts import policy
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.envs.console import run_command, write_atomically, write_json
+from deconfounded.experts import policy
 
 
 def main() -> None:
@@ -36,8 +36,8 @@ def main() -> None:
     wanted = {*commands.check(args, list(METHODS), DEFAULT), *REFERENCES}
     envs.check_task(task)
     policy.load(task)
-    from benchmarks import report, score  # these take seconds; bad input is told at once
-    from benchmarks.jobs import BenchmarkJob
+    from deconfounded.benchmarks import report, score  # these take seconds; bad input is told at once
+    from deconfounded.benchmarks.jobs import BenchmarkJob
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, results = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-import envs
-from benchmarks.catalogue import REFERENCES
-from deconf.equations import imitation_objective
-from envs.task import Array
-from experts.demos import Trials
-from experts.policy import Expert
+from deconfounded import envs
+from deconfounded.benchmarks.catalogue import REFERENCES
+from deconfounded.deconf.equations import imitation_objective
+from deconfounded.envs.task import Array
+from deconfounded.experts.demos import Trials
+from deconfounded.experts.policy import Expert
 
 
 def normalise(returns: Array, random: float, expert: float) -> Array:

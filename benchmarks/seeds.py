@@ -13,13 +13,13 @@ from typing import Any
 
 import torch
 
-import envs
-from benchmarks import catalogue, commands
-from benchmarks.methods import MAKERS, Context, Preset
-from benchmarks.presets import preset
-from deconf.agents import Monitor
-from envs.console import Parser, run_command
-from experts.demos import Agent
+from deconfounded import envs
+from deconfounded.benchmarks import catalogue, commands
+from deconfounded.benchmarks.methods import MAKERS, Context, Preset
+from deconfounded.benchmarks.presets import preset
+from deconfounded.deconf.agents import Monitor
+from deconfounded.envs.console import Parser, run_command
+from deconfounded.experts.demos import Agent
 
 TIMED = ("naive_rnn", "deconfounded", "deconfounded_discrete")
 UPDATES = 12  # of each kind; the first ones warm up

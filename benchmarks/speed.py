@@ -20,9 +20,9 @@ import mujoco
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
-import envs
-from envs.console import Parser, Progress, check_folder, run_command, write_json
-from envs.physics import Physics, cores
+from deconfounded import envs
+from deconfounded.envs.console import Parser, Progress, check_folder, run_command, write_json
+from deconfounded.envs.physics import Physics, cores
 
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)
 SYNC = 64  # environments, at most, that SyncVectorEnv is timed with

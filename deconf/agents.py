@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.data import Batch, Draws
-from deconf.nets import ActionHead
-from envs.task import Array, InputError
-from experts.demos import Agent
+from deconfounded.deconf.data import Batch, Draws
+from deconfounded.deconf.nets import ActionHead
+from deconfounded.envs.task import Array, InputError
+from deconfounded.experts.demos import Agent
 
 State = dict[str, Any]
 """Tensors, numbers, strings, and lists and dictionaries of these."""

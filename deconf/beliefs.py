@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.data import Batch, Draws, Signature
-from deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
-from deconf.scan import GruScan
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
+from deconfounded.deconf.scan import GruScan
 
 
 class Belief(nn.Module, ABC):

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconf.agents import LearnedAgent, Monitor
-from deconf.data import Batch, Draws, Rngs, Signature, listed, take_steps
-from deconf.equations import imitation_loss
-from deconf.nets import ActionHead, Adam, Scaler
-from envs.task import Array
-from experts.demos import Trials
+from deconfounded.deconf.agents import LearnedAgent, Monitor
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.nets import ActionHead, Adam, Scaler
+from deconfounded.envs.task import Array
+from deconfounded.experts.demos import Trials
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.agents import Monitor
-from deconf.data import Batch, Draws, Rngs, Signature, listed, take
-from deconf.nets import Scaler
-from deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
-from envs.task import InputError
-from experts.demos import Agent, Trials
+from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.nets import Scaler
+from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+from deconfounded.envs.task import InputError
+from deconfounded.experts.demos import Agent, Trials
 
 Query = Callable[[Agent | None, Sequence[np.random.Generator]], tuple[Trials, NDArray[np.float32]]]
 """Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each generator.

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from envs.task import Array, InputError
-from experts.demos import Trials
+from deconfounded.envs.task import Array, InputError
+from deconfounded.experts.demos import Trials
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""

@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
-from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
-from deconf.equations import imitation_loss
-from deconf.models import BELIEFS, DiscreteModel, LatentModel, VariationalModel
-from deconf.nets import ActionHead, Adam, scalers
-from envs.task import InputError
-from experts.demos import Agent, Trials
+from deconfounded.deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.models import BELIEFS, DiscreteModel, LatentModel, VariationalModel
+from deconfounded.deconf.nets import ActionHead, Adam, scalers
+from deconfounded.envs.task import InputError
+from deconfounded.experts.demos import Agent, Trials
 
 Explore = Callable[[Agent | None, Sequence[np.random.Generator]], Trials]
 """Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each generator."""

@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from deconf.equations import belief_update
-from envs import BatchEnv, MujocoTask
-from envs.streams import Array, Streams
-from experts.demos import Agent
-from experts.policy import Expert, sample_rows
+from deconfounded.deconf.equations import belief_update
+from deconfounded.envs import BatchEnv, MujocoTask
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.experts.demos import Agent
+from deconfounded.experts.policy import Expert, sample_rows
 
 LEFT_OUT = 1e-4  # of the mass: a value that has less is not simulated
 AT_LEAST = 2

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.beliefs import Belief, EvidenceBelief, GruBelief
-from deconf.data import Batch, Draws, Signature, take
-from deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
-from deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
+from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief
+from deconfounded.deconf.data import Batch, Draws, Signature, take
+from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
+from deconfounded.deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 

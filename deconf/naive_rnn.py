@@ -7,10 +7,10 @@ paper's belief.
 
 from __future__ import annotations
 
-from deconf.agents import Checkpoint, Monitor
-from deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
-from deconf.nets import Scaler
-from deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.agents import Checkpoint, Monitor
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
+from deconfounded.deconf.nets import Scaler
+from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 
 
 def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.data import Batch, Draws, Signature
 
 SMALL = 16**3  # multiplications; torch gives oneDNN a product of more than that
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconf.agents import Monitor, ramp
-from deconf.data import Batch, Draws, Rngs, Signature, listed, take
-from deconf.deconfounded import DeconfoundedAgent, final_belief
-from deconf.equations import gaussian_kl, offline_loss
-from deconf.models import VariationalModel
-from deconf.nets import ActionHead, Adam, scalers
-from experts.demos import Trials
+from deconfounded.deconf.agents import Monitor, ramp
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.deconfounded import DeconfoundedAgent, final_belief
+from deconfounded.deconf.equations import gaussian_kl, offline_loss
+from deconfounded.deconf.models import VariationalModel
+from deconfounded.deconf.nets import ActionHead, Adam, scalers
+from deconfounded.experts.demos import Trials
 
 
 @dataclass(frozen=True)

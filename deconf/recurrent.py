@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconf.agents import LearnedAgent, Monitor
-from deconf.beliefs import GruMemory
-from deconf.data import Batch, Draws, Signature
-from deconf.equations import imitation_loss
-from deconf.nets import ActionHead, Adam, Scaler
+from deconfounded.deconf.agents import LearnedAgent, Monitor
+from deconfounded.deconf.beliefs import GruMemory
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.nets import ActionHead, Adam, Scaler
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from deconf.nets import affine
+from deconfounded.deconf.nets import affine
 
 tanh_backward = torch.ops.aten.tanh_backward.grad_input  # fused
 sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input

@@ -17,19 +17,19 @@ if _gl is not None:
 
 import gymnasium
 
-from envs.adapters import DmEnv, GymEnv, GymVectorEnv
-from envs.bandit import Bandit
-from envs.batch import BatchEnv
-from envs.check import check_task
-from envs.forked_path import ForkedPath
-from envs.heavy_payload import HeavyPayload
-from envs.hidden_goal import HiddenGoal
-from envs.icy_road import IcyRoad
-from envs.physics import MujocoTask
-from envs.slippery_cartpole import SlipperyCartpole
-from envs.slippery_walker import SlipperyWalker
-from envs.task import InputError, Latent, Task
-from envs.tilted_cartpole import TiltedCartpole
+from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
+from deconfounded.envs.bandit import Bandit
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.check import check_task
+from deconfounded.envs.forked_path import ForkedPath
+from deconfounded.envs.heavy_payload import HeavyPayload
+from deconfounded.envs.hidden_goal import HiddenGoal
+from deconfounded.envs.icy_road import IcyRoad
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.slippery_cartpole import SlipperyCartpole
+from deconfounded.envs.slippery_walker import SlipperyWalker
+from deconfounded.envs.task import InputError, Latent, Task
+from deconfounded.envs.tilted_cartpole import TiltedCartpole
 
 __all__ = [
     "BatchEnv",
@@ -104,7 +104,7 @@ def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmE
 for _task in (cls() for cls in TASKS.values()):
     gymnasium.register(
         _task.gym_id,
-        entry_point="envs:make",
-        vector_entry_point="envs:make_registered_vec",
+        entry_point="deconfounded.envs:make",
+        vector_entry_point="deconfounded.envs:make_registered_vec",
         kwargs={"name": _task.name},
     )

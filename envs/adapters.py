@@ -14,8 +14,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from envs.batch import BatchEnv
-from envs.task import InputError, Painter, Task
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.task import InputError, Painter, Task
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.streams import Streams
-from envs.task import Array, Latent, Painter, Task
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array, Latent, Painter, Task
 
 ARMS = 5
 

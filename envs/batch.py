@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.streams import Array, Streams
-from envs.task import InputError, Task
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import InputError, Task
 
 
 class BatchEnv:

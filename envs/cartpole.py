@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics import MujocoTask
-from envs.streams import Streams
-from envs.task import Array
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array
 
 FALLEN = 1.2  # rad
 

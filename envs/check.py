@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from envs.batch import BatchEnv
-from envs.physics import MujocoTask
-from envs.streams import Streams
-from envs.task import InputError, Task
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import InputError, Task
 
 
 @contextmanager

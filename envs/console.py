@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from envs.task import InputError
+from deconfounded.envs.task import InputError
 
 
 class Parser(argparse.ArgumentParser):

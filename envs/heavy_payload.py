@@ -17,9 +17,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from envs.physics import Edit, MujocoTask
-from envs.streams import Streams
-from envs.task import Array, Latent
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array, Latent
 
 SPEED = 3.0  # m/s
 LOST = 1.2  # m

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from envs.physics import Edit
-from envs.puck import Puck
-from envs.task import Array, Latent
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.puck import Puck
+from deconfounded.envs.task import Array, Latent
 
 
 class HiddenGoal(Puck):

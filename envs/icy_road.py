@@ -22,10 +22,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs import render
-from envs.physics import Edit, MujocoTask
-from envs.streams import Streams
-from envs.task import Array, Latent
+from deconfounded.envs import render
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array, Latent
 
 AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
 STEERING, TORQUE = 0.5, 0.03  # rad; N m

@@ -14,9 +14,9 @@ from gymnasium import spaces
 from mujoco import rollout
 from numpy.typing import ArrayLike, NDArray
 
-from envs import render
-from envs.streams import Streams
-from envs.task import ASSETS, Array, InputError, Painter, Simulator, Task
+from deconfounded.envs import render
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import ASSETS, Array, InputError, Painter, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 

@@ -7,9 +7,9 @@ from abc import abstractmethod
 import numpy as np
 from gymnasium import spaces
 
-from envs.physics import MujocoTask
-from envs.streams import Streams
-from envs.task import Array
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array
 
 
 class Puck(MujocoTask):

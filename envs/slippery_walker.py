@@ -25,10 +25,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs import render
-from envs.physics import Edit, MujocoTask
-from envs.streams import Streams
-from envs.task import Array, Latent
+from deconfounded.envs import render
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import Array, Latent
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s

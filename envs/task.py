@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Streams
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 

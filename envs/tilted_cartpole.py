@@ -9,9 +9,9 @@ Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward:
 
 from __future__ import annotations
 
-from envs.cartpole import Cartpole
-from envs.physics import Edit
-from envs.task import Array, Latent
+from deconfounded.envs.cartpole import Cartpole
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent
 
 
 class TiltedCartpole(Cartpole):

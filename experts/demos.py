@@ -13,9 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs import BatchEnv, InputError
-from envs.streams import Array, Streams
-from experts.policy import Expert
+from deconfounded.envs import BatchEnv, InputError
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.experts.policy import Expert
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
-from envs import InputError, Task
-from envs.task import ASSETS, Array
+from deconfounded.envs import InputError, Task
+from deconfounded.envs.task import ASSETS, Array
 
 
 class Random(Protocol):
@@ -99,7 +99,7 @@ def load(task: Task, file: Path | None = None) -> Expert:
     if isinstance(task.action_space, spaces.Discrete):
         return DiscreteExpert(task)
     file = file or path(task)
-    remedy = f"run `python -m experts.train --task {task.name}`"
+    remedy = f"run `deconf train --task {task.name}`"
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:

@@ -10,9 +10,9 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-import envs
-from envs.console import Progress
-from experts.sb3 import Sb3VecEnv
+from deconfounded import envs
+from deconfounded.envs.console import Progress
+from deconfounded.experts.sb3 import Sb3VecEnv
 
 PPO_SETTINGS: dict[str, Any] = {
     "n_steps": 128,

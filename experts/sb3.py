@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-import envs
+from deconfounded import envs
 
 
 class Sb3VecEnv(VecEnv):

@@ -1,4 +1,4 @@
-"""Train a task's expert with PPO on the view that sees theta: `python -m experts.train --task slippery_cartpole`."""
+"""Train a task's expert with PPO on the view that sees theta: `deconf train --task slippery_cartpole`."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-import envs
-from envs.console import Parser, check_folder, run_command, write_json
-from experts import policy
-from experts.demos import ExpertAgent, RandomAgent, run_trials
+from deconfounded import envs
+from deconfounded.envs.console import Parser, check_folder, run_command, write_json
+from deconfounded.experts import policy
+from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
 
 
 def main() -> None:
@@ -35,7 +35,7 @@ def main() -> None:
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
     envs.check_task(task)
     check_folder(file.parent)
-    from experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
+    from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
 
     start = time.time()
     weights = train(task, args.steps, args.seed)
@@ -48,7 +48,7 @@ def main() -> None:
     card = {
         "task": task.name,
         "task_version": task.version,
-        "command": f"python -m experts.train --task {task.name} --steps {args.steps} --seed {args.seed}",
+        "command": f"deconf train --task {task.name} --steps {args.steps} --seed {args.seed}",
         "algorithm": "PPO (stable-baselines3), privileged view, 64 environments, tanh networks of 64 x 64",
         "settings": PPO_SETTINGS,
         "return_mean": round(float(returns.mean()), 2),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import envs
-from deconf.equations import belief_update
-from deconf.exact import ExactAgent, Grid
-from experts import policy
-from experts.demos import ExpertAgent, run_trials
+from deconfounded import envs
+from deconfounded.deconf.equations import belief_update
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.experts import policy
+from deconfounded.experts.demos import ExpertAgent, run_trials
 
 N = 20_000
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import envs
-from benchmarks import certify, run
-from envs.physics import Edit
-from envs.slippery_cartpole import SlipperyCartpole
-from envs.task import Array
-from experts import train
+from deconfounded import envs
+from deconfounded.benchmarks import certify, run
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.slippery_cartpole import SlipperyCartpole
+from deconfounded.envs.task import Array
+from deconfounded.experts import train
 
 
 class MissingFile(SlipperyCartpole):
@@ -73,7 +73,7 @@ def test_slips_are_named(task: type[envs.Task], says: str) -> None:
 
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "nowhere.xml").write_text("<mujoco><worldbody></mujoco>")
-    monkeypatch.setattr("envs.physics.ASSETS", tmp_path)
+    monkeypatch.setattr("deconfounded.envs.physics.ASSETS", tmp_path)
     with pytest.raises(envs.InputError, match=r"^the model \(assets/nowhere\.xml, .*\) of nowhere: XML") as caught:
         envs.check_task(MissingFile())
     assert "\n" not in str(caught.value)

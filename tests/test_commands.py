@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import envs
-import envs.physics
-from benchmarks import certify, pages, pool, publish, score
-from envs.cartpole import Cartpole
-from envs.console import run_command
-from envs.task import Array
-from experts.policy import Expert
+from deconfounded import envs
+from deconfounded.benchmarks import certify, pages, pool, publish, score
+from deconfounded.envs.cartpole import Cartpole
+from deconfounded.envs.console import run_command
+from deconfounded.envs.task import Array
+from deconfounded.experts.policy import Expert
 from tests.test_contract import assert_set_in_place_equals_recompiled
 
 ROOT = Path(__file__).parents[1]
@@ -50,14 +49,14 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
-        (("-m", "experts.train", "--task", "bandit"), "nothing to train"),
+        (("-m", "deconfounded.experts.train", "--task", "bandit"), "nothing to train"),
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
     ],
 )
 def test_bad_input_is_one_line(
     args: tuple[str, ...], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = args[1] if args[0] == "-m" else args[0].removesuffix(".py").replace("/", ".")
+    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
     monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
     with pytest.raises(SystemExit) as ended:
         run_command(importlib.import_module(name).main)
@@ -73,7 +72,7 @@ def test_bad_input_from_the_shell() -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("error: task 'slipery_cartpole' is unknown; did you mean 'slippery_cartpole'?")
     assert len(done.stderr.strip().splitlines()) == 1
-    code = "import sys; sys.argv = ['run.py', '--list']; from benchmarks import run; run.main(); print(*sys.modules)"
+    code = "import sys; sys.argv = ['run.py', '--list']; from deconfounded.benchmarks import run; run.main(); print(*sys.modules)"
     loaded = command("-c", code).stdout.splitlines()[-1].split()
     assert "mujoco" in loaded
     assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
@@ -125,7 +124,7 @@ def test_time_worked_counts_overlaps_once() -> None:
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
 def test_no_gl_is_only_a_note(backend: str) -> None:
     """Without a GL, pictures raise InputError, which run.py turns into a note."""
-    code = "import envs; e = envs.make('slippery_cartpole', render_mode='rgb_array'); e.reset(seed=0); e.render()"
+    code = "from deconfounded import envs; e = envs.make('slippery_cartpole', render_mode='rgb_array'); e.reset(seed=0); e.render()"
     done = command("-c", code, MUJOCO_GL=backend)
     assert "InputError: no GL for pictures" in done.stderr
 

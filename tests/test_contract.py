@@ -14,10 +14,10 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import envs
-from envs.physics import ModelEdit, SpecEdit
-from envs.render import level
-from experts import policy
+from deconfounded import envs
+from deconfounded.envs.physics import ModelEdit, SpecEdit
+from deconfounded.envs.render import level
+from deconfounded.experts import policy
 from tests.tools import actions, far_thetas, gl_works, streams
 
 TASKS = envs.names()

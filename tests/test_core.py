@@ -13,14 +13,14 @@ import torch
 from safetensors.numpy import save_file
 from torch import Tensor
 
-import envs
-from benchmarks import score
-from benchmarks.methods import MAKERS, Context
-from deconf import cloning, deconfounded, naive_rnn, offline
-from deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
-from deconf.data import Batch, Draws, Signature
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.equations import (
+from deconfounded import envs
+from deconfounded.benchmarks import score
+from deconfounded.benchmarks.methods import MAKERS, Context
+from deconfounded.deconf import cloning, deconfounded, naive_rnn, offline
+from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.equations import (
     belief_update,
     gaussian_kl,
     imitation_loss,
@@ -31,14 +31,14 @@ from deconf.equations import (
     posterior_policy,
     reparametrise,
 )
-from deconf.exact import LEFT_OUT, ExactAgent, Grid
-from deconf.models import DiscreteModel, VariationalModel
-from deconf.nets import ActionHead, Embedding, Scaler, scalers
-from deconf.offline import OfflineConfig
-from deconf.recurrent import RecurrentConfig
-from envs.streams import Array
-from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
+from deconfounded.deconf.models import DiscreteModel, VariationalModel
+from deconfounded.deconf.nets import ActionHead, Embedding, Scaler, scalers
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.envs.streams import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
 

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import envs
-from benchmarks import figures, paper, pool
-from benchmarks.jobs import BenchmarkJob, CurveMonitor
-from benchmarks.paper import FigureJob
-from benchmarks.presets import preset
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.recurrent import RecurrentConfig
-from experts.demos import Agent
+from deconfounded import envs
+from deconfounded.benchmarks import figures, paper, pool
+from deconfounded.benchmarks.jobs import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.paper import FigureJob
+from deconfounded.benchmarks.presets import preset
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.experts.demos import Agent
 
 
 def settings(name: str, fresh: bool) -> Any:

@@ -11,22 +11,22 @@ import pytest
 import torch
 from torch.distributions import Normal, kl_divergence
 
-import envs
-from benchmarks.jobs import evaluate
-from benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Context, stream
-from deconf import dagger, deconfounded, models, naive_rnn, offline
-from deconf.agents import LearnedAgent
-from deconf.cloning import CloningConfig
-from deconf.data import Batch, Draws, Signature
-from deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig
-from deconf.models import DiscreteModel, LatentModel, VariationalModel
-from deconf.nets import ActionHead, scalers
-from deconf.offline import OfflineConfig
-from envs.streams import Array
-from experts import policy
-from experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
-from experts.policy import NetworkExpert
-from experts.sb3 import Sb3VecEnv
+from deconfounded import envs
+from deconfounded.benchmarks.jobs import evaluate
+from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Context, stream
+from deconfounded.deconf import dagger, deconfounded, models, naive_rnn, offline
+from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig
+from deconfounded.deconf.models import DiscreteModel, LatentModel, VariationalModel
+from deconfounded.deconf.nets import ActionHead, scalers
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.envs.streams import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.policy import NetworkExpert
+from deconfounded.experts.sb3 import Sb3VecEnv
 from tests.tools import actions, streams, tiny_preset
 
 TASKS = envs.names()
@@ -343,7 +343,7 @@ def test_prior_is_fitted_if_asked_for(fit_prior: bool, monkeypatch: pytest.Monke
 
 def test_gru_scan_has_the_gradient_of_autograd() -> None:
     """Double precision, two seeds, with steps that did not take place."""
-    from deconf.scan import GruScan
+    from deconfounded.deconf.scan import GruScan
 
     draw = Draws([np.random.default_rng(i) for i in range(2)], "cpu").normal
     shapes: Sequence[tuple[int, ...]] = ((3, 5, 12), (3, 4), (4, 12), (1, 12))

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-import envs
-from benchmarks.methods import MAKERS, Context
-from benchmarks.presets import preset
-from benchmarks.score import normalise
-from deconf import cloning
-from deconf.cloning import CloningConfig
-from deconf.dagger import DaggerConfig
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.exact import ExactAgent, Grid
-from envs.task import Array
-from experts import policy
-from experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded import envs
+from deconfounded.benchmarks.methods import MAKERS, Context
+from deconfounded.benchmarks.presets import preset
+from deconfounded.benchmarks.score import normalise
+from deconfounded.deconf import cloning
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.dagger import DaggerConfig
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.envs.task import Array
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
 
 N, EPISODES = 48, 3
 

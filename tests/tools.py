@@ -7,15 +7,15 @@ from itertools import product
 import numpy as np
 from gymnasium import spaces
 
-import envs
-from benchmarks.methods import Preset
-from deconf.cloning import CloningConfig
-from deconf.dagger import DaggerConfig
-from deconf.deconfounded import DeconfoundedConfig
-from deconf.offline import OfflineConfig
-from deconf.recurrent import RecurrentConfig
-from envs import render
-from envs.streams import Array, Streams
+from deconfounded import envs
+from deconfounded.benchmarks.methods import Preset
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.dagger import DaggerConfig
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.envs import render
+from deconfounded.envs.streams import Array, Streams
 
 
 def actions(task: envs.Task, n: int, steps: int) -> Array:

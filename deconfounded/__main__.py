@@ -1,0 +1,51 @@
+"""One command for all: `deconf run --task slippery_cartpole` is `python benchmarks/run.py --task slippery_cartpole`.
+
+Each name below is a file with a command line of its own; `deconf NAME --help` shows it.
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+
+COMMANDS = {
+    "run": ("benchmarks.run", "train, deploy and score methods on a task"),
+    "train": ("experts.train", "train a task's expert (PPO)"),
+    "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
+    "publish": ("benchmarks.publish", "keep a finished run in docs/"),
+    "pages": ("benchmarks.pages", "write the pages of docs/ anew"),
+    "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),
+    "speed": ("benchmarks.speed", "how fast environments step"),
+    "growth": ("benchmarks.growth", "how cost grows"),
+    "seeds": ("benchmarks.seeds", "what seeds cost side by side"),
+    "cost": ("benchmarks.cost", "score against CPU seconds"),
+}
+
+
+def main() -> None:
+    """Run the command that is named first, with the arguments that follow it."""
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name in ("-h", "--help"):
+        print("usage: deconf COMMAND ...\n")
+        for known, (_, text) in COMMANDS.items():
+            print(f"  {known:10} {text}")
+        return
+    if name not in COMMANDS:
+        print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)
+        sys.exit(2)
+    sys.argv = [f"deconf {name}", *sys.argv[2:]]
+    try:
+        runpy.run_module(f"deconfounded.{COMMANDS[name][0]}", run_name="__main__", alter_sys=True)
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("deconfounded"):
+            raise
+        extra = "train" if name == "train" else "bench"
+        print(
+            f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()
