@@ -72,7 +72,10 @@ def test_bad_input_from_the_shell() -> None:
     assert done.returncode == 2
     assert done.stderr.startswith("error: task 'slipery_cartpole' is unknown; did you mean 'slippery_cartpole'?")
     assert len(done.stderr.strip().splitlines()) == 1
-    code = "import sys; sys.argv = ['run.py', '--list']; from deconfounded.benchmarks import run; run.main(); print(*sys.modules)"
+    code = (
+        "import sys; from deconfounded.benchmarks import run;"
+        " sys.argv = ['run.py', '--list']; run.main(); print(*sys.modules)"
+    )
     loaded = command("-c", code).stdout.splitlines()[-1].split()
     assert "mujoco" in loaded
     assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
@@ -124,7 +127,8 @@ def test_time_worked_counts_overlaps_once() -> None:
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
 def test_no_gl_is_only_a_note(backend: str) -> None:
     """Without a GL, pictures raise InputError, which run.py turns into a note."""
-    code = "from deconfounded import envs; e = envs.make('slippery_cartpole', render_mode='rgb_array'); e.reset(seed=0); e.render()"
+    made = "envs.make('slippery_cartpole', render_mode='rgb_array')"
+    code = f"from deconfounded import envs; e = {made}; e.reset(seed=0); e.render()"
     done = command("-c", code, MUJOCO_GL=backend)
     assert "InputError: no GL for pictures" in done.stderr
 
