@@ -2,38 +2,77 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from deconfounded import envs
+from deconfounded.envs import outside
 
 
 @dataclass(frozen=True)
 class Method:
-    """cost: about, where blind BC is 1, for the ETA alone. default: whether it runs if nobody asks for it."""
+    """uses: what it is handed (`deconf.given.USES`); references are handed the environment.
 
+    cost: about, where blind BC is 1, for the ETA alone. default: whether it runs if nobody asks for it. reference:
+    where a method from outside is.
+    """
+
+    uses: tuple[str, ...] = ("demonstrations",)
     cost: int = 1
     default: bool = True
-    learned: bool = True
-    imitates: bool = True  # the demonstrations
     exact: bool = False
+    reference: str = ""
+
+    @property
+    def learned(self) -> bool:
+        """Whether it is trained, on data."""
+        return bool(self.uses) and "environment" not in self.uses
+
+    @property
+    def tier(self) -> str:
+        """Of the paper: 1, demonstrations; 2, exploration too; 3, queries of the expert. Or what else it sees."""
+        if not self.learned:
+            return "sees theta" if self.uses and not self.exact else "reference"
+        if "theta" in self.uses:
+            return "sees theta"
+        return "3" if "queries" in self.uses else "2" if "exploration" in self.uses else "1"
 
 
+_EXPLORES = ("demonstrations", "exploration")
 METHODS = {
-    "deconfounded": Method(4),
-    "deconfounded_gru": Method(14, default=False),
-    "deconfounded_discrete": Method(7, default=False),
-    "deconfounded_offline": Method(7, default=False),
-    "dagger": Method(4, default=False, imitates=False),
-    "naive_rnn": Method(2),
-    "oracle_bc": Method(),
+    "deconfounded": Method(_EXPLORES, 4),
+    "deconfounded_gru": Method(_EXPLORES, 14, default=False),
+    "deconfounded_discrete": Method(_EXPLORES, 7, default=False),
+    "deconfounded_offline": Method(cost=7, default=False),
+    "dagger": Method(("queries",), 4, default=False),
+    "naive_rnn": Method(cost=2),
+    "oracle_bc": Method(("demonstrations", "theta")),
     "blind_bc": Method(),
-    "conditional": Method(learned=False, imitates=False, exact=True),
-    "interventional": Method(learned=False, imitates=False, exact=True),
-    "expert": Method(learned=False, imitates=False),
-    "random": Method(learned=False, imitates=False),
+    "conditional": Method(("environment",), exact=True),
+    "interventional": Method(("environment",), exact=True),
+    "expert": Method(("environment",)),
+    "random": Method(()),
 }
 """Longest first, so that the last ones to run are short. A method may score several ways of deploying one agent."""
+
+
+def add(reference: str) -> str:
+    """Make a method from outside (path/file.py:fit) known, for this process; returns the name that its files get.
+
+    That is the file's, and the function's unless it is `fit`. Raises InputError if it cannot be run.
+    """
+    fit = outside.find("method", reference)
+    if not callable(fit) or not isinstance(getattr(fit, "uses", None), tuple):
+        raise envs.InputError(f"method {reference!r} must be a function declared with @uses(...) of what it may use")
+    where, _, function = reference.rpartition(":")
+    stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
+    name = re.sub(r"\W", "_", stem if function == "fit" else f"{stem}_{function}")
+    made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference))
+    if METHODS.setdefault(name, made) != made:
+        raise envs.InputError(f"method {reference!r} would be called {name}, which there is already; rename its file")
+    return name
+
 
 DEFAULT = tuple(name for name, method in METHODS.items() if method.default)  # the paper's comparison
 EXACT = tuple(name for name, method in METHODS.items() if method.exact)

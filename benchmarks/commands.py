@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks import catalogue
-from deconfounded.benchmarks.catalogue import PRESETS
+from deconfounded.benchmarks.catalogue import METHODS, PRESETS
+from deconfounded.envs import outside
 from deconfounded.envs.console import Parser
 from deconfounded.experts import policy
 
@@ -34,6 +35,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
         "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
     )
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
+    made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     made.add_argument("--out", type=Path, help="output folder; default: a folder under results/")
@@ -44,6 +46,8 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
 def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]) -> list[str]:
     """The methods asked for. Raises InputError for anything that cannot be run."""
     methods = list(known) if args.methods == ["all"] else args.methods or list(default)
+    methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
+    known = [*known, *(name for name, method in METHODS.items() if method.reference)]
     catalogue.check(args.preset, methods, args.seeds, known)
     check_device(args.device)
     return list(dict.fromkeys(methods))
@@ -61,7 +65,7 @@ def check_device(device: str) -> None:
         raise envs.InputError(f"--device {device} cannot be used here; cpu always can") from None
 
 
-def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
+def about(task: envs.Task, name: str, settings: Preset, expert: str | None = None, salt: str = "") -> dict[str, Any]:
     """What a run must agree in for its jobs to be kept."""
     return {
         "task": task.name,
@@ -69,18 +73,21 @@ def about(task: envs.Task, name: str, settings: Preset) -> dict[str, Any]:
         "preset": name,
         "settings": asdict(settings),
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-        "expert": policy.fingerprint(task),
+        "expert": policy.fingerprint(task, expert),
+        "salt": salt,
         "code": code(task),
     }
 
 
 def code(task: envs.Task) -> str:
-    """SHA-256 of the source and the MJCF that a run's numbers depend on."""
+    """SHA-256 of the source and the MJCF that a run's numbers depend on, those of a task or method from outside too."""
     root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
     own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "score", "paper"))
-    for file in (*sources, *own, envs.task.ASSETS / f"{task.name}.xml"):
-        digest.update(file.read_bytes() if file.exists() else b"")
+    named = [task.reference, *(method.reference for method in METHODS.values())]
+    files = (outside.source(outside.find("code", name)) for name in named if outside.is_outside(name))
+    for file in (*sources, *own, task.home / f"{task.name}.xml", *files):
+        digest.update(file.read_bytes() if file and file.exists() else b"")
     return digest.hexdigest()
 
 
@@ -89,18 +96,27 @@ def run(
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
     from deconfounded.benchmarks.pool import prepare, run_all, worked
-    from deconfounded.benchmarks.presets import preset
+    from deconfounded.benchmarks.presets import changed, preset
 
-    settings = preset(args.preset, task, args.device)
+    settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
-    described = about(task, args.preset, settings)
+    expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
+    described = about(task, args.preset, settings, expert, salt)
     prepare(folder, described, args.resume)
     start, label = time.time(), f"{task.name}, {args.preset}"
-    finished, resumed = run_all(kind, task.name, settings, methods, seeds, args.device, folder / "jobs", label)
+    jobs = [
+        kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest)
+        for method in methods
+        for guest in [METHODS[method] if METHODS[method].reference else None]
+    ]
+    finished, resumed = run_all(jobs, args.device, label)
     return finished, {
         "task": task.name,
         "task_version": task.version,
         "preset": args.preset,
+        **({"set": args.set} if args.set else {}),
+        **({"expert": expert} if expert else {}),
+        **({"salt": salt} if salt else {}),
         "seeds": list(range(seeds)),
         "eval_trials": settings.eval_trials,
         "versions": described["versions"],

@@ -78,7 +78,8 @@ def main() -> None:
         prepare(own, commands.about(task, args.preset, settings), args.resume)
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]
-        finished, _ = run_all(BenchmarkJob, task.name, settings, wanted, args.seeds, args.device, own / "jobs", label)
+        jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
+        finished, _ = run_all(jobs, args.device, label)
         results = score.summarise(finished, task.episodes)
         zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
         for method in methods:

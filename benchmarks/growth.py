@@ -47,7 +47,7 @@ def by_steps(steps: int) -> dict[str, float]:
     data, draws, signature = Batch.of(trials, 1), Draws([rng], "cpu"), Signature.of(trials)
     scaled = scalers(data)
     model, config = VariationalModel("evidence", 4, 64, signature, *scaled, draws), RecurrentConfig()
-    optimizer, agent = Adam([model], 1e-3), RecurrentAgent.new(config, signature, scaled[0], draws)
+    optimizer, agent = Adam([model], 1e-3), RecurrentAgent.new(config.width, signature, scaled[0], draws)
     cloner = Cloner(agent, config, steps, Monitor())
     return {
         "an update of the belief": cpu(lambda: model.learn(optimizer, data, 1024, 1e-3, draws)),

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import score
-from deconfounded.benchmarks.catalogue import METHODS
-from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Context, stream
+from deconfounded.benchmarks.guest import Guest
+from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Allowed, Context, stream
 from deconfounded.benchmarks.pool import Job, JobMonitor
+from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs.task import Array
+from deconfounded.experts import saved
 from deconfounded.experts.demos import Agent, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
@@ -77,11 +81,17 @@ class BenchmarkJob(Job):
 
     def run(self) -> str:
         monitor = CurveMonitor(self, 0.8)
-        context = Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder)
-        agents = MAKERS[self.method](context)
-        trained = monitor.worked()
-        found = {name: evaluate(context, agent, METHODS[self.method].learned) for name, agent in agents.items()}
-        meta = {"agents": list(agents), "curve": monitor.kept}
+        context = self.context(monitor)
+        with contextlib.ExitStack() as guests:
+            if self.guest is None:
+                agents = MAKERS[self.method](Allowed(context, self.about.uses))
+            else:
+                guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
+                agents = {self.method: guests.enter_context(contextlib.closing(guest))}
+            trained = monitor.worked()
+            found = {name: evaluate(context, agent, self.about.learned, self.salt) for name, agent in agents.items()}
+            notes = [self._keep(name, agent) for name, agent in agents.items()]
+        meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
         for i, seed in enumerate(self.seeds):
             rows = context.rows(i)
             arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
@@ -91,16 +101,36 @@ class BenchmarkJob(Job):
                 if seed == 0 and name in CLIPPED:
                     arrays.update({f"{name}/{key}": value for key, value in clip.items()})
             self.save(seed, arrays, monitor, meta)
-        return f"trained in {trained:.0f} s, all in {monitor.close():.0f} s"
+        return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
+
+    def _keep(self, name: str, agent: Agent) -> str:
+        """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
+        told = ""
+        for i, seed in enumerate(self.seeds):
+            folder = self.folder.parent / "agents" / f"{name}-{seed}"
+            about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
+            if isinstance(agent, Guest):
+                told = agent.keep(folder, about)
+            elif isinstance(agent, LearnedAgent):
+                saved.save(agent.of_seed(i), folder, **about)
+        return told
 
 
-def evaluate(context: Context, agent: Agent, learned: bool) -> tuple[dict[str, Array], Array, dict[str, Array]]:
+def spaces(task: envs.Task) -> dict[str, int]:
+    """What an agent must fit: O, A, and the number of discrete actions or 0."""
+    discrete = int(task.action_space.n) if isinstance(task.action_space, Discrete) else 0
+    return {"observations": len(task.observation), "action": int(np.prod(task.action_space.shape)), "actions": discrete}
+
+
+def evaluate(
+    context: Context, agent: Agent, learned: bool, salt: str = ""
+) -> tuple[dict[str, Array], Array, dict[str, Array]]:
     """Deploy in all seeds' trials: returns and Eq. (1) [N, E], probes [S, E or 0], and a clip of the first seed."""
     task, seeds = context.task, context.seeds
     # Learned agents go on for twice the episodes they were trained on.
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
     recorder = Recorder(agent, context.env)
-    trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed) for seed in seeds])
+    trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed, salt) for seed in seeds])
     recorder.note()
     objective = score.objective(context.expert, trials, context.env.theta)
     features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +31,9 @@ from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, 
 DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
 
 
-def stream(purpose: int, seed: int) -> int:
-    """A seed for one purpose of one run, far from all others."""
-    return int(np.random.SeedSequence([purpose, seed]).generate_state(1)[0] >> 1)
+def stream(purpose: int, seed: int, salt: str = "") -> int:
+    """A seed for one purpose of one run, far from all others; with a salt, one that nobody can have looked at."""
+    return int(np.random.SeedSequence([purpose, seed, *salt.encode()]).generate_state(1)[0] >> 1)
 
 
 @dataclass(frozen=True)
@@ -67,11 +68,12 @@ class Context:
         seeds: Sequence[int],
         monitor: Monitor | None = None,
         folder: Path | None = None,
+        expert: str | None = None,
     ) -> None:
-        """folder: where each seed's demonstrations are kept, for all methods; None: nowhere."""
+        """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load."""
         self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
         self.folder = folder
-        self.expert = policy.load(task)
+        self.expert = policy.load(task, expert)
 
     @cached_property
     def env(self) -> envs.BatchEnv:
@@ -136,13 +138,15 @@ class Context:
         behaviour = agent or RandomAgent(self.task.action_space)
         return run_trials(env, behaviour, self.task.episodes, seeds)[0], env
 
-    def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
+    def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None) -> Trials:
         """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
-        return self._roll_out(self.preset.explore_trials, agent, rngs)[0]
+        return self._roll_out(n or self.preset.explore_trials, agent, rngs)[0]
 
-    def query(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, NDArray[np.float32]]:
+    def query(
+        self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None
+    ) -> tuple[Trials, NDArray[np.float32]]:
         """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
-        trials, env = self._roll_out(self.preset.query_trials, agent, rngs)
+        trials, env = self._roll_out(n or self.preset.query_trials, agent, rngs)
         self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
@@ -151,32 +155,53 @@ class Context:
         return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
 
 
+class Allowed:
+    """A context of which a method gets what it declares that it uses."""
+
+    FREE = ("preset", "rngs", "monitor", "seeds", "task")
+    OPENS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "demonstrations": ("demonstrations", "source"),
+        "exploration": ("explore",),
+        "queries": ("query",),
+        "theta": ("demonstrated_theta", "env"),
+        "environment": ("env", "expert"),
+    }
+
+    def __init__(self, context: Context, uses: Sequence[str]) -> None:
+        self._context, self._open = context, {*self.FREE, *(name for use in uses for name in self.OPENS[use])}
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._open:
+            raise AttributeError(f"a method asked for {name}, and does not declare that it uses it")
+        return getattr(self._context, name)
+
+
 def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent]:
     once = deconfounded.DeconfoundedAgent(agent.model, agent.policy, "episode")
     return {name: agent, f"{name}_episode": once}
 
 
-def _deconfounded(context: Context, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
+def _deconfounded(context: Context | Allowed, name: str, config: DeconfoundedConfig) -> dict[str, Agent]:
     source = context.source(context.preset.fresh > 0 and not config.accumulate)
     agent = deconfounded.fit(source, context.explore, config, context.rngs, context.monitor)
     return _deploy(name, agent)
 
 
-def _offline(context: Context) -> dict[str, Agent]:
+def _offline(context: Context | Allowed) -> dict[str, Agent]:
     agent = offline.fit(context.demonstrations, context.preset.offline, context.rngs, context.monitor)
     return {"deconfounded_offline": agent}
 
 
-def _naive_rnn(context: Context) -> dict[str, Agent]:
+def _naive_rnn(context: Context | Allowed) -> dict[str, Agent]:
     agent = naive_rnn.fit(context.source(context.preset.fresh > 0), context.preset.naive, context.rngs, context.monitor)
     return {"naive_rnn": agent}
 
 
-def _dagger(context: Context) -> dict[str, Agent]:
+def _dagger(context: Context | Allowed) -> dict[str, Agent]:
     return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.monitor)}
 
 
-def _oracle(context: Context) -> dict[str, Agent]:
+def _oracle(context: Context | Allowed) -> dict[str, Agent]:
     encode = context.task.encode_theta
     agent = cloning.fit(
         context.demonstrations,
@@ -189,18 +214,18 @@ def _oracle(context: Context) -> dict[str, Agent]:
     return {"oracle_bc": agent}
 
 
-def _blind(context: Context) -> dict[str, Agent]:
+def _blind(context: Context | Allowed) -> dict[str, Agent]:
     return {
         "blind_bc": cloning.fit(context.demonstrations, context.preset.cloning, context.rngs, monitor=context.monitor)
     }
 
 
-def _exact(context: Context, conditional: bool) -> dict[str, Agent]:
+def _exact(context: Context | Allowed, conditional: bool) -> dict[str, Agent]:
     agent = ExactAgent(context.env, context.expert, conditional, context.preset.grid)
     return {"conditional" if conditional else "interventional": agent}
 
 
-MAKERS: dict[str, Callable[[Context], dict[str, Agent]]] = {
+MAKERS: dict[str, Callable[[Context | Allowed], dict[str, Agent]]] = {
     "deconfounded": lambda context: _deconfounded(context, "deconfounded", context.preset.deconfounded),
     "deconfounded_gru": lambda context: _deconfounded(
         context, "deconfounded_gru", replace(context.preset.deconfounded, model="gru")

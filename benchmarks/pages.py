@@ -103,7 +103,8 @@ def summary() -> str:
         last = {row[0]: row[column] for row in score.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
-    return markdown_table(("task", "tier", *SUMMARY, "seconds"), rows)
+    methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
+    return markdown_table(("task", "tier", *methods, "seconds"), rows)
 
 
 def certificates() -> str:

@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import re
 import signal
-import threading
 import time
 import zipfile
 import zlib
@@ -25,9 +24,10 @@ import numpy as np
 import torch
 
 from deconfounded import envs
-from deconfounded.benchmarks.catalogue import METHODS
+from deconfounded.benchmarks.catalogue import METHODS, Method
+from deconfounded.benchmarks.guest import die_with_parent
 from deconfounded.benchmarks.methods import Context, Preset
-from deconfounded.deconf.agents import Monitor, State
+from deconfounded.deconf.agents import Monitor, Training
 from deconfounded.envs.console import Progress, check_folder, write_atomically, write_json
 from deconfounded.envs.physics import cores
 from deconfounded.experts.demos import Agent
@@ -44,6 +44,18 @@ class Job(ABC):
     method: str
     seeds: tuple[int, ...]
     folder: Path
+    expert: str | None = None  # another than the task's own
+    salt: str = ""  # of evaluation's seeds
+    guest: Method | None = None  # a method from outside
+
+    @property
+    def about(self) -> Method:
+        """The method's entry in the catalogue."""
+        return self.guest or METHODS[self.method]
+
+    def context(self, monitor: Monitor | None = None) -> Context:
+        """The data and environments of its seeds."""
+        return Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder, self.expert)
 
     @abstractmethod
     def run(self) -> str:
@@ -56,7 +68,7 @@ class Job(ABC):
     @property
     def ticks(self) -> int:
         """Of progress: in proportion to how long a job takes."""
-        return 100 * METHODS[self.method].cost * len(self.seeds)
+        return 100 * self.about.cost * len(self.seeds)
 
     def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
         """Write the file of a seed, atomically; beside `meta` it holds the seed's budget, and when work went on."""
@@ -90,7 +102,7 @@ class DemonstrationJob(Job):
 
     def run(self) -> str:
         start = time.time()
-        trials = Context(envs.get(self.task), self.preset, self.seeds, folder=self.folder).demonstrations
+        trials = self.context().demonstrations
         _ticks.put(self.ticks)
         return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
@@ -98,19 +110,11 @@ class DemonstrationJob(Job):
 _ticks: Queue[int]  # of this worker process, to the main one
 
 
-def _die_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
 def start_worker(ticks: Queue[int]) -> None:
     """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
     global _ticks
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    die_with_parent()
     _ticks = ticks
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class JobMonitor(Monitor):
@@ -126,16 +130,16 @@ class JobMonitor(Monitor):
         self.file = job.folder / f".{job.method}-{'-'.join(map(str, job.seeds))}.pt"
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []
-        self.cpu_start, self.cpu_before = time.process_time(), 0.0
-        self.kept: State = {}
+        self.cpu_start, self.cpu_before = sum(os.times()[:4]), 0.0
+        self.kept: Training = {}
 
     def spans(self) -> list[tuple[float, float]]:
         """When the job was at work: from, to."""
         return [*self.before, (self.start, time.time())]
 
     def cpu(self) -> float:
-        """CPU seconds of this process, for all seeds, so far."""
-        return self.cpu_before + time.process_time() - self.cpu_start
+        """CPU seconds of this process, and of those it started that have ended, for all seeds, so far."""
+        return self.cpu_before + sum(os.times()[:4]) - self.cpu_start
 
     def worked(self) -> float:
         """Seconds of work so far."""
@@ -149,7 +153,7 @@ class JobMonitor(Monitor):
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         self._tell(self.share * done / total)
 
-    def save(self, state: Callable[[], State]) -> None:
+    def save(self, state: Callable[[], Training]) -> None:
         if time.monotonic() - self.saved >= SAVE_EVERY_S:
             buffer = io.BytesIO()
             known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
@@ -157,7 +161,7 @@ class JobMonitor(Monitor):
             write_atomically(self.file, buffer.getvalue())
             self.saved = time.monotonic()
 
-    def load(self) -> State | None:
+    def load(self) -> Training | None:
         try:
             state = torch.load(self.file, self.device, weights_only=True)
         except Exception:  # missing, or damaged, which torch tells in many ways: begin again
@@ -177,26 +181,23 @@ Finished = list[tuple[str, int, dict[str, Any]]]
 """Method, seed, and what its job wrote."""
 
 
-def run_all(
-    kind: type[Job],
-    task: str,
-    preset: Preset,
-    methods: Sequence[str],
-    seeds: int,
-    device: str,
-    folder: Path,
-    label: str,
-) -> tuple[Finished, int]:
-    """Run what has no file yet; returns all that is in the folder now, and how many files were there before."""
-    every = [kind(task, preset, method, tuple(range(seeds)), folder) for method in methods]
+def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, int]:
+    """Run what has no file yet; returns all that is in the folder now, and how many files were there before.
+
+    every: a job for each method, with all seeds, in one folder.
+    """
+    folder = every[0].folder
     left = [[seed for seed in job.seeds if job.load(seed) is None] for job in every]
     parts = [
         replace(job, seeds=part)
         for job, missing in zip(every, left, strict=True)
-        for part in groups(job.method, missing, device)
+        for part in groups(job.about, missing, device)
     ]
-    shown = sorted({seed for job in parts if METHODS[job.method].imitates for seed in job.seeds})
-    first: list[Job] = [DemonstrationJob(task, preset, "demonstrations", (seed,), folder) for seed in shown]
+    shown = {seed: job for job in parts if "demonstrations" in job.about.uses for seed in job.seeds}
+    first: list[Job] = [
+        DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
+        for seed, job in sorted(shown.items())
+    ]
     run_jobs([job for job in first if not job.file(job.seeds[0]).exists()], label)
     run_jobs(parts, label)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
@@ -223,11 +224,12 @@ def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def groups(method: str, left: list[int], device: str) -> list[tuple[int, ...]]:
-    """Seeds to run side by side: as many groups as cores, or one on a GPU; references have nothing to share."""
+def groups(method: Method, left: list[int], device: str) -> list[tuple[int, ...]]:
+    """Seeds to run side by side: as many groups as cores, or one on a GPU; references and guests share nothing."""
     if not left:
         return []
-    n = len(left) if not METHODS[method].learned else min(cores(), len(left)) if device == "cpu" else 1
+    alone = not method.learned or method.reference
+    n = len(left) if alone else min(cores(), len(left)) if device == "cpu" else 1
     return [tuple(map(int, part)) for part in np.array_split(left, n)]
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from typing import Any
 
 from gymnasium import spaces
@@ -140,3 +142,39 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
     if name == "paper":
         amounts = _PAPER if amounts is _BANDIT else replace(amounts, seeds=10)
     return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in CONFIGS})
+
+
+def changed(settings: Preset, changes: Sequence[str]) -> Preset:
+    """The same with other amounts: `seeds=10`, or `naive.updates=500` for a part's.
+
+    Raises InputError for one that there is not, or a value of another type.
+    """
+    for change in changes:
+        key, _, value = change.partition("=")
+        part, _, field = key.rpartition(".")
+        if part not in ("", *CONFIGS):
+            raise envs.closest("--set part", part, list(CONFIGS))
+        of = getattr(settings, part) if part else settings
+        known = {name: now for name, now in asdict(of).items() if name not in CONFIGS}
+        if field not in known:
+            raise envs.closest("--set amount", key, [f"{part}.{name}" if part else name for name in known])
+        new = {field: _parsed(key, value, known[field])}
+        settings = replace(settings, **({part: replace(of, **new)} if part else new))
+    return settings
+
+
+def _parsed(key: str, text: str, now: Any) -> Any:
+    """The text as a value of the same type."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = text
+    whole = isinstance(now, int | None) and not isinstance(now, bool)
+    right = (
+        (value is None or type(value) is int)
+        if now is None
+        else (type(value) in (int, float) if isinstance(now, float) else type(value) is type(now))
+    )
+    if not right or (whole and isinstance(value, int) and value < 0):
+        raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
+    return value

@@ -19,9 +19,11 @@ from deconfounded.experts import policy
 
 def main() -> None:
     """The experiment on one page."""
-    parser = commands.parser(__doc__, "`all`, or some of those that --list names")
-    parser.add_argument("--task", help="which task; see --list")
+    parser = commands.parser(__doc__, "`all`, or some of those that --list names; your own is path/file.py:fit")
+    parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
+    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
+    parser.add_argument("--salt", default="", help="draw other thetas in evaluation, that nobody can have seen")
     args = parser.parse_args()
     if args.list:
         for name in envs.names():
@@ -35,7 +37,7 @@ def main() -> None:
     task = envs.get(args.task)
     wanted = {*commands.check(args, list(METHODS), DEFAULT), *REFERENCES}
     envs.check_task(task)
-    policy.load(task)
+    policy.load(task, args.expert)
     from deconfounded.benchmarks import report, score  # these take seconds; bad input is told at once
     from deconfounded.benchmarks.jobs import BenchmarkJob
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from deconfounded import envs
-from deconfounded.benchmarks.catalogue import REFERENCES
+from deconfounded.benchmarks.catalogue import METHODS, REFERENCES
 from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.task import Array
 from deconfounded.experts.demos import Trials
@@ -96,6 +96,7 @@ def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int
             "ci95": bootstrap(scores[:, episodes - 1]),
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": probes[:, :episodes].mean(0).round(4).tolist(),
+            "tier": jobs[0][1]["meta"].get("tier", ""),
             "budget": mean_budget([data for _, data in jobs]),
             "cpu_s": round(float(np.mean([data["meta"]["cpu_s"] for _, data in jobs])), 1),
         }
@@ -123,7 +124,7 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
 
 
 COLUMNS = (
-    *("method", "return", "score of each episode", "last", "95% interval"),
+    *("method", "tier", "return", "score of each episode", "last", "95% interval"),
     *("Eq. (1)", "theta R2 of each episode", "data, a seed", "CPU s, a seed"),
 )
 
@@ -131,6 +132,12 @@ COLUMNS = (
 def two_decimals(value: float) -> str:
     """As tables show scores: never as -0.00."""
     return f"{np.round(value, 2):z.2f}"
+
+
+def tier(name: str, entry: dict[str, Any]) -> str:
+    """What a method may use, in the paper's terms; one that is not ours says so in its results."""
+    method = METHODS.get(name.removesuffix("_episode"))
+    return entry.get("tier", "") if method is None else method.tier
 
 
 def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -143,7 +150,8 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
         data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
         value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
         cost = f"{entry['cpu_s']:.0f}" if "cpu_s" in entry else ""  # not noted by older runs
-        found.append((name, value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known, data, cost))
+        numbers = (value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known)
+        found.append((name, tier(name, entry), *numbers, data, cost))
     return found
 
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from deconfounded.deconf.agents import LearnedAgent, Monitor
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.nets import ActionHead, Adam, Scaler
-from deconfounded.envs.task import Array
+from deconfounded.envs.task import Array, InputError
 from deconfounded.experts.demos import Trials
 
 
@@ -32,10 +33,24 @@ class MemorylessAgent(LearnedAgent):
 
     def __init__(self, policy: ActionHead, scaler: Scaler, side: Callable[[], Array] | None) -> None:
         super().__init__(policy)
-        self.policy, self.scaler, self.side = policy, scaler, side
+        self.scaler, self.side = scaler, side
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> MemorylessAgent:
+        """An oracle is told by whoever deploys it: `side` is theirs to set."""
+        return cls(ActionHead(signature.obs + shape["theta"], shape["width"], signature, draws), obs, None)
+
+    def shape(self) -> dict[str, Any]:
+        _, inputs, width = next(self.policy.parameters()).shape
+        return {"width": width, "theta": inputs - self.policy.signature.obs}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"policy": self.policy, "scaler": self.scaler}
 
     def choose(self, obs: Tensor) -> Tensor:
         features = self.scaler(obs)
+        if self.shape()["theta"] and self.side is None:
+            raise InputError("an oracle acts on theta, and was told none; set its `side`")
         if self.side is not None:
             theta = torch.as_tensor(self.side()).to(features).reshape(*features.shape[:2], -1)
             features = torch.cat([features, theta], -1)

@@ -43,7 +43,7 @@ def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None =
     draws = Draws(rngs, config.device)
     trials, labels = query(None, rngs)
     data, label = Batch.of(trials, len(rngs), config.device), _labels(trials, labels, len(rngs), config.device)
-    agent = RecurrentAgent.new(config, Signature.of(trials), Scaler(data.obs, data.mask), draws)
+    agent = RecurrentAgent.new(config.width, Signature.of(trials), Scaler(data.obs, data.mask), draws)
     cloner = Cloner(agent, config, data.mask.shape[2], monitor or Monitor(), config.rounds)
     for i in range(config.rounds):
         if i > 0:

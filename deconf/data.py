@@ -23,8 +23,11 @@ Source = Trials | Callable[[Sequence[np.random.Generator]], Trials]
 
 
 def listed(rng: Rngs) -> list[np.random.Generator]:
-    """The generators, one a seed."""
-    return [rng] if isinstance(rng, np.random.Generator) else list(rng)
+    """The generators, one a seed. Raises InputError for anything else, a number, say."""
+    rngs = [rng] if isinstance(rng, np.random.Generator) else rng
+    if not isinstance(rngs, Sequence) or not all(isinstance(one, np.random.Generator) for one in rngs):
+        raise InputError(f"random numbers were to come from {rng!r}; give np.random.default_rng(0), or a list of such")
+    return list(rngs)
 
 
 def drawn(source: Source, rngs: Sequence[np.random.Generator]) -> Trials:

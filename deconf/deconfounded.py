@@ -7,20 +7,22 @@ theta_hat from its belief, acts, and updates the belief on what follows.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from deconfounded.deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconfounded.deconf.equations import imitation_loss
-from deconfounded.deconf.models import BELIEFS, DiscreteModel, LatentModel, VariationalModel
-from deconfounded.deconf.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.models import LatentModel
+from deconfounded.deconf.models import new as new_model
+from deconfounded.deconf.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Agent, Trials
 
@@ -64,7 +66,29 @@ class DeconfoundedAgent(LearnedAgent):
 
     def __init__(self, model: LatentModel, policy: ActionHead, resample: Literal["step", "episode"] = "step") -> None:
         super().__init__(policy)
-        self.model, self.policy, self.resample = model, policy, resample
+        self.model, self.resample = model, resample
+
+    @staticmethod
+    def new(
+        kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> DeconfoundedAgent:
+        """One that knows nothing yet. Raises InputError for a kind of model that there is not."""
+        model = new_model(kind, latent, width, signature, obs, change, draws)
+        return DeconfoundedAgent(model.eval(), ActionHead(model.inputs.obs_width + latent, width, signature, draws))
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DeconfoundedAgent:
+        change = copy.deepcopy(obs)
+        agent = cls.new(shape["model"], shape["latent"], shape["width"], signature, obs, change, draws)
+        agent.resample = shape["resample"]
+        return agent
+
+    def shape(self) -> dict[str, Any]:
+        model = self.model
+        return {"model": model.kind, "latent": model.latent, "width": model.width, "resample": self.resample}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"model": self.model, "policy": self.policy}
 
     def begin(self, n: int) -> None:
         super().begin(n)
@@ -140,8 +164,6 @@ def fit(
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    if config.model not in (*BELIEFS, "discrete"):
-        raise InputError(f"model was {config.model!r}; it must be one of {', '.join(BELIEFS)}, discrete")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
     shown, first = drawn(trials, rngs), explore(None, rngs)
@@ -151,14 +173,8 @@ def fit(
     expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
     # Experts' changes count too: those of random actions alone can be far smaller, and theta is then learned poorly.
     obs, change = scalers(seen.joined(expert))
-    model: LatentModel
-    if config.model == "discrete":
-        model = DiscreteModel(config.latent, config.width, signature, obs, change, draws)
-    else:
-        model = VariationalModel(config.model, config.latent, config.width, signature, obs, change, draws)
-    model.eval()  # but for its updates
-    policy = ActionHead(model.inputs.obs_width + config.latent, config.width, signature, draws)
-    agent = DeconfoundedAgent(model, policy)
+    agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
+    model, policy = agent.model, agent.policy  # the model is in its eval mode but for its updates
 
     inferences = config.rounds * config.inference_updates
     total = inferences + config.rounds * config.imitation_updates + config.final_updates

@@ -17,6 +17,7 @@ from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief
 from deconfounded.deconf.data import Batch, Draws, Signature, take
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
+from deconfounded.envs.task import InputError
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 
@@ -24,7 +25,9 @@ BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 class LatentModel(nn.Module, ABC):
     """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat."""
 
+    kind: str
     latent: int
+    width: int
     inputs: Inputs
 
     @abstractmethod
@@ -74,7 +77,7 @@ class VariationalModel(LatentModel):
         self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> None:
         super().__init__()
-        self.latent = latent
+        self.kind, self.latent, self.width = kind, latent, width
         self.encoder: Belief = BELIEFS[kind](latent, width, signature, obs, change, draws)  # type: ignore[abstract]
         self.inputs = self.encoder.inputs
         self.dynamics = DynamicsHead(latent, width, self.inputs, change, draws)
@@ -119,11 +122,13 @@ class DiscreteModel(LatentModel):
     p(k) is uniform, so that each k stands for an equal share of p(theta); fitted, whichever k is ahead takes more.
     """
 
+    kind = "discrete"
+
     def __init__(
         self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> None:
         super().__init__()
-        self.latent, self.inputs = latent, Inputs(signature, obs)
+        self.latent, self.width, self.inputs = latent, width, Inputs(signature, obs)
         self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
 
     def _evidence(self, batch: Batch) -> Tensor:
@@ -165,3 +170,14 @@ class DiscreteModel(LatentModel):
             dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
             losses.append(marginal_loss(prior, dealt, real))
         return torch.stack(losses).mean(0)
+
+
+def new(
+    kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+) -> LatentModel:
+    """`evidence`, `gru` or `discrete`, untrained. Raises InputError for another kind."""
+    if kind == "discrete":
+        return DiscreteModel(latent, width, signature, obs, change, draws)
+    if kind not in BELIEFS:
+        raise InputError(f"model was {kind!r}; it must be one of {', '.join(BELIEFS)}, discrete")
+    return VariationalModel(kind, latent, width, signature, obs, change, draws)

@@ -21,7 +21,7 @@ def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | N
     rngs, monitor = listed(rng), monitor or Monitor()
     shown = drawn(trials, rngs)
     data, draws = Batch.of(shown, len(rngs), config.device), Draws(rngs, config.device)
-    agent = RecurrentAgent.new(config, Signature.of(shown), Scaler(data.obs, data.mask), draws)
+    agent = RecurrentAgent.new(config.width, Signature.of(shown), Scaler(data.obs, data.mask), draws)
     cloner = Cloner(agent, config, data.mask.shape[2], monitor)
     checkpoint = Checkpoint(
         monitor, rngs, memory=agent.memory, policy=agent.policy, optimizer=cloner.optimizer, draws=draws

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from deconfounded.deconf.agents import LearnedAgent, Monitor
 from deconfounded.deconf.beliefs import GruMemory
@@ -38,13 +39,23 @@ class RecurrentAgent(LearnedAgent):
 
     def __init__(self, memory: GruMemory, policy: ActionHead) -> None:
         super().__init__(policy)
-        self.memory, self.policy = memory, policy
+        self.memory = memory
 
     @staticmethod
-    def new(config: RecurrentConfig, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
         """One that knows nothing yet."""
-        memory = GruMemory(config.width, signature, obs, draws)
-        return RecurrentAgent(memory, ActionHead(config.width + signature.obs, config.width, signature, draws))
+        memory = GruMemory(width, signature, obs, draws)
+        return RecurrentAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+        return cls.new(shape["width"], signature, obs, draws)
+
+    def shape(self) -> dict[str, Any]:
+        return {"width": self.memory.width}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"memory": self.memory, "policy": self.policy}
 
     def begin(self, n: int) -> None:
         super().begin(n)

@@ -3,3 +3,18 @@
 Each of the four is a folder at the top of the repository; the links here are for type checkers and editors. Importing
 this package imports none of them, so that who wants the environments alone needs no more than these.
 """
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from deconfounded.experts.demos import Agent
+
+
+def load(folder: Path | str) -> Agent:
+    """The agent that `agent.save(folder)` or a run left in a folder; see `experts.saved`."""
+    from deconfounded.experts import saved
+
+    return saved.load(folder)

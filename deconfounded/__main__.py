@@ -12,6 +12,8 @@ COMMANDS = {
     "run": ("benchmarks.run", "train, deploy and score methods on a task"),
     "train": ("experts.train", "train a task's expert (PPO)"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
+    "play": ("benchmarks.play", "run a kept agent in one environment"),
+    "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
     "publish": ("benchmarks.publish", "keep a finished run in docs/"),
     "pages": ("benchmarks.pages", "write the pages of docs/ anew"),
     "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),

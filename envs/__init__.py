@@ -1,12 +1,12 @@
-"""Tasks with hidden physics, and the registry: `names`, `get`, `make`, `make_vec`, `make_dm`.
+"""Tasks with hidden physics, and the registry: `names`, `get`, `register`, `make`, `make_vec`, `make_dm`.
 
-A new task is one file, one MJCF and two lines here: its import, and its class in TASKS. Importing this package also
-registers every task with gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v0")` works.
+A new task is one file, one MJCF and two lines here: its import, and its class in the list at the end. One of your own
+stays in your own folder: `get("path/file.py:Class")`. Importing this package also registers every task with gymnasium,
+so that `gymnasium.make("deconf/SlipperyCartpole-v1")` works.
 """
 
 from __future__ import annotations
 
-import difflib
 import os
 
 _gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` dies of a backend that is not there; pictures can wait
@@ -14,8 +14,6 @@ import mujoco  # noqa: F401
 
 if _gl is not None:
     os.environ["MUJOCO_GL"] = _gl
-
-import gymnasium
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.bandit import Bandit
@@ -26,13 +24,26 @@ from deconfounded.envs.heavy_payload import HeavyPayload
 from deconfounded.envs.hidden_goal import HiddenGoal
 from deconfounded.envs.icy_road import IcyRoad
 from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.registry import (
+    TASKS,
+    closest,
+    get,
+    make,
+    make_dm,
+    make_registered_vec,
+    make_vec,
+    names,
+    register,
+)
 from deconfounded.envs.slippery_cartpole import SlipperyCartpole
 from deconfounded.envs.slippery_walker import SlipperyWalker
 from deconfounded.envs.task import InputError, Latent, Task
 from deconfounded.envs.tilted_cartpole import TiltedCartpole
 
 __all__ = [
+    "TASKS",
     "BatchEnv",
+    "DmEnv",
     "GymEnv",
     "GymVectorEnv",
     "InputError",
@@ -40,71 +51,24 @@ __all__ = [
     "MujocoTask",
     "Task",
     "check_task",
+    "closest",
     "get",
     "make",
     "make_dm",
+    "make_registered_vec",
     "make_vec",
     "names",
+    "register",
 ]
 
-TASKS: dict[str, type[Task]] = {
-    cls.name: cls
-    for cls in (
-        Bandit,
-        TiltedCartpole,
-        SlipperyCartpole,
-        HeavyPayload,
-        IcyRoad,
-        SlipperyWalker,
-        HiddenGoal,
-        ForkedPath,
-    )
-}
-
-
-def names() -> list[str]:
-    """The registered tasks."""
-    return list(TASKS)
-
-
-def closest(kind: str, given: str, known: list[str], remedy: str = "") -> InputError:
-    """The error for a name that is not known: it names the nearest one, and what else may help."""
-    near = difflib.get_close_matches(given, known, 1, 0.6)
-    hint = f"did you mean {near[0]!r}? " if near else ""
-    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}{remedy}")
-
-
-def get(name: str) -> Task:
-    """The task of that name. Raises InputError, naming the nearest, if there is none."""
-    if name not in TASKS:
-        raise closest("task", name, names(), "; a new one must be in TASKS in envs/__init__.py")
-    return TASKS[name]()
-
-
-def make(name: str, privileged: bool = False, render_mode: str | None = None) -> GymEnv:
-    """A gymnasium environment; `privileged` appends theta to the observation, for experts."""
-    return GymEnv(get(name), privileged, render_mode)
-
-
-def make_vec(name: str, n: int, privileged: bool = False) -> GymVectorEnv:
-    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool."""
-    return GymVectorEnv(get(name), n, privileged)
-
-
-def make_registered_vec(name: str, num_envs: int = 1, privileged: bool = False) -> GymVectorEnv:
-    """`make_vec` as gymnasium.make_vec calls it."""
-    return make_vec(name, num_envs, privileged)
-
-
-def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmEnv:
-    """A dm_env environment."""
-    return DmEnv(get(name), privileged, seed)
-
-
-for _task in (cls() for cls in TASKS.values()):
-    gymnasium.register(
-        _task.gym_id,
-        entry_point="deconfounded.envs:make",
-        vector_entry_point="deconfounded.envs:make_registered_vec",
-        kwargs={"name": _task.name},
-    )
+for _task in (
+    Bandit,
+    TiltedCartpole,
+    SlipperyCartpole,
+    HeavyPayload,
+    IcyRoad,
+    SlipperyWalker,
+    HiddenGoal,
+    ForkedPath,
+):
+    register(_task)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from deconfounded.envs import render
 from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import ASSETS, Array, InputError, Painter, Simulator, Task
+from deconfounded.envs.task import Array, InputError, Painter, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -208,8 +208,8 @@ class MujocoTask(Task):
         return action
 
     def spec(self) -> mujoco.MjSpec:
-        """The nominal model, from assets/<name>.xml. Every environment has a copy, so that it should be small."""
-        return mujoco.MjSpec.from_file(str(ASSETS / f"{self.name}.xml"))
+        """The nominal model, from <name>.xml in `home`. Every environment has a copy, so that it should be small."""
+        return mujoco.MjSpec.from_file(str(self.home / f"{self.name}.xml"))
 
     def decorate(self, spec: mujoco.MjSpec) -> None:
         """Add what is to be looked at only, for pictures: by default, a sky."""

@@ -12,6 +12,7 @@ actions are always [N, A]. A task holds no state of its own: states, thetas and 
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -124,6 +125,7 @@ class Task(ABC):
     """
 
     name: ClassVar[str]
+    reference: ClassVar[str] = ""  # what `get` knows it by in any process: its name, or where it is from
     version: ClassVar[int] = 0
     tier: ClassVar[int | None] = 2  # of the paper, that identifies the interventional policy; None: none does
     latents: ClassVar[tuple[Latent, ...]]
@@ -177,6 +179,12 @@ class Task(ABC):
     @abstractmethod
     def painter(self, theta: Array) -> Painter:
         """Draws one environment of that theta [L]. Raises InputError where no picture can be made."""
+
+    @property
+    def home(self) -> Path:
+        """The folder of its MJCF and of its expert's weights: assets/, or where the file of a task from outside is."""
+        cls = next(cls for cls in type(self).__mro__ if "name" in vars(cls))
+        return ASSETS if cls.__module__.startswith(__package__) else Path(inspect.getfile(cls)).resolve().parent
 
     @property
     def observation_space(self) -> spaces.Box:

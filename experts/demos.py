@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +25,7 @@ class Trials:
 
     obs [B, E, T + 1, O] float32; action [B, E, T, A] float32; mask [B, E, T] bool, whether step t took place (False
     once an episode has ended early); actions: the number of discrete actions, or 0 for actions in [-1, 1].
-    Raises InputError for shapes that do not fit each other, or NaN.
+    Raises InputError for shapes that do not fit each other, NaN, or actions that cannot be.
     """
 
     obs: NDArray[np.float32]
@@ -33,6 +34,13 @@ class Trials:
     actions: int = 0
 
     def __post_init__(self) -> None:
+        for name, dtype in (("obs", np.float32), ("action", np.float32), ("mask", bool)):
+            try:
+                array = np.array(getattr(self, name), dtype)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{name} of Trials must be an array of numbers ({error})") from None
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
         b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
         if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
             raise InputError(
@@ -45,10 +53,8 @@ class Trials:
             raise InputError("Trials held no step that took place; their mask must be True somewhere")
         if self.actions and not np.isin(self.action, np.arange(self.actions)).all():
             raise InputError(f"Trials held an action that is not one of 0..{self.actions - 1}")
-        for name, dtype in (("obs", np.float32), ("action", np.float32), ("mask", bool)):
-            array = np.array(getattr(self, name), dtype)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+        if not self.actions and (far := float(np.abs(self.action).max())) > 1:
+            raise InputError(f"Trials held an action of size {far:g}; actions must be in [-1, 1], or `actions` given")
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -73,6 +79,10 @@ def joined(parts: Sequence[Trials]) -> Trials:
     """The trials of all parts, one after another; they are of the same kind and shape."""
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
     return Trials(obs, action, mask, parts[0].actions)
+
+
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+"""Settings that json can hold, and arrays."""
 
 
 class Agent(ABC):
@@ -101,6 +111,15 @@ class Agent(ABC):
     def features(self) -> NDArray[np.float32] | None:
         """What the agent knows now [N, F], for probes of theta in it; None for agents without memory."""
         return None
+
+    def state(self) -> State:
+        """What `from_state` makes this agent anew from. Raises InputError for one that cannot be kept."""
+        raise InputError(f"{type(self).__name__} cannot be saved; give it `state` and `from_state`")
+
+    @classmethod
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Agent:
+        """The agent that gave this `state`."""
+        raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 
 
 class ExpertAgent(Agent):

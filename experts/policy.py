@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -14,7 +15,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
-from deconfounded.envs import InputError, Task
+from deconfounded.envs import InputError, Task, outside
 from deconfounded.envs.task import ASSETS, Array
 
 
@@ -61,21 +62,15 @@ class DiscreteExpert(Expert):
         return np.broadcast_to(probs, (len(obs), probs.shape[-1]))
 
 
-class NetworkExpert(Expert):
-    """clip(mu(s, theta) + sigma eps, -1, 1): a tanh network's mean with the task's expert noise sigma."""
+class BoxExpert(Expert):
+    """clip(mu(s, theta) + sigma eps, -1, 1): any mean action with the task's expert noise sigma."""
 
-    def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
-        self.task, self.weights = task, weights
+    def __init__(self, task: Task) -> None:
+        self.task = task
 
+    @abstractmethod
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
-        """mu [N, A], clipped to [-1, 1]. Rows in equal groups come out, bit for bit, as they would group by group."""
-        w, last = self.weights, len(self.weights) // 2 - 1
-        rows = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
-        hidden = rows.reshape(groups, -1, rows.shape[1])
-        for i in range(last):
-            hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
-        out = hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"]
-        return np.clip(out.reshape(len(rows), -1), -1, 1).astype(float)
+        """mu [N, A] in [-1, 1]. Rows in equal groups should come out, bit for bit, as they would group by group."""
 
     def act(self, obs: Array, theta: Array, rng: Random) -> Array:
         mean = self.mean(obs, theta, getattr(rng, "groups", 1))
@@ -89,17 +84,73 @@ class NetworkExpert(Expert):
         return np.where(action >= 1, log_ndtr(-z), np.where(action <= -1, log_ndtr(z), inside)).sum(-1)
 
 
+class NetworkExpert(BoxExpert):
+    """A tanh network on the observation and the encoded theta."""
+
+    def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
+        super().__init__(task)
+        self.weights = weights
+
+    def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
+        w, last = self.weights, len(self.weights) // 2 - 1
+        rows = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
+        hidden = rows.reshape(groups, -1, rows.shape[1])
+        for i in range(last):
+            hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
+        out = hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"]
+        return np.clip(out.reshape(len(rows), -1), -1, 1).astype(float)
+
+
+class OwnExpert(BoxExpert):
+    """Any callable from observation [N, O] and theta [N, L], in its units, to the mean action [N, A]."""
+
+    def __init__(self, task: Task, call: Callable[[Array, Array], Array], name: str) -> None:
+        super().__init__(task)
+        self.call, self.name = call, name
+
+    def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
+        """Clipped to [-1, 1]. Raises InputError for what is not one finite row for each observation."""
+        try:
+            given = np.asarray(self.call(obs, theta), float)
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"expert {self.name}: {outside.told(error)}") from error
+        shape = (len(obs), self.task.action_space.shape[0])  # type: ignore[index]
+        if given.shape != shape or not np.isfinite(given).all():
+            what = f"shape {given.shape}" if given.shape != shape else "NaN or infinity"
+            raise InputError(f"expert {self.name} gave {what} for {len(obs)} observations; it must be {shape}, finite")
+        return np.clip(given, -1, 1)
+
+
 def path(task: Task) -> Path:
     """Where the weights of a task's expert lie; its card lies beside them as .json."""
-    return ASSETS / "experts" / f"{task.name}.safetensors"
+    folder = ASSETS / "experts" if task.home == ASSETS else task.home
+    return folder / f"{task.name}.safetensors"
 
 
-def load(task: Task, file: Path | None = None) -> Expert:
-    """The task's expert. Raises InputError if its weights are missing, damaged or of the wrong shape."""
+def load(task: Task, source: str | Path | None = None) -> Expert:
+    """The task's expert: the closed form, the weights that come with the task, or others.
+
+    source: a .safetensors file, or a callable (`OwnExpert`) as path/file.py:name or package.module:name. Raises
+    InputError if it is missing, damaged, or does not fit the task.
+    """
     if isinstance(task.action_space, spaces.Discrete):
+        if source is not None:
+            raise InputError(f"expert was {source}; that of {task.name} is its closed form, `expert_probs`")
         return DiscreteExpert(task)
-    file = file or path(task)
-    remedy = f"run `deconf train --task {task.name}`"
+    if isinstance(source, str) and outside.is_outside(source) and not source.endswith(".safetensors"):
+        expert = OwnExpert(task, outside.find("expert", source), source)
+        if not callable(expert.call):
+            raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")
+        lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
+        expert.mean(np.zeros((2, len(task.observation)), np.float32), lat)
+        return expert
+    return NetworkExpert(task, _weights(task, Path(source) if source else path(task)))
+
+
+def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
+    remedy = f"run `deconf train --task {task.reference or task.name}`"
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:
@@ -114,11 +165,15 @@ def load(task: Task, file: Path | None = None) -> Expert:
         if weight.shape[1] != width or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"layer {i} of {file} takes {weight.shape[1]} finite inputs, not {width}; {remedy}")
         width = len(bias)
+    assert isinstance(task.action_space, spaces.Box)
     if width != task.action_space.shape[0]:
         raise InputError(f"expert weights at {file} give {width} actions, not {task.action_space.shape[0]}; {remedy}")
-    return NetworkExpert(task, weights)
+    return weights
 
 
-def fingerprint(task: Task) -> str:
-    """SHA-256 of the weights, or `closed form`."""
-    return hashlib.sha256(path(task).read_bytes()).hexdigest() if path(task).is_file() else "closed form"
+def fingerprint(task: Task, source: str | Path | None = None) -> str:
+    """SHA-256 of the weights, or of the file that holds the callable; or `closed form`."""
+    file: Path | None = Path(source) if source else path(task)
+    if isinstance(source, str) and outside.is_outside(source) and not source.endswith(".safetensors"):
+        file = outside.source(outside.find("expert", source))
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file and file.is_file() else "closed form"

@@ -16,23 +16,27 @@ from deconfounded.envs.console import Parser, check_folder, run_command, write_j
 from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
 
+STEPS = 3_000_000
+
 
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--task", required=True)
-    parser.add_argument("--steps", type=int, default=3_000_000, help="control steps of PPO")
+    parser.add_argument("--steps", type=int, default=STEPS, help=f"control steps of PPO; default: {STEPS:,}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="weights file; default: the one that ships with the task")
+    parser.add_argument("--out", type=Path, help="weights file; default: <task>.safetensors in this folder")
     args = parser.parse_args()
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
     if args.steps < 1 or args.seed < 0:
         raise envs.InputError(f"--steps was {args.steps} and --seed {args.seed}; they must be at least 1 and 0")
-    file = args.out or policy.path(task)
+    file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
+    if args.out is None and file.exists():
+        raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
     envs.check_task(task)
     check_folder(file.parent)
     from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
@@ -48,7 +52,7 @@ def main() -> None:
     card = {
         "task": task.name,
         "task_version": task.version,
-        "command": f"deconf train --task {task.name} --steps {args.steps} --seed {args.seed}",
+        "command": f"deconf train --task {args.task} --steps {args.steps} --seed {args.seed}",
         "algorithm": "PPO (stable-baselines3), privileged view, 64 environments, tanh networks of 64 x 64",
         "settings": PPO_SETTINGS,
         "return_mean": round(float(returns.mean()), 2),
@@ -68,6 +72,8 @@ def main() -> None:
             f"warning: the expert of {task.name} is hardly better than random actions: more --steps, or another reward"
         )
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
+    if file.resolve() != policy.path(task).resolve():
+        print(f"commands take it as --expert {file}; they look for {policy.path(task)} unasked")
 
 
 if __name__ == "__main__":

@@ -73,7 +73,7 @@ def test_slips_are_named(task: type[envs.Task], says: str) -> None:
 
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "nowhere.xml").write_text("<mujoco><worldbody></mujoco>")
-    monkeypatch.setattr("deconfounded.envs.physics.ASSETS", tmp_path)
+    monkeypatch.setattr(MissingFile, "home", tmp_path)
     with pytest.raises(envs.InputError, match=r"^the model \(assets/nowhere\.xml, .*\) of nowhere: XML") as caught:
         envs.check_task(MissingFile())
     assert "\n" not in str(caught.value)

@@ -44,7 +44,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py",), "--task is missing"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
         (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
-        (("benchmarks/run.py", "--task", "leaning_beam"), "must be in TASKS in envs/__init__.py"),
+        (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
         (("benchmarks/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
@@ -214,7 +214,7 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     xml = re.search(r"```xml\n(.*?)```", text, re.S).group(1)
     assert len(code.splitlines()) <= 60
     (tmp_path / "bent_cartpole.xml").write_text(xml)
-    monkeypatch.setattr(envs.physics, "ASSETS", tmp_path)
+    monkeypatch.setattr(envs.Task, "home", tmp_path)
     space: dict = {}
     exec(code, space)
     task = space["BentCartpole"]()

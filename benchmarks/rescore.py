@@ -1,0 +1,94 @@
+"""Score a kept agent anew, on thetas that it has not seen: `deconf score --agent DIR --task slippery_cartpole`
+
+Thetas are drawn from p(theta) by --seed and --salt, or with --range from another range, outside of the task's own if
+you like: what the expert, random actions and the agent then make of it are measured side by side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from deconfounded import envs
+from deconfounded.benchmarks import score
+from deconfounded.benchmarks.methods import EVALUATION, stream
+from deconfounded.benchmarks.play import ready
+from deconfounded.envs.console import Parser, check_folder, run_command, write_json
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.policy import Expert
+
+
+def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
+    """The task with other ranges of its latents, name=low:high; the encoding of theta is the task's own still.
+
+    Raises InputError for a latent that there is not, or a range that cannot be.
+    """
+    moved = {}
+    for text in ranges:
+        name, _, bounds = text.partition("=")
+        try:
+            low, high = map(float, bounds.split(":"))
+        except ValueError:
+            raise envs.InputError(f"--range was {text!r}; it must be like {task.latents[0].name}=0.1:0.2") from None
+        known = {lat.name: lat for lat in task.latents}
+        if name not in known:
+            raise envs.closest("latent", name, list(known))
+        moved[name] = replace(known[name], low=low, high=high)
+    other = type(task)()
+    other.latents = tuple(moved.get(lat.name, lat) for lat in task.latents)  # type: ignore[misc]
+    return other
+
+
+def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
+    """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
+    env = envs.BatchEnv(where, trials)
+    found = {}
+    for name, one in (
+        ("agent", agent),
+        ("expert", ExpertAgent(env, expert)),
+        ("random", RandomAgent(task.action_space)),
+    ):
+        found[name] = run_trials(env, one, task.episodes, seed)[1]
+    best, worst = found["expert"].mean(), found["random"].mean()
+    by_trial = score.normalise(found["agent"], worst, best)
+    return {
+        "score": by_trial.mean(0).round(4).tolist(),
+        "ci95_last": score.bootstrap(by_trial[:, -1]),
+        "return": {name: returns.mean(0).round(4).tolist() for name, returns in found.items()},
+    }
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--agent", type=Path, required=True, help="a folder under a run's agents/")
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--trials", type=int, default=128)
+    parser.add_argument("--seed", type=int, default=0, help="0 and no --salt: the thetas of a run's seed 0")
+    parser.add_argument("--salt", default="", help="any text")
+    parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from there")
+    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
+    parser.add_argument("--out", type=Path, help="a .json file to write")
+    args = parser.parse_args()
+    task = envs.get(args.task)
+    agent, expert, where = ready(args.agent, task), policy.load(task, args.expert), elsewhere(task, args.range)
+    if args.trials < 2 or args.seed < 0:
+        raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be at least 2 and 0")
+    if args.out is not None:
+        check_folder(args.out.parent)
+    found = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
+    low, high = found["ci95_last"]
+    print(
+        f"{task.name}, {args.trials} trials: score of each episode {' '.join(map(score.two_decimals, found['score']))}"
+        f" (0 random, 1 expert; last {low:.2f} to {high:.2f}, 95% over trials)"
+    )
+    if args.out is not None:
+        asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}
+        about = {"task": task.name, "task_version": task.version, "agent": str(args.agent)}
+        write_json(args.out, {**about, **asked, **found})
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,87 @@
+"""What is named from outside: `path/file.py:name`, or `package.module:name`."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import inspect
+import sys
+import traceback
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from deconfounded.envs.task import InputError
+
+
+def is_outside(reference: str) -> bool:
+    """Whether it names something by where it is, and not a registered one."""
+    return ":" in reference
+
+
+def find(kind: str, reference: str) -> Any:
+    """The object named. kind: what it should be, for the error.
+
+    A file is run once, as Python runs a script: what lies beside it can be imported, after all that is installed.
+    Raises InputError if there is no such file, module or name in it, or if running it fails.
+    """
+    where, _, name = reference.rpartition(":")
+    if not where or not name:
+        raise InputError(f"{kind} was {reference!r}; from outside it must be path/file.py:name or package.module:name")
+    try:
+        module = _run(Path(where)) if where.endswith(".py") else importlib.import_module(where)
+    except FileNotFoundError:
+        raise InputError(f"{kind} {reference!r}: there is no file {where}") from None
+    except ModuleNotFoundError as error:
+        raise InputError(f"{kind} {reference!r}: module {error.name} was not found") from None
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{kind} {reference!r}: {told(error)}") from error
+    if not hasattr(module, name):
+        known = [key for key in vars(module) if not key.startswith("_")]
+        raise InputError(f"{kind} {reference!r}: {where} has no {name!r}; it has {', '.join(known)}")
+    return getattr(module, name)
+
+
+def told(error: Exception) -> str:
+    """An error as part of one line: what it says, its type, and where it came from."""
+    text = " ".join(str(error.args[0] if error.args else error).split())
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
+
+
+def absolute(reference: str) -> str:
+    """The same, wherever it is read from."""
+    where, colon, name = reference.rpartition(":")
+    return f"{Path(where).resolve()}:{name}" if where.endswith(".py") else f"{where}{colon}{name}"
+
+
+def source(of: Any) -> Path | None:
+    """The file that defines a class or function, or the class of an object; None if it has none."""
+    try:
+        return Path(inspect.getfile(of if inspect.isclass(of) or inspect.isroutine(of) else type(of))).resolve()
+    except (TypeError, OSError):
+        return None
+
+
+def _run(file: Path) -> ModuleType:
+    path = file.resolve()
+    if not path.is_file():
+        raise FileNotFoundError(file)
+    name = f"outside_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        sys.modules[name] = module
+        if str(path.parent) not in sys.path:
+            sys.path.append(str(path.parent))
+        try:
+            spec.loader.exec_module(module)
+        except BaseException:
+            del sys.modules[name]
+            raise
+    return sys.modules[name]

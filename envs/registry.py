@@ -1,0 +1,87 @@
+"""The registry of tasks: `register`, `names`, `get`, `make`, `make_vec`, `make_dm`."""
+
+from __future__ import annotations
+
+import difflib
+from importlib.metadata import entry_points
+
+import gymnasium
+
+from deconfounded.envs import outside
+from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
+from deconfounded.envs.task import InputError, Task
+
+TASKS: dict[str, type[Task]] = {}
+GROUP = "deconfounded.tasks"  # entry points of installed packages: name = "package.module:Class"
+
+
+def register(cls: type[Task]) -> type[Task]:
+    """Add a task by its name, for `get` and for gymnasium; usable as a decorator. Raises InputError if it is taken."""
+    known = TASKS.setdefault(cls.name, cls)
+    if known is not cls:
+        raise InputError(f"task name {cls.name!r} of {_where(cls)} is taken by {_where(known)}; give it another name")
+    if "reference" not in vars(cls):
+        cls.reference = cls.name
+    gymnasium.registry.pop(cls().gym_id, None)
+    gymnasium.register(
+        cls().gym_id,
+        entry_point="deconfounded.envs:make",
+        vector_entry_point="deconfounded.envs:make_registered_vec",
+        kwargs={"name": cls.name},
+    )
+    return cls
+
+
+def _where(cls: type[Task]) -> str:
+    return str(outside.source(cls) or cls.__module__)
+
+
+def names() -> list[str]:
+    """The tasks that are registered, and those that installed packages offer as entry points."""
+    return list(dict.fromkeys([*TASKS, *(point.name for point in entry_points(group=GROUP))]))
+
+
+def closest(kind: str, given: str, known: list[str], remedy: str = "") -> InputError:
+    """The error for a name that is not known: it names the nearest one, and what else may help."""
+    near = difflib.get_close_matches(given, known, 1, 0.6)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}{remedy}")
+
+
+def get(name: str) -> Task:
+    """The task of that name, or one from outside: path/file.py:Class, or package.module:Class.
+
+    Raises InputError, naming the nearest, if there is none.
+    """
+    if name in TASKS:
+        return TASKS[name]()
+    for point in entry_points(group=GROUP):
+        if point.name == name:
+            name = point.value
+    if not outside.is_outside(name):
+        raise closest("task", name, names(), "; your own is path/file.py:Class")
+    cls = outside.find("task", name)
+    if not (isinstance(cls, type) and issubclass(cls, Task)):
+        raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
+    cls.reference = outside.absolute(name)
+    return register(cls)()
+
+
+def make(name: str, privileged: bool = False, render_mode: str | None = None) -> GymEnv:
+    """A gymnasium environment; `privileged` appends theta to the observation, for experts."""
+    return GymEnv(get(name), privileged, render_mode)
+
+
+def make_vec(name: str, n: int, privileged: bool = False) -> GymVectorEnv:
+    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool."""
+    return GymVectorEnv(get(name), n, privileged)
+
+
+def make_registered_vec(name: str, num_envs: int = 1, privileged: bool = False) -> GymVectorEnv:
+    """`make_vec` as gymnasium.make_vec calls it."""
+    return make_vec(name, num_envs, privileged)
+
+
+def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmEnv:
+    """A dm_env environment."""
+    return DmEnv(get(name), privileged, seed)

@@ -1,0 +1,65 @@
+"""Agents that last: a folder with agent.json and agent.safetensors, written by `save` and read by `load`; no pickle."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import shutil
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.numpy import save as to_bytes
+
+from deconfounded.envs import InputError, outside
+from deconfounded.envs.console import check_folder, write_atomically, write_json
+from deconfounded.experts.demos import Agent
+
+CODE = "agent.py"  # of an agent from outside, kept beside its arrays
+
+
+def save(agent: Agent, folder: Path, **about: Any) -> None:
+    """Keep an agent: its class by name, its settings, its arrays; about: what else to say of it, for json.
+
+    Of a class that a file brought from outside, the file is kept too, so that the folder is whole; what else that file
+    imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept.
+    """
+    settings, arrays = agent.state()
+    check_folder(folder)
+    cls, code = type(agent), outside.source(type(agent))
+    where = cls.__module__
+    if where.startswith("outside_") and code is not None:
+        shutil.copy(code, folder / CODE)
+        where = CODE
+    write_atomically(folder / "agent.safetensors", to_bytes(arrays))
+    about["versions"] = {name: version(name) for name in ("deconfounded-imitation", "numpy")}
+    write_json(folder / "agent.json", {"class": f"{where}:{cls.__qualname__}", "settings": settings, **about})
+
+
+def describe(folder: Path) -> dict[str, Any]:
+    """agent.json. Raises InputError if there is none, or it is damaged."""
+    try:
+        return json.loads((folder / "agent.json").read_text())
+    except OSError:
+        raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
+    except ValueError:
+        raise InputError(f"{folder / 'agent.json'} is damaged; run the benchmark again") from None
+
+
+def load(folder: Path | str) -> Agent:
+    """The agent kept in a folder, ready for `begin`. Raises InputError if it is missing or damaged.
+
+    The class that agent.json names is imported, so that loading an agent is running its code.
+    """
+    folder = Path(folder)
+    about = describe(folder)
+    try:
+        where, _, name = about["class"].rpartition(":")
+        cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
+        if not (inspect.isclass(cls) and issubclass(cls, Agent)):
+            raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
+        return cls.from_state(about["settings"], load_file(folder / "agent.safetensors"))
+    except (SafetensorError, OSError, KeyError, RuntimeError, TypeError) as error:
+        raise InputError(f"the agent in {folder} is damaged ({outside.told(error)}); run the benchmark again") from None
