@@ -102,7 +102,7 @@ def make_registered_vec(
     if max_episode_steps not in (None, horizon):
         raise InputError(
             f"max_episode_steps of {name} was {max_episode_steps}; it must be {horizon} here, or left out:"
-            " vectorization_mode='sync' takes others"
+            " vectorization_mode='sync' takes shorter ones"
         )
     return make_vec(name, num_envs, **kwargs)
 
