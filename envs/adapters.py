@@ -27,6 +27,35 @@ def _observation_space(task: Task, privileged: bool) -> spaces.Box:
     return spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
+def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
+    """What gymnasium wants to know of pictures. Raises InputError for a render_mode that is none."""
+    if render_mode not in (None, "rgb_array"):
+        raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be 'rgb_array' or None")
+    return {"render_modes": ["rgb_array"], "render_fps": round(1 / task.control_dt)}
+
+
+class _Pictures:
+    """Pictures of the environments of a batch; each has a painter, made again when its theta has changed."""
+
+    def __init__(self, batch: BatchEnv) -> None:
+        self._batch = batch
+        self._action = np.zeros((batch.n, *(batch.task.action_space.shape or (1,))))
+        self._painters: dict[int, tuple[NDArray[Any], Painter]] = {}
+
+    def act(self, action: NDArray[Any], alive: NDArray[np.bool_]) -> None:
+        """Remember the actions [N, A] that led to the next pictures: of environments that went on, `alive` [N]."""
+        self._action = np.where(alive[:, None], action, self._action)
+
+    def __call__(self, i: int) -> NDArray[np.uint8]:
+        """Environment i -> [H, W, 3]. Raises InputError before the first reset, and where no picture can be made."""
+        if not self._batch.state.size:
+            raise InputError("render was called before the first reset; reset once")
+        theta = self._batch.theta[i].copy()
+        if i not in self._painters or (self._painters[i][0] != theta).any():
+            self._painters[i] = theta, self._batch.task.painter(theta)
+        return self._painters[i][1](self._batch.state[i], self._action[i])
+
+
 class GymEnv(gym.Env[Any, Any]):
     """One environment with gymnasium's interface: the batch of one.
 
@@ -34,56 +63,54 @@ class GymEnv(gym.Env[Any, Any]):
     theta is in no observation (but for privileged=True, for experts) and in no info. Raises InputError for bad input.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 25}
-
     def __init__(self, task: Task, privileged: bool = False, render_mode: str | None = None) -> None:
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be 'rgb_array' or None")
+        self.metadata = _metadata(task, render_mode)
         self.task, self.render_mode = task, render_mode
         self.batch = BatchEnv(task, 1, privileged)
         self.observation_space = _observation_space(task, privileged)
         self.action_space = copy.deepcopy(task.action_space)
-        self.metadata = {**self.metadata, "render_fps": round(1 / task.control_dt)}
-        self._action = np.zeros(self.action_space.shape or (1,))
-        self._painter: Painter | None = None
+        self._pictures, self._warned = _Pictures(self.batch), False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
-        if not (options or {}).get("keep_theta"):
-            self._painter = None
-        return self.batch.reset(seed, options)[0], {}
+        obs = self.batch.reset(seed, options)[0]
+        self._warned = False
+        return obs, {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        self._action = np.asarray(action)
-        row = np.reshape(self._action, (1,)) if self._action.size == 1 else self._action
-        obs, reward, terminated, truncated = self.batch.step(row[None])
+        alive, row = self.batch.alive, np.asarray(action)
+        row = np.reshape(row, (1, 1)) if row.size == 1 else row[None]
+        obs, reward, terminated, truncated = self.batch.step(row)
+        self._pictures.act(row, alive)
+        if not alive[0] and not self._warned:
+            gym.logger.warn(f"step of {self.task.name} was called after the end of an episode; it moves nothing: reset")
+            self._warned = True
         return obs[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
 
     def render(self) -> Any:
-        if self.render_mode is None:
-            return None
-        if not self.batch.state.size:
-            raise InputError("render was called before the first reset; reset once")
-        if self._painter is None:
-            self._painter = self.task.painter(self.batch.theta[0])
-        return self._painter(self.batch.state[0], self._action.reshape(-1))
+        return None if self.render_mode is None else self._pictures(0)
 
 
 class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
 
-    A finished environment is reset by the next step (AutoresetMode.NEXT_STEP), with a theta of its own.
+    A finished environment is reset by the next step (AutoresetMode.NEXT_STEP): under the same theta until it has had
+    `episodes` of them, then with a new one of its own. `reset` takes the options of GymEnv.reset, keep_theta as a mask
+    [N] too: kept, an environment starts the next episode of its trial; else the first of a new one.
     """
 
-    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
-
-    def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
-        if n < 1:
-            raise InputError(f"the number of environments was {n}; it must be at least 1")
-        self.task, self.num_envs = task, n
+    def __init__(
+        self, task: Task, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
+    ) -> None:
+        for what, given in (("environments", n), ("episodes", episodes)):
+            if given < 1:
+                raise InputError(f"the number of {what} was {given}; it must be at least 1")
+        self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode.NEXT_STEP}
+        self.task, self.num_envs, self.episodes, self.render_mode = task, n, episodes, render_mode
         self.batch = BatchEnv(task, n, privileged)
+        self._pictures, self._episode = _Pictures(self.batch), np.zeros(n, int)
         self.single_observation_space = _observation_space(task, privileged)
         self.single_action_space = copy.deepcopy(task.action_space)
         self.observation_space = batch_space(self.single_observation_space, n)
@@ -92,14 +119,27 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        return self.batch.reset(seed, options), {}
+        obs = self.batch.reset(seed, options)
+        self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
+        return obs, {}
 
     def step(
         self, actions: Any
     ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
         array = np.asarray(actions)
         rows = array[:, None] if array.ndim == 1 else array
-        return *self.batch.step(rows, autoreset=True), {}
+        alive = self.batch.alive
+        obs, reward, terminated, truncated = self.batch.step(rows)
+        self._pictures.act(rows, alive)
+        if not alive.all():
+            keep = self._episode < self.episodes
+            obs = self.batch.reset(options={"keep_theta": keep}, where=~alive)
+            self._episode = np.where(alive, self._episode, np.where(keep, self._episode + 1, 1))
+        return obs, reward, terminated, truncated, {}
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """One picture [H, W, 3] for each environment; None without a render_mode."""
+        return None if self.render_mode is None else tuple(self._pictures(i) for i in range(self.num_envs))
 
 
 class DmEnv(dm_env.Environment):
@@ -107,7 +147,7 @@ class DmEnv(dm_env.Environment):
 
     def __init__(self, task: Task, privileged: bool = False, seed: int | None = None) -> None:
         self.task, self._batch = task, BatchEnv(task, 1, privileged)
-        self._space = _observation_space(task, privileged)
+        self._space, self._pictures = _observation_space(task, privileged), _Pictures(self._batch)
         self._batch.seed(seed)
 
     def reset(self, options: dict[str, Any] | None = None) -> dm_env.TimeStep:
@@ -117,11 +157,17 @@ class DmEnv(dm_env.Environment):
     def step(self, action: Any) -> dm_env.TimeStep:
         if not self._batch.alive[0]:
             return self.reset()
-        obs, reward, terminated, truncated = self._batch.step(np.reshape(action, (1, -1)))
+        alive, row = self._batch.alive, np.reshape(action, (1, -1))
+        obs, reward, terminated, truncated = self._batch.step(row)
+        self._pictures.act(row, alive)
         if terminated[0]:
             return dm_env.termination(float(reward[0]), obs[0])
         end = dm_env.truncation if truncated[0] else dm_env.transition
         return end(float(reward[0]), obs[0])
+
+    def render(self) -> NDArray[np.uint8]:
+        """The picture [H, W, 3] of the present state. Raises InputError before the first reset."""
+        return self._pictures(0)
 
     def observation_spec(self) -> specs.BoundedArray:
         space = self._space

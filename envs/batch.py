@@ -54,37 +54,51 @@ class BatchEnv:
     ) -> NDArray[np.float32]:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
-        options: `keep_theta` True goes on with the theta at hand (the next episode of a trial); `theta` [L] or
-        [N, L] forces one. Neither moves the start or the noise. Raises InputError for a theta out of bounds.
+        options: `keep_theta` True, or a mask [N], goes on with the theta at hand (the next episode of a trial), the
+        others draw a new one; `theta` [L] or [N, L] forces one. Neither moves the start or the noise. Raises
+        InputError for a theta out of bounds and for a mask that is none.
         """
         options = options or {}
         if unknown := set(options) - {"keep_theta", "theta"}:
             raise InputError(f"reset option {sorted(unknown)[0]!r} is unknown; there are keep_theta and theta")
-        keep, forced = bool(options.get("keep_theta")), options.get("theta")
-        if keep and forced is not None:
+        keep, forced = self._keep_mask(options.get("keep_theta", False)), options.get("theta")
+        if keep.any() and forced is not None:
             raise InputError("reset was given keep_theta and theta; give one of them")
         first = not self.state.size
-        if keep and first:
+        if keep.any() and first:
             raise InputError("keep_theta was given before the first reset; reset once without it")
         if forced is not None:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
         rows = self._every if where is None else np.flatnonzero(where)
-        theta_rng, start_rng, noise_rng = (
-            Streams(streams) for streams in zip(*(self._streams[i] for i in rows.tolist()), strict=True)
-        )
-        if not keep:
-            theta = self.task.sample_theta(theta_rng) if forced is None else forced[rows]
-            for i, row in zip(rows.tolist(), theta, strict=True):
+        theta_rng, start_rng, noise_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
+        new = ~keep[rows]
+        if new.any():
+            drawing = Streams([rng for rng, draws in zip(theta_rng, new, strict=True) if draws])
+            theta = self.task.sample_theta(drawing) if forced is None else forced[rows]
+            for i, row in zip(rows[new].tolist(), theta, strict=True):
                 self.simulator.set_theta(i, row)
-        start, noise = self.task.init_state(start_rng), self.task.sample_noise(noise_rng)
+        start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
         if first:
             self.state = np.zeros((self.n, start.shape[1]))
             self._noise = np.zeros((self.n, *noise.shape[1:]))
         self.state[rows], self._noise[rows] = start, noise
         self._steps[rows], self.alive[rows] = 0, True
         return self.observe()
+
+    def _keep_mask(self, keep: object) -> NDArray[np.bool_]:
+        """True, False or booleans [N] -> booleans [N]. Raises InputError for anything else."""
+        try:
+            mask = np.asarray(keep)
+        except ValueError:  # rows of many lengths
+            mask = np.asarray(keep, object)
+        if mask.dtype != bool or mask.shape not in ((), (self.n,)):
+            raise InputError(
+                f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be True, False, or bool of shape"
+                f" ({self.n},), one for each environment"
+            )
+        return np.broadcast_to(mask, self.n)
 
     def observe(self) -> NDArray[np.float32]:
         """Observations [N, O] of the present states; the privileged view appends the encoded theta."""
@@ -93,12 +107,10 @@ class BatchEnv:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
 
-    def step(
-        self, action: object, autoreset: bool = False
-    ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
-        Environments whose episode is over are not stepped; autoreset: they start the next one, with a theta of its own.
+        Environments whose episode is over are not stepped.
         Actions out of [-1, 1] are clipped. Raises InputError for a wrong shape or NaN, and before the first reset.
         """
         if not self.state.size:
@@ -122,6 +134,4 @@ class BatchEnv:
             self.state = self.state.copy()  # what agents remember of the one before stays
             self.state[rows] = after
         self.alive = ~(over | terminated | truncated)
-        if autoreset and rows is not None:
-            return self.reset(where=over), reward, terminated, truncated
         return self.observe(), reward, terminated, truncated

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from importlib.metadata import entry_points
+from typing import Any
 
 import gymnasium
 
@@ -27,6 +28,7 @@ def register(cls: type[Task]) -> type[Task]:
         cls().gym_id,
         entry_point="deconfounded.envs:make",
         vector_entry_point="deconfounded.envs:make_registered_vec",
+        max_episode_steps=cls.horizon,
         kwargs={"name": cls.name},
     )
     return cls
@@ -72,14 +74,24 @@ def make(name: str, privileged: bool = False, render_mode: str | None = None) ->
     return GymEnv(get(name), privileged, render_mode)
 
 
-def make_vec(name: str, n: int, privileged: bool = False) -> GymVectorEnv:
-    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool."""
-    return GymVectorEnv(get(name), n, privileged)
+def make_vec(
+    name: str, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
+) -> GymVectorEnv:
+    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool; trials are of `episodes` each."""
+    return GymVectorEnv(get(name), n, privileged, episodes, render_mode)
 
 
-def make_registered_vec(name: str, num_envs: int = 1, privileged: bool = False) -> GymVectorEnv:
-    """`make_vec` as gymnasium.make_vec calls it."""
-    return make_vec(name, num_envs, privileged)
+def make_registered_vec(
+    name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kwargs: Any
+) -> GymVectorEnv:
+    """`make_vec` as gymnasium.make_vec calls it, with the registered time limit. Raises InputError for another one."""
+    horizon = get(name).horizon
+    if max_episode_steps not in (None, horizon):
+        raise InputError(
+            f"max_episode_steps of {name} was {max_episode_steps}; it must be {horizon} here, or left out:"
+            " vectorization_mode='sync' takes shorter ones"
+        )
+    return make_vec(name, num_envs, **kwargs)
 
 
 def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmEnv:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 import os
 import subprocess
@@ -86,7 +87,8 @@ class Painter:
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
         self._renderer = mujoco.Renderer(model, height, width)
-        weakref.finalize(self, _close, self._renderer)  # with this painter, and before the GL library is gone
+        # With this painter, and before the GL library is gone: finalize's own place at exit can be after that.
+        atexit.register(weakref.finalize(self, _close, self._renderer))
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
         """Full physics state [S] -> picture [H, W, 3]."""

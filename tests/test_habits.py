@@ -1,0 +1,341 @@
+"""What users of gymnasium and dm_env are in the habit of doing: trials in vectors, pictures, videos, time limits."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
+from numpy.typing import NDArray
+
+from deconfounded import envs
+from deconfounded.envs.streams import Array
+from tests.tools import actions, gl_works, streams
+
+TASKS = envs.names()
+CONTROL = "slippery_cartpole"
+
+
+def flat(task: envs.Task, n: int, steps: int) -> Array:
+    """[steps, n, ...] actions as gymnasium wants them."""
+    acts = actions(task, n, steps)
+    return acts[..., 0].astype(int) if task.action_space.shape == () else acts
+
+
+def thetas(task: envs.Task, seed: int, k: int) -> Array:
+    """The first k thetas [k, L] of the environment of that seed."""
+    rng = streams(np.random.SeedSequence(seed).spawn(3)[0])  # type: ignore[arg-type]
+    return np.concatenate([task.sample_theta(rng) for _ in range(k)])
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestTrials:
+    @pytest.mark.parametrize("episodes", [1, 3])
+    def test_vector_equals_single_environments(self, name: str, episodes: int) -> None:
+        """Bit for bit, with keep_theta given by hand; theta is the next of its own stream after `episodes` of them."""
+        task, n = envs.get(name), 3
+        vec, single = envs.make_vec(name, n, episodes=episodes), [envs.make(name) for _ in range(n)]
+        drawn = [thetas(task, 7 + i, 9) for i in range(n)]
+        obs = vec.reset(seed=7)[0]
+        ended, over = np.zeros(n, int), np.zeros(n, bool)
+        for i, env in enumerate(single):
+            np.testing.assert_array_equal(env.reset(seed=7 + i)[0], obs[i])
+        for action in flat(task, n, 4 * task.horizon + 5):
+            obs, reward, terminated, truncated, info = vec.step(action)
+            assert info == {}
+            for i, env in enumerate(single):
+                if over[i]:
+                    keep = {"keep_theta": True} if ended[i] % episodes else None
+                    np.testing.assert_array_equal(env.reset(options=keep)[0], obs[i])
+                    assert (reward[i], terminated[i], truncated[i]) == (0, False, False)
+                else:
+                    one = env.step(action[i])
+                    np.testing.assert_array_equal(one[0], obs[i])
+                    assert one[1:4] == (reward[i], terminated[i], truncated[i])
+                if ended[i] // episodes < 9:
+                    np.testing.assert_array_equal(vec.batch.theta[i], drawn[i][ended[i] // episodes])
+            over = terminated | truncated
+            ended += over
+        assert (ended >= 4).all()
+
+    def test_a_mask_keeps_theta_and_moves_nobody(self, name: str) -> None:
+        """Kept, or not: each is, bit for bit, as in a batch where all are, or none is; its next theta is its next."""
+        task, n = envs.get(name), 4
+        mask = np.array([True, False, False, True])
+        acts = actions(task, n, 5)
+
+        def run(keep: bool | NDArray[np.bool_] | list[bool]) -> tuple[Array, Array]:
+            batch = envs.BatchEnv(task, n)
+            batch.reset(5)
+            seen, theta = [batch.reset(options={"keep_theta": keep})], [batch.theta.copy()]
+            for action in acts:
+                seen.append(batch.step(action)[0])
+            seen.append(batch.reset())
+            theta.append(batch.theta.copy())
+            return np.array(seen).swapaxes(0, 1), np.array(theta).swapaxes(0, 1)
+
+        kept, drawn, mixed, again = run(True), run(False), run(mask), run(mask.tolist())
+        for all_kept, none_kept, one, other in zip(kept, drawn, mixed, again, strict=True):
+            np.testing.assert_array_equal(one, np.where(mask[:, None, None], all_kept, none_kept))
+            np.testing.assert_array_equal(one, other)
+        for i in range(n):
+            own = thetas(task, 5 + i, 3)
+            np.testing.assert_array_equal(mixed[1][i], own[:2] if mask[i] else own[1:])
+
+    def test_a_mask_through_the_vector_env(self, name: str) -> None:
+        """Kept environments go on with their trial, the others start one: the autoreset counts from there."""
+        task = envs.get(name)
+        vec = envs.make_vec(name, 2, episodes=2)
+        vec.reset(seed=3)
+        vec.reset(options={"keep_theta": [True, False]})
+        first = vec.batch.theta.copy()
+        ended, over = np.zeros(2, int), np.zeros(2, bool)
+        own = thetas(task, 3, 2), thetas(task, 4, 3)
+        np.testing.assert_array_equal(first, [own[0][0], own[1][1]])
+        for action in flat(task, 2, task.horizon + 1):
+            *_, terminated, truncated, _ = vec.step(action)
+            for i in np.flatnonzero(over & (ended == 1)):
+                np.testing.assert_array_equal(vec.batch.theta[i], own[i][1])
+            over = terminated | truncated
+            ended += over
+        assert ended.all()
+
+    def test_bad_masks(self, name: str) -> None:
+        env, vec = envs.make(name), envs.make_vec(name, 3)
+        vec.reset(seed=0)
+        env.reset(seed=0)
+        for wrong in ([True, False], [1, 0, 1], 1, None, "yes", [[True], [True, False]], np.ones((3, 1), bool)):
+            with pytest.raises(
+                envs.InputError, match=r"^keep_theta was .*must be True, False, or bool of shape \(3,\)"
+            ):
+                vec.reset(options={"keep_theta": wrong})
+        with pytest.raises(envs.InputError, match=r"must be True, False, or bool of shape \(1,\)"):
+            env.reset(options={"keep_theta": np.ones(3, bool)})
+        lows = [lat.low for lat in vec.task.latents]
+        with pytest.raises(envs.InputError, match="give one of them"):
+            vec.reset(options={"keep_theta": [True, False, False], "theta": lows})
+        with pytest.raises(envs.InputError, match="before the first reset"):
+            envs.make_vec(name, 3).reset(options={"keep_theta": [False, False, True]})
+        with pytest.raises(envs.InputError, match=r"^the number of episodes was 0; it must be at least 1$"):
+            envs.make_vec(name, 3, episodes=0)
+
+
+def test_a_forced_theta_starts_a_trial() -> None:
+    """It stays for `episodes` episodes, and then the first theta of the stream follows."""
+    task = envs.get(CONTROL)
+    vec = envs.make_vec(CONTROL, 2, episodes=2)
+    forced = task.theta_grid(3)[[1, 1]]
+    vec.reset(seed=3, options={"theta": forced})
+    ended, over = np.zeros(2, int), np.zeros(2, bool)
+    for action in flat(task, 2, 2 * task.horizon + 3):
+        *_, terminated, truncated, _ = vec.step(action)
+        for i in range(2):
+            if ended[i] <= 2 and over[i]:
+                expected = forced[i] if ended[i] < 2 else thetas(task, 3 + i, 1)[0]
+                np.testing.assert_array_equal(vec.batch.theta[i], expected)
+        over = terminated | truncated
+        ended += over
+    assert (ended >= 2).all()
+
+
+@pytest.mark.parametrize("name", TASKS)
+class TestTimeLimits:
+    def test_registered_limit_is_the_task_s(self, name: str) -> None:
+        """The made environment truncates when ours does; only an episode that ends by itself then is called both."""
+        task, n = envs.get(name), 8
+        assert gymnasium.spec(task.gym_id).max_episode_steps == task.horizon
+        for seed in range(n):
+            made, own = gymnasium.make(task.gym_id), envs.make(name)
+            assert made.spec is not None
+            assert made.spec.max_episode_steps == task.horizon
+            np.testing.assert_array_equal(made.reset(seed=seed)[0], own.reset(seed=seed)[0])
+            for step, action in enumerate(flat(task, n, task.horizon)[:, seed], start=1):
+                obs, reward, terminated, truncated, info = made.step(action)
+                mine = own.step(action)
+                np.testing.assert_array_equal(obs, mine[0])
+                assert (reward, terminated, info) == (mine[1], mine[2], {})
+                assert truncated == (mine[3] or step == task.horizon)
+                if terminated or truncated:
+                    break
+            assert mine[2] or step == task.horizon
+
+    def test_vectors_of_gymnasium(self, name: str) -> None:
+        """By the vector entry point and in a SyncVectorEnv: the same bits, over an autoreset."""
+        task = envs.get(name)
+        ours = gymnasium.make_vec(task.gym_id, num_envs=3, vectorization_mode="vector_entry_point")
+        sync = gymnasium.make_vec(task.gym_id, num_envs=3, vectorization_mode="sync")
+        assert isinstance(ours, envs.GymVectorEnv)
+        assert isinstance(sync, SyncVectorEnv)
+        assert ours.spec is not None
+        assert ours.spec.max_episode_steps == task.horizon
+        np.testing.assert_array_equal(ours.reset(seed=1)[0], sync.reset(seed=1)[0])
+        for action in flat(task, 3, task.horizon + 3):
+            mine, theirs = ours.step(action), sync.step(action)
+            for x, y in zip(mine[:3], theirs[:3], strict=True):
+                np.testing.assert_array_equal(x, y)
+            np.testing.assert_array_equal(mine[3] | mine[2], theirs[3] | theirs[2])
+        trials = gymnasium.make_vec(task.gym_id, num_envs=2, episodes=4, privileged=True)
+        assert isinstance(trials, envs.GymVectorEnv)
+        assert (trials.episodes, trials.batch.privileged) == (4, True)
+        with pytest.raises(envs.InputError, match=rf"^max_episode_steps of {name} was 7; it must be {task.horizon} "):
+            gymnasium.make_vec(task.gym_id, num_envs=3, max_episode_steps=7)
+
+    def test_stepping_on_after_the_end_warns_once(self, name: str) -> None:
+        """Once an episode, as gymnasium's own do; dm_env restarts instead."""
+        task = envs.get(name)
+        env = envs.make(name)
+        acts = flat(task, 1, task.horizon)[:, 0]
+        for _ in range(2):
+            env.reset(seed=0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                for action in acts:
+                    _, _, terminated, truncated, _ = env.step(action)
+                    if terminated or truncated:
+                        break
+            with pytest.warns(UserWarning, match=f"step of {name} was called after the end of an episode") as caught:
+                rewards = [env.step(acts[0])[1] for _ in range(3)]
+            assert len(caught) == 1
+            assert rewards == [0, 0, 0]
+        dm = envs.make_dm(name, seed=0)
+        dm.reset()
+        steps = [dm.step(action) for action in acts]
+        end = next((i for i, step in enumerate(steps) if step.last()), None)
+        assert end is not None
+        assert (steps[end + 1] if end + 1 < len(steps) else dm.step(acts[0])).first()
+
+
+def test_made_without_an_import_of_ours() -> None:
+    """Gymnasium loads no plug-ins, but the module that an id names: in a process that has imported nothing else."""
+    code = (
+        "import gymnasium; env = gymnasium.make('deconfounded.envs:deconf/SlipperyCartpole-v1');"
+        "env.reset(seed=0); print(env.unwrapped.task.name);"
+        "print(gymnasium.make_vec('deconfounded.envs:deconf/SlipperyCartpole-v1', num_envs=3).reset(seed=0)[0].shape)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [CONTROL, f"(3, {len(envs.get(CONTROL).observation)})"]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_render_modes(name: str) -> None:
+    """Pictures are made where they were asked for, at the speed of the task."""
+    for env in (envs.make(name), envs.make_vec(name, 2)):
+        env.reset(seed=0)
+        assert env.render() is None
+        assert env.metadata["render_modes"] == ["rgb_array"]
+        assert env.metadata["render_fps"] == round(1 / envs.get(name).control_dt)
+    line = f"^render_mode of {name} was 'human'; it must be 'rgb_array' or None$"
+    for made in (lambda: envs.make(name, render_mode="human"), lambda: envs.make_vec(name, 2, render_mode="human")):
+        with pytest.raises(envs.InputError, match=line):
+            made()
+    for early in (envs.make(name, render_mode="rgb_array"), envs.make_vec(name, 2, render_mode="rgb_array")):
+        with pytest.raises(envs.InputError, match="render was called before the first reset"):
+            early.render()
+    with pytest.raises(envs.InputError, match="render was called before the first reset"):
+        envs.make_dm(name).render()
+
+
+@pytest.mark.skipif(not gl_works(), reason="no GL")
+@pytest.mark.parametrize("name", TASKS)
+class TestPictures:
+    def test_vectors_and_dm_env_draw_as_single_environments(self, name: str) -> None:
+        """Pixel for pixel SyncVectorEnv's, over an autoreset; dm_env's are those of the first."""
+        task, n = envs.get(name), 2
+        ours = envs.make_vec(name, n, render_mode="rgb_array")
+        sync = SyncVectorEnv([lambda: envs.make(name, render_mode="rgb_array") for _ in range(n)])
+        dm = envs.make_dm(name, seed=2)
+        dm.reset()
+        for vec in (ours, sync):
+            vec.reset(seed=2)
+        ended = np.zeros(n, int)
+        for t, action in enumerate(flat(task, n, task.horizon + 3)):
+            _, _, terminated, truncated, _ = ours.step(action)
+            sync.step(action)
+            dm.step(action[0])
+            if t < 2 or (ended > 0).any() or t == task.horizon - 1:
+                pictures = ours.render()
+                assert isinstance(pictures, tuple)
+                for mine, theirs in zip(pictures, sync.render(), strict=True):
+                    assert (mine.shape, mine.dtype) == ((240, 320, 3), np.uint8)
+                    np.testing.assert_array_equal(mine, theirs)
+                np.testing.assert_array_equal(dm.render(), pictures[0])
+            if t > 2 and (ended > 0).all():
+                break
+            ended += terminated | truncated
+        assert ended.all()
+
+    def test_a_painter_lives_as_long_as_its_theta(self, name: str) -> None:
+        """A new one for each new theta, and for no other environment."""
+        task = envs.get(name)
+        made: list[Array] = []
+        painter = task.painter
+
+        def spy(theta: Array) -> object:
+            made.append(theta)
+            return painter(theta)
+
+        task.painter = spy  # type: ignore[method-assign, assignment]
+        vec = envs.GymVectorEnv(task, 2, render_mode="rgb_array")
+        vec.reset(seed=0)
+        vec.render()
+        vec.render()
+        np.testing.assert_array_equal(made, vec.batch.theta)
+        low, high = ([getattr(lat, bound) for lat in task.latents] for bound in ("low", "high"))
+        for options in ({"keep_theta": True}, {"theta": [low, high]}, {"theta": [low, low]}):
+            made.clear()
+            before = vec.batch.theta.copy()
+            vec.reset(options=options)
+            vec.render()
+            now = vec.batch.theta
+            np.testing.assert_array_equal(np.reshape(made, (-1, now.shape[1])), now[(now != before).any(1)])
+        np.testing.assert_array_equal(made, [low])  # the second alone
+
+
+@pytest.mark.skipif(not gl_works(), reason="no GL")
+def test_painters_that_live_to_the_end_leave_in_silence() -> None:
+    """The GL library is gone before the first finalizer of the process, whose place the others share."""
+    code = (
+        "import weakref; kept = {1}; weakref.finalize(kept, print)\n"
+        "from deconfounded import envs; vec = envs.make_vec('slippery_cartpole', 2, render_mode='rgb_array')\n"
+        "vec.reset(seed=0); vec.render()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not gl_works(), reason="no GL")
+class TestVideos:
+    def test_record_video(self, tmp_path: Path) -> None:
+        """A frame for the reset and one for each step, at the task's speed."""
+        env = gymnasium.make("deconf/SlipperyCartpole-v1", render_mode="rgb_array")
+        recorded = RecordVideo(env, str(tmp_path / "one"), episode_trigger=lambda _: True)
+        recorded.reset(seed=0)
+        for action in flat(envs.get(CONTROL), 1, 10)[:, 0]:
+            recorded.step(action)
+        recorded.close()
+        film(tmp_path / "one" / "rl-video-episode-0.mp4", 11, (240, 320, 3))
+
+    def test_vector_record_video(self, tmp_path: Path) -> None:
+        vec = envs.make_vec(CONTROL, 4, render_mode="rgb_array")
+        recorded = VectorRecordVideo(vec, str(tmp_path / "four"), episode_trigger=lambda _: True)
+        recorded.reset(seed=0)
+        for action in flat(envs.get(CONTROL), 4, 10):
+            recorded.step(action)
+        recorded.close()
+        film(tmp_path / "four" / "rl-video-episode-0.mp4", 11, (480, 640, 3))
+
+
+def film(path: Path, frames: int, shape: tuple[int, int, int]) -> None:
+    """The file holds that many frames of that shape, at the speed of CONTROL, that are not all the same."""
+    seen = iio.imread(path)
+    assert seen.shape == (frames, *shape)
+    assert (seen[0] != seen[-1]).any()
+    assert round(iio.immeta(path)["fps"]) == round(1 / envs.get(CONTROL).control_dt)
