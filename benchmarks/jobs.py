@@ -119,7 +119,11 @@ class BenchmarkJob(Job):
 def spaces(task: envs.Task) -> dict[str, int]:
     """What an agent must fit: O, A, and the number of discrete actions or 0."""
     discrete = int(task.action_space.n) if isinstance(task.action_space, Discrete) else 0
-    return {"observations": len(task.observation), "action": int(np.prod(task.action_space.shape)), "actions": discrete}
+    return {
+        "observations": len(task.observation),
+        "action": int(np.prod(task.action_space.shape or 1)),
+        "actions": discrete,
+    }
 
 
 def evaluate(

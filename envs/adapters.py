@@ -129,13 +129,15 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         array = np.asarray(actions)
         rows = array[:, None] if array.ndim == 1 else array
         alive = self.batch.alive
-        obs, reward, terminated, truncated = self.batch.step(rows)
-        self._pictures.act(rows, alive)
-        if not alive.all():
-            keep = self._episode < self.episodes
-            obs = self.batch.reset(options={"keep_theta": keep}, where=~alive)
-            self._episode = np.where(alive, self._episode, np.where(keep, self._episode + 1, 1))
-        return obs, reward, terminated, truncated, {}
+        ended = self.batch.advance(rows)
+        if self.render_mode is not None:
+            self._pictures.act(rows, alive)
+        if alive.all():
+            return self.batch.observe(), *ended, {}
+        keep = self._episode < self.episodes
+        obs = self.batch.reset(options={"keep_theta": keep}, where=~alive)
+        self._episode = np.where(alive, self._episode, np.where(keep, self._episode + 1, 1))
+        return obs, *ended, {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One picture [H, W, 3] for each environment; None without a render_mode."""

@@ -110,9 +110,14 @@ class BatchEnv:
     def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
-        Environments whose episode is over are not stepped.
-        Actions out of [-1, 1] are clipped. Raises InputError for a wrong shape or NaN, and before the first reset.
+        Environments whose episode is over are not stepped. Actions out of [-1, 1] are clipped. Raises InputError for a
+        wrong shape or NaN, and before the first reset.
         """
+        ended = self.advance(action)
+        return self.observe(), *ended
+
+    def advance(self, action: object) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+        """`step` without its observation, for who resets what has ended before looking."""
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")
         task, checked, over = self.task, self.task.check_action(action, self.n), ~self.alive
@@ -134,4 +139,4 @@ class BatchEnv:
             self.state = self.state.copy()  # what agents remember of the one before stays
             self.state[rows] = after
         self.alive = ~(over | terminated | truncated)
-        return self.observe(), reward, terminated, truncated
+        return reward, terminated, truncated

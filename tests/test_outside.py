@@ -1,0 +1,378 @@
+"""Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; README's."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import deconfounded
+from deconfounded import envs
+from deconfounded.benchmarks import catalogue, certify
+from deconfounded.benchmarks.guest import Guest
+from deconfounded.benchmarks.jobs import evaluate
+from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, Allowed, Context, stream
+from deconfounded.experts import policy, saved
+from deconfounded.experts.demos import run_trials
+from tests.tools import tiny_preset
+
+ROOT = Path(__file__).parents[1]
+CONTROL = "slippery_cartpole"
+BENT = "bent_cartpole.py:BentCartpole"
+
+
+def snippets(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """README's task, expert and method, and packages that would be in the way."""
+    made = tmp_path_factory.mktemp("own")
+    python = snippets("python")
+    (made / "bent_cartpole.py").write_text(next(code for code in python if "class BentCartpole" in code))
+    (made / "bent_cartpole.xml").write_text(snippets("xml")[0])
+    (made / "linear.py").write_text(next(code for code in python if "def control" in code))
+    method = next(code for code in python if "class Clone" in code)
+    (made / "my_rnn.py").write_text(method.replace("range(200)", "range(2)"))
+    for name in ("envs", "benchmarks", "experts", "deconf"):
+        (made / name).mkdir()
+        (made / name / "__init__.py").write_text("raise RuntimeError('somebody else's')")
+    return made
+
+
+def deconf(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
+    environ = {**os.environ, "MUJOCO_GL": "off", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "deconfounded", *args]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
+
+
+def test_run_play_score(folder: Path) -> None:
+    """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
+    assert len((folder / "my_rnn.py").read_text().splitlines()) <= 50
+    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "cloning.updates=5")
+    mine = ("--task", BENT, "--expert", "linear.py:control")
+    done = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small)
+    assert done.returncode == 0, done.stderr
+    run = folder / "results" / "bent_cartpole-smoke"
+    results = json.loads((run / "results.json").read_text())
+    assert results["set"] == ["eval_trials=4", "expert_trials=8", "cloning.updates=5"]
+    assert results["expert"] == "linear.py:control"
+    assert results["methods"]["my_rnn"]["tier"] == "1"
+    assert results["methods"]["my_rnn"]["budget"] == {"expert_trials": 8}
+    assert "Clone cannot be saved" in done.stdout
+    again = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small, "--resume")
+    assert again.returncode == 0, again.stderr
+    assert "seed 0:" not in again.stdout
+
+    agent = ("--agent", str(run / "agents" / "blind_bc-0"))
+    played = deconf(folder, "play", *agent, "--task", BENT, "--theta", "0.2", "--episodes", "2")
+    assert re.search(r"bend 0\.2 rad: returns [\d.]+ [\d.]+$", played.stdout.strip()), played.stderr
+    scored = deconf(folder, "score", *agent, *mine, "--trials", "4", "--range", "bend=0.4:0.5", "--out", "s.json")
+    assert scored.returncode == 0, scored.stderr
+    found = json.loads((folder / "s.json").read_text())
+    assert len(found["score"]) == 5
+    wrong = deconf(folder, "play", *agent, "--task", "bandit")
+    assert wrong.returncode == 2
+    assert wrong.stderr.startswith("error: the agent in ")
+
+    with (folder / "linear.py").open("a") as file:
+        file.write("# another\n")
+    changed = deconf(folder, "run", *mine, "--methods", "blind_bc", *small, "--resume")
+    assert "holds a run with another expert" in changed.stderr
+    assert not list((ROOT / "assets").rglob("bent_cartpole*"))
+
+
+def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is known by its name from then on, to gymnasium too; its weights are looked for beside it."""
+    monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
+    task = envs.get(f"{folder}/{BENT}")
+    assert task.name == "bent_cartpole"
+    assert task.reference == f"{folder}/{BENT}"
+    assert policy.path(task) == folder / "bent_cartpole.safetensors"
+    assert type(envs.get("bent_cartpole")) is type(task)
+    with pytest.raises(envs.InputError, match=r"run `deconf train --task .*bent_cartpole.py:BentCartpole`"):
+        policy.load(task)
+    expert = policy.load(task, f"{folder}/linear.py:control")
+    result = certify.certify(task, expert, trials=8, grid=5)
+    assert result["return_expert"] > 2 * result["return_random"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "says"),
+    [
+        ("x = 1", "Task", "has no 'Task'; it has x"),
+        ("Task = 3", "Task", "is 3; it must be a subclass of deconfounded.envs.Task"),
+        ("1 / 0", "Task", r"division by zero \(ZeroDivisionError, mine.py:1\)"),
+        ("import nonsuch", "Task", "module nonsuch was not found"),
+        ("def f(:", "Task", "SyntaxError, "),
+        (
+            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
+            "Task",
+            "'tilted_cartpole' of .* is taken by .*; give it another name",
+        ),
+    ],
+)
+def test_a_bad_file_is_one_line(tmp_path: Path, text: str, name: str, says: str) -> None:
+    (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(envs.InputError, match=says) as caught:
+        envs.get(f"{tmp_path}/mine.py:{name}")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("reference", "says"), [("gone.py:T", "there is no file gone.py"), (":T", "must be path/file.py:name")]
+)
+def test_a_bad_reference_is_one_line(reference: str, says: str) -> None:
+    with pytest.raises(envs.InputError, match=says):
+        envs.get(reference)
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("return np.zeros(3)", r"gave shape \(3,\) for 2 observations; it must be \(2, 1\), finite"),
+        ("return np.full((len(obs), 1), np.nan)", "gave NaN or infinity"),
+        ("return obs.nonsuch", r"nonsuch' \(AttributeError, mine.py:3\)"),
+    ],
+)
+def test_a_bad_expert_is_one_line(tmp_path: Path, code: str, says: str) -> None:
+    (tmp_path / "mine.py").write_text(f"import numpy as np\ndef control(obs, theta):\n    {code}\n")
+    with pytest.raises(envs.InputError, match=says):
+        policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
+
+
+HEAD = """
+import numpy as np
+from deconfounded.deconf.given import uses
+from deconfounded.experts.demos import Agent
+
+class Still(Agent):
+    def begin(self, n): self.n = n
+    def reset(self, rngs): pass
+    def act(self, obs): return np.zeros((len(obs), 1))
+
+"""
+
+
+def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Context, Guest]:
+    """A method of that text, fitted."""
+    (folder / "mine.py").write_text(HEAD + text)
+    context = Context(envs.get(task), tiny_preset(), [0])
+    return context, Guest(context, "mine", f"{folder}/mine.py:fit", uses)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.demos.Agent"),
+        ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:12\)"),
+        ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
+        ("def fit(given): import os; os._exit(1)", r"its process was killed \(out of memory\?\)"),
+        ("def fit(given): given.explore(trials=0)", "asked for exploration, and declares"),
+    ],
+)
+def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"method mine: {says}" if "trials=0" not in text else says) as caught:
+        guest(tmp_path, text, CONTROL, "demonstrations")
+    assert "\n" not in str(caught.value)
+
+
+def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "METHODS", dict(catalogue.METHODS))
+    (tmp_path / "mine.py").write_text("def fit(given): pass")
+    with pytest.raises(envs.InputError, match=r"must be a function declared with @uses"):
+        catalogue.add(f"{tmp_path}/mine.py:fit")
+    (tmp_path / "other.py").write_text(HEAD + "@uses('the_test_set')\ndef fit(given): pass")
+    with pytest.raises(envs.InputError, match="a method uses 'the_test_set'; it may use demonstrations, exploration"):
+        catalogue.add(f"{tmp_path}/other.py:fit")
+    (tmp_path / "naive_rnn.py").write_text(HEAD + "@uses()\ndef fit(given): pass")
+    with pytest.raises(envs.InputError, match="would be called naive_rnn, which there is already"):
+        catalogue.add(f"{tmp_path}/naive_rnn.py:fit")
+    (tmp_path / "fine.py").write_text(HEAD + "@uses('queries', 'theta')\ndef best(given): pass")
+    assert catalogue.add(f"{tmp_path}/fine.py:best") == "fine_best"
+    assert catalogue.METHODS["fine_best"].tier == "sees theta"
+
+
+def test_guests_get_what_ours_get(tmp_path: Path) -> None:
+    """Demonstrations, theta, explorations and queries: bit for bit those of the context, and counted."""
+    text = """
+@uses("demonstrations", "exploration", "queries", "theta")
+def fit(given):
+    shown, theta = given.demonstrations, given.theta
+    free, (asked, labels) = given.explore(), given.query(Still(), 3)
+    np.savez("%s", shown=shown.obs, theta=theta, free=free.obs, asked=asked.action, labels=labels)
+    given.progress(1.0, imitation=0.5)
+    return Still()
+"""
+    out = tmp_path / "seen.npz"
+    context, agent = guest(tmp_path, text % out, CONTROL, "demonstrations", "exploration", "queries", "theta")
+    agent.close()
+    with np.load(out) as seen:
+        other = Context(envs.get(CONTROL), tiny_preset(), [0])
+        np.testing.assert_array_equal(seen["shown"], other.demonstrations.obs)
+        np.testing.assert_array_equal(seen["theta"], other.task.encode_theta(other.demonstrated_theta))
+        rngs = other.rngs
+        np.testing.assert_array_equal(seen["free"], other.explore(None, rngs).obs)
+        assert (seen["asked"] == 0).all()
+        assert seen["labels"].shape == (3, 5, 150, 1)
+        assert (seen["labels"] != 0).any()
+    budget = context.monitor.budget
+    assert budget["expert_trials"] == [4]
+    assert budget["exploration_trials"] == [4 + 3]
+    assert budget["thetas"] == [4]
+    assert budget["queries"][0] > 100
+
+
+HUNTER = """
+import sys, types
+
+def hunt(start, depth=60, limit=400_000):
+    # Every number within reach: attributes, containers, closures, defaults, globals, modules, slots.
+    seen, found, kinds, queue = set(), [], set(), [start]
+    while queue and len(seen) < limit:
+        thing = queue.pop()
+        if id(thing) in seen:
+            continue
+        seen.add(id(thing))
+        kinds.add(type(thing).__name__)
+        if isinstance(thing, (bool, str, bytes, type(None))):
+            continue
+        if isinstance(thing, (int, float, np.number)):
+            found.append(float(thing)) if abs(thing) < 1e30 else None
+            continue
+        if isinstance(thing, np.ndarray):
+            if thing.dtype.kind in "iuf" and thing.size < 100_000:
+                found.extend(thing.ravel().astype(float).tolist())
+            continue
+        if isinstance(thing, dict):
+            queue.extend(thing.keys()); queue.extend(thing.values()); continue
+        if isinstance(thing, (list, tuple, set, frozenset)):
+            queue.extend(thing); continue
+        if isinstance(thing, types.ModuleType) and not thing.__name__.startswith(("deconfounded", "outside", "__m")):
+            continue
+        for name in (*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "__defaults__"):
+            try:
+                queue.append(getattr(thing, name))
+            except Exception:
+                pass
+        if isinstance(thing, types.CellType):
+            try: queue.append(thing.cell_contents)
+            except ValueError: pass
+    return found, kinds
+"""
+HIDDEN = {"BatchEnv", "Context", "Physics", "NetworkExpert", "Simulator"}
+
+
+def test_a_hunter_finds_no_theta(tmp_path: Path) -> None:
+    """A method that walks all that is reachable from what it is handed, and from the agent that acts in evaluation.
+
+    It finds no theta of demonstrations, explorations or evaluation, no seed of these and no environment; the same walk
+    over what this side holds finds all of them.
+    """
+    text = f"""{HUNTER}
+class Spy(Still):
+    def __init__(self, given): self.given, self.acts = given, 0
+    def reset(self, rngs): self.rngs = rngs
+    def act(self, obs):
+        self.acts += 1
+        if self.acts in (40, 900):
+            write(hunt([self, obs, sys.modules, sys._getframe()]), f"act{{self.acts}}")
+        return super().act(obs)
+
+def write(hunted, name):
+    found, kinds = hunted
+    np.savez(f"{tmp_path}/{{name}}.npz", found=np.unique(found), kinds=sorted(kinds))
+
+@uses("demonstrations", "exploration", "queries")
+def fit(given):
+    given.demonstrations, given.explore(Still()), given.query()
+    write(hunt([given, fit, sys.modules, sys._getframe()]), "fit")
+    return Spy(given)
+"""
+    context, agent = guest(tmp_path, text, CONTROL, "demonstrations", "exploration", "queries")
+    evaluate(context, agent, True)
+    agent.close()
+    seeds = [stream(purpose, 0) for purpose in (DEMOS, EVALUATION)]
+    draws = context.rngs[0]
+    draws.integers(2**63)
+    explored = [stream(EXPLORATION, int(draws.integers(2**31))) for _ in range(2)]
+    hidden = [context.demonstrated_theta]
+    for seed in (*explored, stream(EVALUATION, 0)):
+        env = envs.BatchEnv(context.task, 4)
+        env.reset(seed)
+        hidden.append(env.theta)
+    thetas = np.concatenate(hidden).ravel()
+    for name in ("fit", "act40", "act900"):
+        with np.load(tmp_path / f"{name}.npz") as hunted:
+            assert len(hunted["found"]) > 1000
+            assert {"Given", "Generator", "Trials"} <= set(hunted["kinds"])
+            assert not HIDDEN & set(hunted["kinds"])
+            assert not np.isin(thetas, hunted["found"]).any()
+            assert not np.isin(np.add.outer([*seeds, *explored], range(4)), hunted["found"]).any()
+    space: dict = {}
+    exec("import numpy as np\n" + HUNTER, space)
+    found, kinds = space["hunt"]([context, Allowed(context, ["theta"]), stream(EVALUATION, 0)])
+    assert np.isin(context.env.theta, found).all()
+    assert np.isin(stream(EVALUATION, 0), found).all()
+    assert HIDDEN - {"Simulator"} <= kinds
+
+
+def test_salt_draws_other_thetas() -> None:
+    """Evaluation's alone: without a salt they are as they always were."""
+    assert stream(EVALUATION, 0, "") == stream(EVALUATION, 0)
+    assert len({stream(EVALUATION, 0, salt) for salt in ("", "a", "b", "ab")}) == 4
+
+
+def test_ours_see_what_they_declare() -> None:
+    """Makers are handed a context that opens what the catalogue says, and nothing else."""
+    context = Context(envs.get(CONTROL), tiny_preset(), [0])
+    for use, opens in (("demonstrations", "demonstrations"), ("exploration", "explore"), ("theta", "env")):
+        assert getattr(Allowed(context, [use]), opens) is not None
+        with pytest.raises(AttributeError, match="does not declare"):
+            getattr(Allowed(context, []), opens)
+
+
+class TestSaved:
+    """Agents that are kept: `deconfounded.load` in another process gives the same bits."""
+
+    def test_missing_or_damaged(self, tmp_path: Path) -> None:
+        with pytest.raises(envs.InputError, match=r"holds no agent.json"):
+            deconfounded.load(tmp_path)
+        (tmp_path / "agent.json").write_text("{")
+        with pytest.raises(envs.InputError, match="is damaged"):
+            deconfounded.load(tmp_path)
+        (tmp_path / "agent.json").write_text(
+            '{"class": "deconfounded.deconf.recurrent:RecurrentAgent", "settings": {}}'
+        )
+        (tmp_path / "agent.safetensors").write_bytes(b"half")
+        with pytest.raises(envs.InputError, match="is damaged"):
+            deconfounded.load(tmp_path)
+
+    def test_an_agent_from_outside(self, tmp_path: Path) -> None:
+        """It is kept with its code, and does not need the file it came from."""
+        text = """
+class Constant(Still):
+    def __init__(self, value): self.value = value
+    def act(self, obs): return np.full((len(obs), 1), self.value)
+    def state(self): return {"sign": -1}, {"size": np.array(abs(self.value))}
+    @classmethod
+    def from_state(cls, settings, arrays): return cls(settings["sign"] * arrays["size"])
+
+@uses()
+def fit(given): return Constant(-0.25)
+"""
+        context, agent = guest(tmp_path, text)
+        assert agent.keep(tmp_path / "kept", {"seed": 0}) == ""
+        expected = run_trials(context.env, agent, 1, 3)[1]
+        agent.close()
+        (tmp_path / "mine.py").unlink()
+        assert saved.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
+        again = deconfounded.load(tmp_path / "kept")
+        np.testing.assert_array_equal(run_trials(context.env, again, 1, 3)[1], expected)
