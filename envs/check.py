@@ -34,7 +34,7 @@ def check_task(task: Task) -> None:
         with _part(task, f"the model (assets/{task.name}.xml, or what `spec` makes)"):
             task.model  # noqa: B018 (compiles it)
         with _part(task, "process_noise"):
-            task._noisy  # noqa: B018
+            task.noise  # noqa: B018
     n = 2
     rng = Streams([np.random.default_rng(seed) for seed in range(n)])
     action = np.zeros((n, *(task.action_space.shape or (1,))))

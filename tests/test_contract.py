@@ -357,7 +357,7 @@ class TestPhysics:
         assert set(task.process_noise) == {joint.name for joint in task.spec().joints}
         start = task.init_state(streams(0))
         action, simulator = np.ones((1, *task.action_space.shape)), task.simulator(1)
-        noisy, _ = task._noisy
+        noisy = task.noise.columns
         quiet = set(range(1, 1 + task.model.nq + task.model.nv)) - set(noisy)
         thetas = task.theta_grid(3)
         each = task.outcome(np.repeat(start, len(thetas), 0), np.repeat(action, len(thetas), 0), thetas)
