@@ -216,7 +216,10 @@ def card(task: envs.Task) -> str:
     bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())
     parts.append(markdown_table(("observation", "bounds"), bounds))
     if isinstance(task, envs.MujocoTask):
-        noise = ((joint, *(f"{std:g}" for std in stds)) for joint, stds in task.process_noise.items())
+        noise = []  # of a free joint, two of each: position and rotation, and their velocities
+        for joint, stds in task.process_noise.items():
+            halves = stds[: len(stds) // 2], stds[len(stds) // 2 :]
+            noise.append((joint, *(", ".join(f"{std:g}" for std in half) for half in halves)))
         parts.append(markdown_table(("joint", "noise a step, m or rad", "m/s or rad/s"), noise))
     return "\n\n".join(parts)
 

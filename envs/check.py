@@ -1,18 +1,34 @@
-"""Does a task hold together? Asked before anything is trained or measured: a slip in a task file is one line then."""
+"""Does a task hold together? `check_task` asks before anything is trained or measured: a slip is one line then.
+
+The command asks that, and then every check of the contract (envs/contract.py), a line for each; it exits with 1 if any
+failed: `python -m deconfounded.envs.check --task slippery_cartpole`
+"""
 
 from __future__ import annotations
 
-import traceback
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
+from gymnasium import spaces
 
 from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.outside import told
 from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.probe import Skipped, actions, beyond_bounds
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import InputError, Task
+
+# `python -m` finds this module loaded already, by its package, and warns of it; nothing here is made twice.
+warnings.filterwarnings("ignore", r"'deconfounded\.envs\.check' found in sys\.modules", RuntimeWarning)
+
+
+def _sentence(error: Exception) -> str:
+    """One line: what an error says and, unless it is a check's own, its type and where it was raised."""
+    ours = isinstance(error, InputError | AssertionError) and str(error)
+    return " ".join(str(error).split()) if ours else told(error)
 
 
 @contextmanager
@@ -22,19 +38,15 @@ def _part(task: Task, name: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        text = " ".join(str(error.args[0] if error.args else error).split())
-        frame = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(frame.filename).name}:{frame.lineno}"
-        raise InputError(f"{name} of {task.name}: {text} ({type(error).__name__}, {where})") from error
+        raise InputError(f"{name} of {task.name}: {_sentence(error)}") from error
 
 
 def check_task(task: Task) -> None:
-    """Build it and take one step, twice side by side. Raises InputError that names the part which does not fit."""
+    """Build it, take one step, then an episode of random actions. Raises InputError that names what does not fit."""
     if isinstance(task, MujocoTask):
-        with _part(task, f"the model (assets/{task.name}.xml, or what `spec` makes)"):
-            task.model  # noqa: B018 (compiles it)
-        with _part(task, "process_noise"):
-            task._noisy  # noqa: B018
+        _check_model(task)
+    with _part(task, "action_space"):
+        _check_actions(task)
     n = 2
     rng = Streams([np.random.default_rng(seed) for seed in range(n)])
     action = np.zeros((n, *(task.action_space.shape or (1,))))
@@ -57,5 +69,82 @@ def check_task(task: Task) -> None:
             if not np.isfinite(given).all():
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):
-        env.reset(0)
-        env.step(action)
+        _check_episodes(task)
+
+
+def _check_model(task: MujocoTask) -> None:
+    """The model compiles, every joint has its noise stated, and pictures have their camera."""
+    with _part(task, f"the model ({task.home.name}/{task.name}.xml, or what `spec` makes)"):
+        model = task.model
+    with _part(task, "process_noise"):
+        noise = task.noise
+        for i in range(model.njnt):
+            if (joint := model.joint(i).name) not in task.process_noise:
+                named = f"joint {joint}" if joint else f"joint number {i}, which has no name"
+                raise InputError(f"process_noise of {task.name} lacks {named}; it must have every joint, 0 if no noise")
+        if not noise.size:
+            raise InputError(f"process_noise of {task.name} was 0 throughout; one step must not give theta away")
+    cameras = [model.camera(i).name for i in range(model.ncam)]
+    if "view" not in cameras:
+        given = ", ".join(cameras) or "none"
+        raise InputError(f"cameras of {task.name} were {given}; one must be called view, for pictures")
+
+
+def _check_actions(task: Task) -> None:
+    """Actions are those that experts, networks and random agents make, and the expert's have a density."""
+    space = task.action_space
+    if isinstance(space, spaces.Discrete):
+        return
+    box = isinstance(space, spaces.Box) and len(space.shape) == 1
+    if not box or (space.low != -1).any() or (space.high != 1).any():
+        given = " ".join(str(space).split())
+        raise InputError(
+            f"action_space of {task.name} was {given}; it must be Box(-1, 1, (A,)), which `control` scales, or Discrete"
+        )
+    if not 0 < task.expert_noise < np.inf:
+        raise InputError(
+            f"expert_noise of {task.name} was {task.expert_noise:g}; it must be above 0, and finite, or the expert's"
+            f" log_prob is NaN"
+        )
+
+
+def _check_episodes(task: Task) -> None:
+    """Rewards and observations keep to their bounds, in an episode each of 16 environments with random actions."""
+    env = BatchEnv(task, 16)
+    env.reset(0)
+    for action in actions(task, 16, task.horizon):
+        if beyond := beyond_bounds(task, env.state[env.alive]):
+            raise InputError(beyond)
+        reward = env.step(action)[1].max()
+        if reward > 1 + 1e-9:
+            raise InputError(f"reward of {task.name} was {reward:g}; it must be at most 1 a step")
+        if not env.alive.any():
+            return
+
+
+def main() -> None:
+    """The command line."""
+    from deconfounded import envs
+    from deconfounded.envs.console import Parser
+    from deconfounded.envs.contract import CONTRACT
+
+    parser = Parser(__doc__)
+    parser.add_argument("--task", required=True)
+    task, failed = envs.get(parser.parse_args().task), False
+    for name, check in {"check_task": check_task, **CONTRACT}.items():
+        try:
+            check(task)
+        except Skipped as why:
+            print(f"skip {name}: {why}", flush=True)
+        except Exception as error:
+            failed = True
+            print(f"FAIL {name}: {_sentence(error)}", flush=True)
+        else:
+            print(f"ok   {name}", flush=True)
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    from deconfounded.envs.console import run_command
+
+    run_command(main)

@@ -15,8 +15,9 @@ from mujoco import rollout
 from numpy.typing import ArrayLike, NDArray
 
 from deconfounded.envs import render
+from deconfounded.envs.noise import ProcessNoise, columns
 from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, InputError, Painter, Simulator, Task
+from deconfounded.envs.task import Array, Painter, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
@@ -196,8 +197,9 @@ class MujocoTask(Task):
     """
 
     substeps: ClassVar[int] = 2  # physics steps a control step
-    process_noise: ClassVar[dict[str, tuple[float, float]]]  # joint -> std of (position, velocity) a control step
-    # A coordinate without noise counts as no evidence: it must be of no consequence, or one that theta does not move.
+    process_noise: ClassVar[dict[str, tuple[float, ...]]]  # joint -> std of (position, velocity) a control step
+    # Of ball and free joints, see envs/noise.py. A coordinate without noise counts as no evidence: it must be of no
+    # consequence, or one that theta does not move.
 
     @abstractmethod
     def apply_latent(self, edit: Edit, theta: Array) -> None:
@@ -225,48 +227,48 @@ class MujocoTask(Task):
         return float(self.model.opt.timestep) * self.substeps
 
     def qpos(self, state: Array, joint: str) -> Array:
-        """Position [...] of a hinge or slide joint in states [..., S]; rad or m."""
-        return state[..., 1 + self._address(joint)[0]]
+        """Position [...] of a hinge or slide joint in states [..., S], rad or m.
+
+        Of a ball joint its quaternion [..., 4], of a free one position (m) and quaternion [..., 7].
+        """
+        return state[..., self._address(joint)[0]]
 
     def qvel(self, state: Array, joint: str) -> Array:
-        """Velocity [...] of a hinge or slide joint; rad/s or m/s."""
-        return state[..., 1 + self.model.nq + self._address(joint)[1]]
+        """Velocity [...] of a hinge or slide joint, rad/s or m/s.
+
+        Of a ball joint its angular velocity about its own axes [..., 3], of a free one velocity and that [..., 6].
+        """
+        return state[..., self._address(joint)[1]]
 
     def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
-        """States [N, S] with the named joints' (position, velocity), [N] or numbers; all others at the MJCF's rest."""
-        shape = np.broadcast_shapes((1,), *(np.shape(value) for pair in joints.values() for value in pair))
-        state = np.zeros((*shape, mujoco.mj_stateSize(self.model, STATE.value)))
+        """States [N, S] with the named joints' (position, velocity), [N] or numbers; all others at the MJCF's rest.
+
+        Of ball and free joints they are [N, K] or [K], with K as of `qpos` and `qvel`, or a number for all K.
+        """
+        pairs = [zip(self._address(joint), pair, strict=True) for joint, pair in joints.items()]
+        values = [(at, np.asarray(value, float)) for pair in pairs for at, value in pair]
+        rows = (value.shape if isinstance(at, int) else value.shape[:-1] for at, value in values)
+        state = np.zeros((*np.broadcast_shapes((1,), *rows), mujoco.mj_stateSize(self.model, STATE.value)))
         state[:, 1 : 1 + self.model.nq] = self.model.qpos0
-        for joint, (position, velocity) in joints.items():
-            q, v = self._address(joint)
-            state[:, 1 + q], state[:, 1 + self.model.nq + v] = position, velocity
+        for at, value in values:
+            state[:, at] = value
         return state
 
-    def _address(self, joint: str) -> tuple[int, int]:
+    def _address(self, joint: str) -> tuple[int | slice, int | slice]:
         if joint not in self._addresses:
-            accessor = self.model.joint(joint)
-            self._addresses[joint] = (int(accessor.qposadr[0]), int(accessor.dofadr[0]))
+            q, v = columns(self.model, joint)
+            single = len(q) == 1
+            self._addresses[joint] = (q[0], v[0]) if single else (slice(q.start, q.stop), slice(v.start, v.stop))
         return self._addresses[joint]
 
     @cached_property
-    def _addresses(self) -> dict[str, tuple[int, int]]:
+    def _addresses(self) -> dict[str, tuple[int | slice, int | slice]]:
         return {}
 
     @cached_property
-    def _noisy(self) -> tuple[NDArray[np.int64], Array]:
-        """Indices [Z] into the state and standard deviations [Z]."""
-        index, sigma = [], []
-        for joint, stds in self.process_noise.items():
-            if not min(stds) >= 0:
-                raise InputError(
-                    f"process_noise of joint {joint} was {stds}; it must be standard deviations, from 0 up"
-                )
-            q, v = self._address(joint)
-            for i, std in zip((1 + q, 1 + self.model.nq + v), stds, strict=True):
-                if std > 0:
-                    index.append(i)
-                    sigma.append(std)
-        return np.array(index, int), np.array(sigma, float)
+    def noise(self) -> ProcessNoise:
+        """The noise of `process_noise`. Raises InputError where it does not fit the model's joints."""
+        return ProcessNoise(self.model, self.process_noise)
 
     def simulator(self, n: int) -> Physics:
         return Physics(self, n)
@@ -278,7 +280,7 @@ class MujocoTask(Task):
         return render.Painter(spec.compile())
 
     def sample_noise(self, rng: Streams) -> Array:
-        return rng.standard_normal((rng.groups, self.horizon, len(self._noisy[0])))
+        return rng.standard_normal((rng.groups, self.horizon, self.noise.size))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
         physics = self.simulator(len(state))
@@ -287,13 +289,9 @@ class MujocoTask(Task):
         return physics.outcome(state, action)
 
     def apply_noise(self, outcome: Array, noise: Array) -> Array:
-        index, sigma = self._noisy
-        outcome[:, index] += sigma * noise
-        return outcome
+        return self.noise.apply(outcome, noise)
 
     def log_prob(self, next_state: Array, outcome: Array) -> Array:
-        index, sigma = self._noisy
-        z = (next_state[..., index] - outcome[..., index]) / sigma
-        return -0.5 * (z**2).sum(-1) - np.log(sigma).sum() - 0.5 * len(sigma) * np.log(2 * np.pi)
+        return self.noise.log_prob(next_state, outcome)
 
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)

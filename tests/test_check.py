@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import certify, run
-from deconfounded.envs.physics import Edit
+from deconfounded.envs import check, contract
+from deconfounded.envs.contract import CONTRACT
+from deconfounded.envs.physics import Edit, ModelEdit
 from deconfounded.envs.slippery_cartpole import SlipperyCartpole
+from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
 from deconfounded.experts import train
 
@@ -53,28 +60,101 @@ class NoReward(SlipperyCartpole):
         return np.full(len(state), np.nan)
 
 
+class SilentExpert(SlipperyCartpole):
+    expert_noise = 0.0
+
+
+class NanExpert(SlipperyCartpole):
+    expert_noise = float("nan")
+
+
+class NoNoise(SlipperyCartpole):
+    process_noise = {joint: (0.0, 0.0) for joint in SlipperyCartpole.process_noise}
+
+
+class ForgottenJoint(SlipperyCartpole):
+    process_noise = {joint: stds for joint, stds in SlipperyCartpole.process_noise.items() if joint != "axle"}
+
+
+class UnnamedJoint(SlipperyCartpole):
+    process_noise = ForgottenJoint.process_noise
+
+    def spec(self) -> mujoco.MjSpec:
+        spec = super().spec()
+        for tendon in spec.tendons:
+            spec.delete(tendon)
+        spec.delete(spec.actuator("spin"))
+        spec.joint("axle").name = ""
+        return spec
+
+
+class TooManyStds(SlipperyCartpole):
+    process_noise = {**SlipperyCartpole.process_noise, "hinge": (0.1, 0.1, 0.1)}
+
+
+class LargeReward(SlipperyCartpole):
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        return 1.5 * super().reward(state, action, next_state, theta)
+
+
+class WideActions(SlipperyCartpole):
+    action_space = spaces.Box(-1.0, 2.0, (1,), np.float32)
+
+
+class OneSidedActions(SlipperyCartpole):
+    action_space = spaces.Box(0.0, 1.0, (1,), np.float32)
+
+
+class TableOfActions(SlipperyCartpole):
+    action_space = spaces.Box(-1.0, 1.0, (1, 1), np.float32)
+
+
+class NarrowBounds(SlipperyCartpole):
+    observation = {**SlipperyCartpole.observation, "velocity": (-20, 0.5)}
+
+
+class NoCamera(SlipperyCartpole):
+    def spec(self) -> mujoco.MjSpec:
+        spec = super().spec()
+        spec.camera("view").name = "side"
+        return spec
+
+
 @pytest.mark.parametrize(
     ("task", "says"),
     [
-        (MissingFile, r"the model \(assets/nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
+        (MissingFile, r"the model \(tests/nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
         (MisspeltJoint, "process_noise of slippery_cartpole: .*'slyder'"),
         (MisspeltElement, "apply_latent of slippery_cartpole: .*'pool'"),
         (OneTooMany, r"observe of slippery_cartpole gave \(2, 6\) of 2 environments; it must be \(2, 7\)"),
         (NoReward, r"reward of slippery_cartpole gave \[nan, nan\]; it must be finite"),
         (ColumnOfRewards, r"reward of slippery_cartpole gave \(2, 1\)"),
         (NegativeNoise, r"process_noise of joint hinge was \(0.0, -0.1\)"),
+        (SilentExpert, "expert_noise of slippery_cartpole was 0; it must be above 0"),
+        (NanExpert, "expert_noise of slippery_cartpole was nan; it must be above 0"),
+        (NoNoise, "process_noise of slippery_cartpole was 0 throughout"),
+        (ForgottenJoint, "process_noise of slippery_cartpole lacks joint axle; it must have every joint"),
+        (UnnamedJoint, "process_noise of slippery_cartpole lacks joint number 1, which has no name"),
+        (TooManyStds, r"process_noise of joint hinge, a hinge joint, was \(0.1, 0.1, 0.1\); it must be 2 "),
+        (LargeReward, r"reward of slippery_cartpole was 1\.\d+; it must be at most 1 a step"),
+        (WideActions, r"action_space of slippery_cartpole was Box\(-1.0, 2.0, .*; it must be Box\(-1, 1, "),
+        (OneSidedActions, r"action_space of slippery_cartpole was Box\(0.0, 1.0, .*; it must be Box\(-1, 1, "),
+        (TableOfActions, r"action_space of slippery_cartpole was .* \(1, 1\), .*; it must be Box\(-1, 1, "),
+        (NarrowBounds, "observation velocity of slippery_cartpole was .*; its bounds, -20 to 0.5, must be wide enough"),
+        (NoCamera, "cameras of slippery_cartpole were side; one must be called view"),
         (MisspeltName, r"terminated of slippery_cartpole: .*'LIMIT'.* \(NameError, test_check.py:\d+\)"),
     ],
 )
 def test_slips_are_named(task: type[envs.Task], says: str) -> None:
-    with pytest.raises(envs.InputError, match=f"^{says}"):
+    with pytest.raises(envs.InputError, match=f"^{says}") as caught:
         envs.check_task(task())
+    assert "\n" not in str(caught.value)
 
 
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "nowhere.xml").write_text("<mujoco><worldbody></mujoco>")
     monkeypatch.setattr(MissingFile, "home", tmp_path)
-    with pytest.raises(envs.InputError, match=r"^the model \(assets/nowhere\.xml, .*\) of nowhere: XML") as caught:
+    with pytest.raises(envs.InputError, match=r"^the model \(.*/nowhere\.xml, .*\) of nowhere: XML") as caught:
         envs.check_task(MissingFile())
     assert "\n" not in str(caught.value)
 
@@ -82,6 +162,129 @@ def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("name", envs.names())
 def test_registered_tasks_pass(name: str) -> None:
     envs.check_task(envs.get(name))
+
+
+class WiderNoise(SlipperyCartpole):
+    def apply_noise(self, outcome: Array, noise: Array) -> Array:
+        return super().apply_noise(outcome, 1.2 * noise)
+
+
+class NoEffect(SlipperyCartpole):
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        pass
+
+
+class InPlaceOnly(SlipperyCartpole):
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        if isinstance(edit, ModelEdit):
+            super().apply_latent(edit, theta)
+
+
+class EditsTheNominal(SlipperyCartpole):
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        self.model.tendon_frictionloss[:] = theta[0]
+        super().apply_latent(edit, theta)
+
+
+class Leaky(SlipperyCartpole):
+    last = 0.0
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        self.last = float(theta[0])
+        super().apply_latent(edit, theta)
+
+    def init_state(self, rng: Streams) -> Array:
+        start = super().init_state(rng)
+        self.qpos(start, "slider")[...] += 0.01 * self.last
+        return start
+
+
+class OwnRandomness(SlipperyCartpole):
+    def init_state(self, rng: Streams) -> Array:
+        return super().init_state(Streams([np.random.default_rng() for _ in range(rng.groups)]))
+
+
+class ConstantObservation(SlipperyCartpole):
+    def observe(self, state: Array) -> Array:
+        return super().observe(state) * (np.arange(6) != 3)
+
+
+class FixedStart(SlipperyCartpole):
+    def init_state(self, rng: Streams) -> Array:
+        return np.repeat(super().init_state(Streams([np.random.default_rng(0)])), rng.groups, 0)
+
+
+class QuietPole(SlipperyCartpole):
+    process_noise = {**SlipperyCartpole.process_noise, "hinge": (0.004, 0.0)}
+
+
+class WrongBound(SlipperyCartpole):
+    def check_theta(self, theta: object, n: int) -> Array:
+        return np.broadcast_to(np.asarray(theta, float), (n, 1))
+
+
+class UnnamedGeom(SlipperyCartpole):
+    def spec(self) -> mujoco.MjSpec:
+        spec = super().spec()
+        spec.worldbody.add_geom(size=[0.1, 0, 0], contype=0, conaffinity=0)
+        return spec
+
+
+@pytest.mark.parametrize(
+    ("task", "check", "says"),
+    [
+        (WiderNoise, "log_prob_is_the_density_of_the_noise", "log_prob of slippery_cartpole"),
+        (NoEffect, "effect", r"thetas .* have the trajectories of "),
+        (InPlaceOnly, "set_in_place_equals_recompiled", "tendon_frictionloss of models set in place and compiled"),
+        (EditsTheNominal, "nominal_model_is_not_touched", "tendon_frictionloss of models of the task"),
+        (Leaky, "no_leak", "first observations of theta .* differ"),
+        (OwnRandomness, "gymnasium_env", "gymnasium's checker: "),
+        (OwnRandomness, "adapters_agree", "first observations of GymVectorEnv and SyncVectorEnv differ"),
+        (OwnRandomness, "any_batch_size", "runs of seed 11 among five and alone differ"),
+        (OwnRandomness, "seed_streams", "the start and what the seed's second stream draws differ"),
+        (OwnRandomness, "seed_kinds", "first observations of seed 3 and .* differ"),
+        (OwnRandomness, "privileged_view", "observations with and without the privileged view differ"),
+        (ConstantObservation, "starts_vary_and_nothing_is_constant", "observation velocity of .* never moved"),
+        (FixedStart, "starts_vary_and_nothing_is_constant", "eight episodes started with the same"),
+        (QuietPole, "noise_covers_every_coordinate_that_matters", "theta moves a coordinate without process noise"),
+        (NarrowBounds, "bounds_are_wide_enough", "observation velocity of slippery_cartpole was"),
+        (WrongBound, "theta_out_of_bounds", ".* was let through"),
+        (UnnamedGeom, "every_element_is_named", "of the geoms of slippery_cartpole, number "),
+        (NoCamera, "every_element_is_named", "the cameras of slippery_cartpole were "),
+        (NoReward, "dm_env_tests", "dm_env's test_.*: .*reward of slippery_cartpole was nan"),
+    ],
+)
+def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> None:
+    with pytest.raises((AssertionError, envs.InputError), match=f"^{says}"):
+        CONTRACT[check](task())
+
+
+def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A line for each check, and exit code 1 if any failed."""
+    names = ("effect", "reset_options", "bounds_are_wide_enough")
+    monkeypatch.setattr(contract, "CONTRACT", {name: CONTRACT[name] for name in names})
+    monkeypatch.setitem(envs.TASKS, "slippery_cartpole", NoEffect)
+    outputs = []
+    for name in ("bandit", "slippery_cartpole"):
+        monkeypatch.setattr("sys.argv", ["check", "--task", name])
+        with pytest.raises(SystemExit) as done:
+            check.main()
+        outputs.append((done.value.code, capsys.readouterr().out.splitlines()))
+    skipped = "skip bounds_are_wide_enough: this is of MuJoCo tasks"
+    assert outputs[0] == (0, ["ok   check_task", "ok   effect", "ok   reset_options", skipped])
+    code, (_, failed, *rest) = outputs[1]
+    assert code == 1
+    assert failed.startswith("FAIL effect: thetas [")
+    assert rest == ["ok   reset_options", "ok   bounds_are_wide_enough"]
+
+
+def test_check_command_says_one_line() -> None:
+    """Of a task that is not there, without a word of the interpreter's; and nothing is lost under `python -O`."""
+    command = [sys.executable, "-O", "-m", "deconfounded.envs.check", "--task", "nowhere"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from deconfounded import envs
 from deconfounded.benchmarks import certify, pages, pool, publish, score
 from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.console import run_command
+from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.task import Array
 from deconfounded.experts.policy import Expert
-from tests.test_contract import assert_set_in_place_equals_recompiled
 
 ROOT = Path(__file__).parents[1]
 
@@ -219,7 +219,7 @@ def test_worked_example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     exec(code, space)
     task = space["BentCartpole"]()
     check_env(envs.GymEnv(task), skip_render_check=True)
-    assert_set_in_place_equals_recompiled(task)
+    CONTRACT["set_in_place_equals_recompiled"](task)
 
 
 def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

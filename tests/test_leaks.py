@@ -22,12 +22,13 @@ from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConf
 from deconfounded.deconf.models import DiscreteModel, LatentModel, VariationalModel
 from deconfounded.deconf.nets import ActionHead, scalers
 from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.envs.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
 from deconfounded.experts.policy import NetworkExpert
 from deconfounded.experts.sb3 import Sb3VecEnv
-from tests.tools import actions, streams, tiny_preset
+from tests.tools import tiny_preset
 
 TASKS = envs.names()
 CONTROL = "slippery_cartpole"

@@ -1,0 +1,138 @@
+"""Process noise: normal on every coordinate of a joint, and for rotations on the tangent space at the outcome."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded.envs.streams import Array
+from deconfounded.envs.task import InputError
+
+WIDEST = 0.5  # std of a rotation, rad: beyond, more than half a turn is no longer out of the question
+
+
+class Kind(NamedTuple):
+    """A type of joint: how many columns it has in qpos and qvel, and what its standard deviations are of."""
+
+    name: str
+    qpos: int
+    qvel: int
+    stds: tuple[str, ...]
+
+
+KINDS = {
+    mujoco.mjtJoint.mjJNT_FREE: Kind(
+        "free", 7, 6, ("position m", "rotation rad", "velocity m/s", "angular velocity rad/s")
+    ),
+    mujoco.mjtJoint.mjJNT_BALL: Kind("ball", 4, 3, ("rotation rad", "angular velocity rad/s")),
+    mujoco.mjtJoint.mjJNT_SLIDE: Kind("slide", 1, 1, ("position m", "velocity m/s")),
+    mujoco.mjtJoint.mjJNT_HINGE: Kind("hinge", 1, 1, ("position rad", "velocity rad/s")),
+}
+
+
+def columns(model: mujoco.MjModel, joint: str) -> tuple[range, range]:
+    """Where states [..., S] have a joint's qpos and qvel. Raises KeyError, which names all joints, if it is unknown."""
+    found = model.joint(joint)
+    kind = KINDS[mujoco.mjtJoint(int(found.type[0]))]
+    q, v = 1 + int(found.qposadr[0]), 1 + model.nq + int(found.dofadr[0])
+    return range(q, q + kind.qpos), range(v, v + kind.qvel)
+
+
+class ProcessNoise:
+    """Independent normal noise, of a standard deviation for each part of a joint; 0 is no noise.
+
+    stds: joint -> (position, velocity) of a hinge or slide joint; (rotation, angular velocity) of a ball joint, and
+    (position, rotation, velocity, angular velocity) of a free one, each std on all three axes. Units are m and rad,
+    or these a second. A rotation q becomes q exp(w / 2), for noise w [3] (rad) about the body's own axes.
+
+    Attributes: `size`, Z, the unit noise a step, in the order of stds; `columns`, those of the state that it moves.
+    Raises InputError for stds that do not fit the joint, or that are negative, and KeyError for an unknown joint.
+    """
+
+    def __init__(self, model: mujoco.MjModel, stds: Mapping[str, tuple[float, ...]]) -> None:
+        self.size = 0
+        index: list[int] = []  # of plain coordinates, in the state
+        draws: list[int] = []  # and in the noise
+        sigma: list[float] = []
+        self._rotations: list[tuple[slice, slice, float]] = []  # likewise, of quaternions
+        for joint, given in stds.items():
+            for part, std in _parts(model, joint, given):
+                if std == 0:
+                    continue
+                width = min(len(part), 3)
+                if len(part) == 4:
+                    rows = slice(part.start, part.stop), slice(self.size, self.size + 3)
+                    self._rotations.append((*rows, std))
+                else:
+                    index += part
+                    draws += range(self.size, self.size + width)
+                    sigma += [std] * width
+                self.size += width
+        self._index, self._draws, self._sigma = np.array(index, int), np.array(draws, int), np.array(sigma, float)
+        quaternions = [np.arange(at.start, at.stop) for at, _, _ in self._rotations]
+        self.columns: NDArray[np.int64] = np.sort(np.concatenate([self._index, *quaternions]))
+
+    def apply(self, outcome: Array, noise: Array) -> Array:
+        """Outcome [N, S], which is written to, and unit noise [N, Z] -> next state [N, S]; quaternions are unit."""
+        outcome[:, self._index] += self._sigma * noise[:, self._draws]
+        for at, drawn, std in self._rotations:
+            turned = _product(outcome[:, at], _exp(std * noise[:, drawn]))
+            outcome[:, at] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+        return outcome
+
+    def log_prob(self, next_state: Array, outcome: Array) -> Array:
+        """log p [...] of next states [..., S], given their outcome [..., S].
+
+        Rotations have theirs with respect to the Haar measure, dw near the outcome and (sin(|w| / 2) / (|w| / 2))^2 dw
+        further off, so that densities about several outcomes compare. q and -q are the same rotation.
+        """
+        z = (next_state[..., self._index] - outcome[..., self._index]) / self._sigma
+        total = -0.5 * (z**2).sum(-1) - np.log(self._sigma).sum() - 0.5 * len(self._sigma) * np.log(2 * np.pi)
+        for at, _, std in self._rotations:
+            turned = _product(outcome[..., at] * (1, -1, -1, -1), next_state[..., at])
+            half = np.arctan2(np.linalg.norm(turned[..., 1:], axis=-1), np.abs(turned[..., 0]))  # |w| / 2
+            normal = -0.5 * (2 * half / std) ** 2 - 3 * np.log(std) - 1.5 * np.log(2 * np.pi)
+            total = total + normal - 2 * np.log(np.sinc(half / np.pi))
+        return total
+
+
+def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[tuple[range, float]]:
+    """A joint's standard deviations, each with the columns of the state that it is of."""
+    q, v = columns(model, joint)
+    parts = {1: [q, v], 4: [q, v], 7: [q[:3], q[3:], v[:3], v[3:]]}[len(q)]
+    kind = KINDS[mujoco.mjtJoint(int(model.joint(joint).type[0]))]
+    if len(stds) != len(kind.stds):
+        raise InputError(
+            f"process_noise of joint {joint}, a {kind.name} joint, was {stds}; it must be {len(kind.stds)} standard"
+            f" deviations: {', '.join(kind.stds)}"
+        )
+    if not all(0 <= std < np.inf for std in stds):
+        raise InputError(f"process_noise of joint {joint} was {stds}; it must be standard deviations, from 0 up")
+    if any(std > WIDEST for part, std in zip(parts, stds, strict=True) if len(part) == 4):
+        raise InputError(f"process_noise of joint {joint} was {stds}; its rotation's must be at most {WIDEST} rad")
+    return list(zip(parts, stds, strict=True))
+
+
+def _product(p: Array, q: Array) -> Array:
+    """Quaternions p and q [..., 4] -> p q [..., 4]: q's rotation, then p's."""
+    a, b, c, d = np.moveaxis(p, -1, 0)
+    e, f, g, h = np.moveaxis(q, -1, 0)
+    return np.stack(
+        [
+            a * e - b * f - c * g - d * h,
+            a * f + b * e + c * h - d * g,
+            a * g - b * h + c * e + d * f,
+            a * h + b * g - c * f + d * e,
+        ],
+        -1,
+    )
+
+
+def _exp(w: Array) -> Array:
+    """Rotation vectors [..., 3] (rad) -> unit quaternions [..., 4]."""
+    half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)
