@@ -44,7 +44,9 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     from deconfounded.deconf.given import Given, serve
 
     try:
-        agent = outside.find("method", reference)(Given(channel, about))
+        given = Given(channel, about)
+        agent = outside.find("method", reference)(given)
+        given.close()
         if not isinstance(agent, Agent):
             raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.demos.Agent")
         channel.send(("fitted",))

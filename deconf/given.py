@@ -50,7 +50,7 @@ class Given:
     """
 
     def __init__(self, channel: Connection, about: dict[str, Any]) -> None:
-        self._channel = channel
+        self._channel: Connection | None = channel
         self.observations: int = about["observations"]
         self.action_space: spaces.Box | spaces.Discrete = about["action_space"]
         self.episodes: int = about["episodes"]
@@ -77,11 +77,22 @@ class Given:
 
     def progress(self, share: float, **losses: float) -> None:
         """So much of the training is done, from 0 to 1; losses are for the learning curve."""
-        self._channel.send(("progress", float(share), {name: float(loss) for name, loss in losses.items()}))
+        if self._channel is not None:
+            self._channel.send(("progress", float(share), {name: float(loss) for name, loss in losses.items()}))
 
     def _ask(self, kind: str, agent: Agent | None = None, *rest: Any) -> Any:
-        self._channel.send((kind, agent is not None, *rest))
-        return serve(self._channel, agent)
+        channel, self._channel = self._channel, None
+        if channel is None:
+            raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
+        try:
+            channel.send((kind, agent is not None, *rest))
+            return serve(channel, agent)
+        finally:
+            self._channel = channel
+
+    def close(self) -> None:
+        """Fitting is over."""
+        self._channel = None
 
 
 def serve(channel: Connection, agent: Agent | None) -> Any:

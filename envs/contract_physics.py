@@ -58,7 +58,7 @@ def nominal_model_is_not_touched(task: Task) -> None:
 def same_model(model: mujoco.MjModel, other: mujoco.MjModel, what: str) -> None:
     """Raises AssertionError, which says how they came to be, unless two models are equal in every array, to the bit.
 
-    Only inertia, which scaling rounds in another order, and what MuJoCo derives from it need not be so in the last bits.
+    Only inertia, which scaling rounds in another order, and what follows from it need not be so in the last bits.
     """
     compared = 0
     for field in dir(model):

@@ -172,7 +172,7 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
     ("text", "says"),
     [
         ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.demos.Agent"),
-        ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:12\)"),
+        ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
         ("def fit(given): import os; os._exit(1)", r"its process was killed \(out of memory\?\)"),
         ("def fit(given): given.explore(trials=0)", "asked for exploration, and declares"),
@@ -231,40 +231,39 @@ def fit(given):
 
 
 HUNTER = """
-import sys, types
+import collections, sys, types
 
-def hunt(start, depth=60, limit=400_000):
-    # Every number within reach: attributes, containers, closures, defaults, globals, modules, slots.
-    seen, found, kinds, queue = set(), [], set(), [start]
+OURS = ("deconfounded", "outside_", "__mp_main__", "tests")
+
+def hunt(start, limit=300_000):
+    # Every number within reach, nearest first: attributes, containers, closures, globals, frames, our modules.
+    seen, found, kinds, queue = {}, [], set(), collections.deque(start)
     while queue and len(seen) < limit:
-        thing = queue.pop()
-        if id(thing) in seen:
+        thing = queue.popleft()
+        if id(thing) in seen or isinstance(thing, (bool, str, bytes, type(None))):
             continue
-        seen.add(id(thing))
+        seen[id(thing)] = thing  # and so alive: ids are not used again
         kinds.add(type(thing).__name__)
-        if isinstance(thing, (bool, str, bytes, type(None))):
-            continue
         if isinstance(thing, (int, float, np.number)):
-            found.append(float(thing)) if abs(thing) < 1e30 else None
-            continue
-        if isinstance(thing, np.ndarray):
+            if abs(thing) < 1e30:
+                found.append(float(thing))
+        elif isinstance(thing, np.ndarray):
             if thing.dtype.kind in "iuf" and thing.size < 100_000:
                 found.extend(thing.ravel().astype(float).tolist())
+        elif isinstance(thing, dict):
+            queue.extend((*thing.keys(), *thing.values()))
+        elif isinstance(thing, (list, tuple, set, frozenset)):
+            queue.extend(thing)
+        elif isinstance(thing, types.ModuleType) and not thing.__name__.startswith(OURS):
             continue
-        if isinstance(thing, dict):
-            queue.extend(thing.keys()); queue.extend(thing.values()); continue
-        if isinstance(thing, (list, tuple, set, frozenset)):
-            queue.extend(thing); continue
-        if isinstance(thing, types.ModuleType) and not thing.__name__.startswith(("deconfounded", "outside", "__m")):
+        elif isinstance(thing, (type, types.FunctionType)) and not (thing.__module__ or "").startswith(OURS):
             continue
-        for name in (*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "__defaults__"):
-            try:
-                queue.append(getattr(thing, name))
-            except Exception:
-                pass
-        if isinstance(thing, types.CellType):
-            try: queue.append(thing.cell_contents)
-            except ValueError: pass
+        else:
+            for name in {*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "cell_contents"}:
+                try:
+                    queue.append(getattr(thing, name))
+                except Exception:
+                    pass
     return found, kinds
 """
 HIDDEN = {"BatchEnv", "Context", "Physics", "NetworkExpert", "Simulator"}
@@ -282,8 +281,8 @@ class Spy(Still):
     def reset(self, rngs): self.rngs = rngs
     def act(self, obs):
         self.acts += 1
-        if self.acts in (40, 900):
-            write(hunt([self, obs, sys.modules, sys._getframe()]), f"act{{self.acts}}")
+        if self.acts in (40, 80):
+            write(hunt([self, obs, sys._getframe(), *sys.modules.values()]), f"act{{self.acts}}")
         return super().act(obs)
 
 def write(hunted, name):
@@ -293,7 +292,7 @@ def write(hunted, name):
 @uses("demonstrations", "exploration", "queries")
 def fit(given):
     given.demonstrations, given.explore(Still()), given.query()
-    write(hunt([given, fit, sys.modules, sys._getframe()]), "fit")
+    write(hunt([given, fit, sys._getframe(), *sys.modules.values()]), "fit")
     return Spy(given)
 """
     context, agent = guest(tmp_path, text, CONTROL, "demonstrations", "exploration", "queries")
@@ -309,10 +308,10 @@ def fit(given):
         env.reset(seed)
         hidden.append(env.theta)
     thetas = np.concatenate(hidden).ravel()
-    for name in ("fit", "act40", "act900"):
+    for name in ("fit", "act40", "act80"):
         with np.load(tmp_path / f"{name}.npz") as hunted:
-            assert len(hunted["found"]) > 1000
-            assert {"Given", "Generator", "Trials"} <= set(hunted["kinds"])
+            assert len(hunted["found"]) > (10_000 if name == "fit" else 100)
+            assert {"Given", "Generator", "Trials" if name == "fit" else "frame"} <= set(hunted["kinds"])
             assert not HIDDEN & set(hunted["kinds"])
             assert not np.isin(thetas, hunted["found"]).any()
             assert not np.isin(np.add.outer([*seeds, *explored], range(4)), hunted["found"]).any()
