@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from gymnasium import spaces
 
@@ -158,23 +158,19 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
         known = {name: now for name, now in asdict(of).items() if name not in CONFIGS}
         if field not in known:
             raise envs.closest("--set amount", key, [f"{part}.{name}" if part else name for name in known])
-        new = {field: _parsed(key, value, known[field])}
+        kind = get_type_hints(type(of))[field]
+        new = {field: _parsed(key, value, get_args(kind) or (kind,), known[field])}
         settings = replace(settings, **({part: replace(of, **new)} if part else new))
     return settings
 
 
-def _parsed(key: str, text: str, now: Any) -> Any:
-    """The text as a value of the same type."""
+def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
+    """The text as a value of one of those types, or one of those values."""
     try:
         value = json.loads(text)
     except ValueError:
         value = text
-    whole = isinstance(now, int | None) and not isinstance(now, bool)
-    right = (
-        (value is None or type(value) is int)
-        if now is None
-        else (type(value) in (int, float) if isinstance(now, float) else type(value) is type(now))
-    )
-    if not right or (whole and isinstance(value, int) and value < 0):
+    right = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
+    if not right or (isinstance(value, int | float) and value < 0):
         raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
     return value

@@ -156,7 +156,7 @@ class LearnedAgent(Agent):
     def state(self) -> State:
         settings = {"seeds": self.seeds, "signature": asdict(self.policy.signature), "shape": self.shape()}
         named = ((f"{name}.{key}", x) for name, part in self.parts().items() for key, x in part.state_dict().items())
-        return settings, {key: np.array(x.cpu()) for key, x in named}
+        return settings, {key: x.cpu().numpy().copy() for key, x in named}
 
     @classmethod
     def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LearnedAgent:

@@ -22,7 +22,7 @@ class RecurrentConfig:
     """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
 
     width: int = 64
-    updates: int = 1000
+    updates: int = 1500
     batch: int = 32
     chunk: int = 50
     learning_rate: float = 3e-3

@@ -12,8 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
-from tqdm import tqdm
-
 from deconfounded.envs.task import InputError
 
 
@@ -72,7 +70,11 @@ class Progress:
     def __init__(self, total: int, label: str, every_s: float = 15) -> None:
         self.total, self.done, self._label, self._every = total, 0, label, every_s
         self._start = self._last = time.monotonic()
-        self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False) if sys.stderr.isatty() else None
+        self._bar: Any = None
+        if sys.stderr.isatty():
+            from tqdm import tqdm  # who has the environments alone has no bars
+
+            self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False)
 
     def update(self, n: int, note: str = "") -> None:
         """n more are done."""

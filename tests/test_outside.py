@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import queue
 import re
 import subprocess
 import sys
@@ -14,12 +15,14 @@ import pytest
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks import catalogue, certify
+from deconfounded.benchmarks import catalogue, certify, play, pool, presets
 from deconfounded.benchmarks.guest import Guest
-from deconfounded.benchmarks.jobs import evaluate
-from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, Allowed, Context, stream
+from deconfounded.benchmarks.jobs import BenchmarkJob, evaluate
+from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Allowed, Context, stream
+from deconfounded.deconf import naive_rnn
+from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.experts import policy, saved
-from deconfounded.experts.demos import run_trials
+from deconfounded.experts.demos import Trials, run_trials
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -354,6 +357,51 @@ class TestSaved:
         with pytest.raises(envs.InputError, match="is damaged"):
             deconfounded.load(tmp_path)
 
+    @pytest.mark.parametrize("task", ["bandit", CONTROL])
+    def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
+        monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+        (tmp_path / "jobs").mkdir()
+        for method in ("deconfounded", "naive_rnn", "deconfounded_discrete", "blind_bc"):
+            job = BenchmarkJob(task, tiny_preset(), method, (0, 1), tmp_path / "jobs")
+            job.run()
+            for seed in (0, 1):
+                wrote = job.load(seed)
+                assert wrote is not None
+                for name in wrote["meta"]["agents"]:
+                    env, expected = envs.BatchEnv(envs.get(task), 4), wrote[f"{name}/returns"]
+                    agent = play.ready(tmp_path / "agents" / f"{name}-{seed}", env.task)
+                    again = run_trials(env, agent, expected.shape[1], stream(EVALUATION, seed))[1]
+                    np.testing.assert_array_equal(again, expected)
+
+    @pytest.mark.parametrize("task", ["bandit", CONTROL])
+    def test_in_another_process(self, task: str, tmp_path: Path) -> None:
+        """One plain gymnasium environment: the agent of a fit and, over there, the loaded one return the same bits."""
+        context = Context(envs.get(task), tiny_preset(), [0])
+        agent = MAKERS["deconfounded"](context)["deconfounded"]
+        assert isinstance(agent, LearnedAgent)
+        agent.save(tmp_path)
+        returns, _ = play.play(agent, envs.make(task), 2, 5)
+        code = (
+            "import deconfounded; from deconfounded import envs; from deconfounded.benchmarks import play;"
+            f"print(play.play(deconfounded.load({str(tmp_path)!r}), envs.make({task!r}), 2, 5)[0])"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+        assert done.stdout.strip() == str(returns), done.stderr
+
+    def test_oracles_need_to_be_told(self, tmp_path: Path) -> None:
+        context = Context(envs.get(CONTROL), tiny_preset(), [0])
+        oracle = MAKERS["oracle_bc"](context)["oracle_bc"]
+        assert isinstance(oracle, LearnedAgent)
+        oracle.save(tmp_path)
+        with pytest.raises(envs.InputError, match="is an oracle"):
+            play.ready(tmp_path, context.task)
+        agent = deconfounded.load(tmp_path)
+        agent.begin(1)
+        agent.reset([np.random.default_rng(0)])
+        with pytest.raises(envs.InputError, match="set its `side`"):
+            agent.act(np.zeros((1, 6), np.float32))
+
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
         """It is kept with its code, and does not need the file it came from."""
         text = """
@@ -375,3 +423,63 @@ def fit(given): return Constant(-0.25)
         assert saved.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
         again = deconfounded.load(tmp_path / "kept")
         np.testing.assert_array_equal(run_trials(context.env, again, 1, 3)[1], expected)
+
+
+class TestSentences:
+    """What is used out of order, or is not what it should be, is told in a line."""
+
+    def agent(self) -> LearnedAgent:
+        agent = MAKERS["naive_rnn"](Context(envs.get(CONTROL), tiny_preset(), [0]))["naive_rnn"]
+        assert isinstance(agent, LearnedAgent)
+        return agent
+
+    def test_agents(self) -> None:
+        agent, obs = self.agent(), np.zeros((1, 6), np.float32)
+        with pytest.raises(envs.InputError, match="act was called before begin and reset"):
+            agent.act(obs)
+        with pytest.raises(envs.InputError, match="reset was called before begin"):
+            agent.reset([np.random.default_rng(0)])
+        with pytest.raises(envs.InputError, match="was given 0 trials"):
+            agent.begin(0)
+        agent.begin(1)
+        with pytest.raises(envs.InputError, match=r"come from \[0\]; give np.random.default_rng\(0\)"):
+            agent.reset([0])  # type: ignore[list-item]
+        agent.reset([np.random.default_rng(0)])
+        with pytest.raises(envs.InputError, match=r"observations had shape \(6,\); they must be \(1, 6\)"):
+            agent.act(obs[0])
+        assert agent.act(obs).shape == (1, 1)
+
+    def test_generators(self) -> None:
+        with pytest.raises(envs.InputError, match="random numbers were to come from 0; give"):
+            naive_rnn.fit(Context(envs.get(CONTROL), tiny_preset(), [0]).demonstrations, tiny_preset().naive, 0)  # type: ignore[arg-type]
+
+    def test_trials(self) -> None:
+        fine = {"obs": [[[[0.0], [1.0]]]], "action": [[[[0.5]]]], "mask": [[[True]]]}
+        assert Trials(**fine).action.dtype == np.float32  # type: ignore[arg-type]
+        with pytest.raises(envs.InputError, match=r"an action of size 1.5; actions must be in \[-1, 1\]"):
+            Trials(**{**fine, "action": [[[[1.5]]]]})  # type: ignore[arg-type]
+        with pytest.raises(envs.InputError, match="obs of Trials must be an array of numbers"):
+            Trials(**{**fine, "obs": [[0], [1, 2]]})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("naive.updates=many", "--set naive.updates was 'many'; it must be like 1500"),
+        ("naive.update=5", "did you mean 'naive.updates'"),
+        ("naiv.updates=5", "--set part 'naiv' is unknown; did you mean 'naive'"),
+        ("seeds=1.5", "--set seeds was '1.5'; it must be like 3"),
+        ("seeds=-1", "--set seeds was '-1'"),
+        ("naive.cooled=1", "must be like true"),
+    ],
+)
+def test_bad_amounts_are_one_line(change: str, says: str) -> None:
+    with pytest.raises(envs.InputError, match=says):
+        presets.changed(presets.preset("default", envs.get(CONTROL), "cpu"), [change])
+
+
+def test_amounts() -> None:
+    full = presets.preset("default", envs.get(CONTROL), "cpu")
+    made = presets.changed(full, ["seeds=10", "naive.learning_rate=1e-3", "deconfounded.inference_batch=null"])
+    assert (made.seeds, made.naive.learning_rate, made.deconfounded.inference_batch) == (10, 1e-3, None)
+    assert made.dagger == full.dagger
