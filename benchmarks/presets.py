@@ -40,7 +40,7 @@ _CONTROL = Preset(
     ),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
-    dagger=DaggerConfig(updates=4500),
+    dagger=DaggerConfig(updates=4500, learning_rate=2e-3),
     cloning=CloningConfig(),
 )
 _ON_BANDIT = DeconfoundedConfig(
