@@ -219,11 +219,12 @@ def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--task", required=True)
+    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
     parser.add_argument("--out", type=Path, help="output folder; default: results/certificates")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
-    expert = policy.load(task)
+    expert = policy.load(task, args.expert)
     folder = args.out or Path("results") / "certificates"
     check_folder(folder)
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)

@@ -43,11 +43,12 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     return made
 
 
-def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]) -> list[str]:
-    """The methods asked for. Raises InputError for anything that cannot be run."""
+def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
+    """The methods asked for; guests: from outside too. Raises InputError for anything that cannot be run."""
     methods = list(known) if args.methods == ["all"] else args.methods or list(default)
-    methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
-    known = [*known, *(name for name, method in METHODS.items() if method.reference)]
+    if guests:
+        methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
+        known = [*known, *(name for name, method in METHODS.items() if method.reference)]
     catalogue.check(args.preset, methods, args.seeds, known)
     check_device(args.device)
     return list(dict.fromkeys(methods))

@@ -68,9 +68,10 @@ def main() -> None:
     from deconfounded.benchmarks import score
     from deconfounded.benchmarks.jobs import BenchmarkJob
     from deconfounded.benchmarks.pool import prepare, run_all
-    from deconfounded.benchmarks.presets import CONFIGS, preset
+    from deconfounded.benchmarks.presets import CONFIGS, changed, preset
 
-    folder, full = args.out or Path("results") / f"cost-{task.name}", preset(args.preset, task, args.device)
+    folder = args.out or Path("results") / f"cost-{task.name}"
+    full = changed(preset(args.preset, task, args.device), args.set)
     found: dict[str, Any] = {method: {} for method in methods}
     for share in SHARES:
         settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})

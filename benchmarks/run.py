@@ -35,7 +35,7 @@ def main() -> None:
     if args.task is None:
         raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
     task = envs.get(args.task)
-    wanted = {*commands.check(args, list(METHODS), DEFAULT), *REFERENCES}
+    wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
     envs.check_task(task)
     policy.load(task, args.expert)
     from deconfounded.benchmarks import report, score  # these take seconds; bad input is told at once

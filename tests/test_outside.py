@@ -58,7 +58,7 @@ def deconf(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
 
 def test_run_play_score(folder: Path) -> None:
     """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
-    assert len((folder / "my_rnn.py").read_text().splitlines()) <= 50
+    assert len([line for line in (folder / "my_rnn.py").read_text().splitlines() if line]) <= 40
     small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "cloning.updates=5")
     mine = ("--task", BENT, "--expert", "linear.py:control")
     done = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small)
