@@ -21,6 +21,7 @@ from deconfounded.benchmarks.jobs import BenchmarkJob, evaluate
 from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Allowed, Context, stream
 from deconfounded.deconf import naive_rnn
 from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.envs import check
 from deconfounded.experts import policy, saved
 from deconfounded.experts.demos import Trials, run_trials
 from tests.tools import tiny_preset
@@ -90,6 +91,35 @@ def test_run_play_score(folder: Path) -> None:
     changed = deconf(folder, "run", *mine, "--methods", "blind_bc", *small, "--resume")
     assert "holds a run with another expert" in changed.stderr
     assert not list((ROOT / "assets").rglob("bent_cartpole*"))
+
+
+def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """README's task holds the whole contract; one that gives theta away does not."""
+    monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
+    assert len((folder / "bent_cartpole.py").read_text().splitlines()) <= 60
+    leaky = "from bent_cartpole import BentCartpole\nclass Leaky(BentCartpole):\n    name = 'leaky'\n"
+    leaky += "    process_noise = {**BentCartpole.process_noise, 'hinge': (0, 0)}\n"
+    (folder / "leaky.py").write_text(leaky)
+    (folder / "leaky.xml").write_text((folder / "bent_cartpole.xml").read_text())
+    for file, code in ((BENT, 0), ("leaky.py:Leaky", 1)):
+        monkeypatch.setattr("sys.argv", ["deconf check", "--task", f"{folder}/{file}"])
+        with pytest.raises(SystemExit) as ended:
+            check.main()
+        told = capsys.readouterr().out
+        assert ended.value.code == code, told
+        assert ("FAIL" in told) == bool(code)
+    assert "FAIL noise_covers_every_coordinate_that_matters: theta moves a coordinate without process noise" in told
+
+
+def test_loop_of_readme(tmp_path: Path) -> None:
+    """Ten lines that deploy an agent."""
+    agent = MAKERS["deconfounded"](Context(envs.get(CONTROL), tiny_preset(), [0]))["deconfounded"]
+    assert isinstance(agent, LearnedAgent)
+    agent.save(tmp_path / "results" / "slippery_cartpole-default" / "agents" / "deconfounded-0")
+    (code,) = (code for code in snippets("python") if "deconfounded.load" in code)
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=environ)
+    assert done.returncode == 0, done.stderr
 
 
 def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
