@@ -21,12 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.methods import DEMOS, stream
-from deconfounded.benchmarks.score import normalise
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.methods import DEMOS, stream
+from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid
-from deconfounded.envs.console import Parser, Progress, check_folder, run_command, write_json
+from deconfounded.envs.files import check_folder, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials

@@ -14,15 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
-from deconfounded.benchmarks import catalogue
-from deconfounded.benchmarks.catalogue import METHODS, PRESETS
+from deconfounded.benchmarks.console import Parser
+from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
 from deconfounded.envs import outside
-from deconfounded.envs.console import Parser
 from deconfounded.experts import policy
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
-    from deconfounded.benchmarks.methods import Preset
-    from deconfounded.benchmarks.pool import Finished, Job
+    from deconfounded.benchmarks.engine.methods import Preset
+    from deconfounded.benchmarks.engine.pool import Finished, Job
 
 LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
@@ -84,7 +84,7 @@ def code(task: envs.Task) -> str:
     """SHA-256 of the source and the MJCF that a run's numbers depend on, those of a task or method from outside too."""
     root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
-    own = (root / "benchmarks" / f"{name}.py" for name in ("methods", "jobs", "score", "paper"))
+    own = (root / "benchmarks" / f"{name}.py" for name in ("engine/methods", "engine/jobs", "engine/measure", "paper"))
     named = [task.reference, *(method.reference for method in METHODS.values())]
     files = (outside.source(outside.find("code", name)) for name in named if outside.is_outside(name))
     for file in (*sources, *own, task.home / f"{task.name}.xml", *files):
@@ -96,8 +96,8 @@ def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
-    from deconfounded.benchmarks.pool import prepare, run_all, worked
-    from deconfounded.benchmarks.presets import changed, preset
+    from deconfounded.benchmarks.engine.pool import prepare, run_all, worked
+    from deconfounded.benchmarks.engine.presets import changed, preset
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds

@@ -16,8 +16,9 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.catalogue import METHODS, REFERENCES
-from deconfounded.envs.console import run_command, write_json
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.envs.files import write_json
 from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
@@ -65,10 +66,10 @@ def main() -> None:
     task, methods = envs.get(args.task), commands.check(args, LEARNED, LEARNED)
     envs.check_task(task)
     policy.load(task)
-    from deconfounded.benchmarks import score
-    from deconfounded.benchmarks.jobs import BenchmarkJob
-    from deconfounded.benchmarks.pool import prepare, run_all
-    from deconfounded.benchmarks.presets import CONFIGS, changed, preset
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.presets import CONFIGS, changed, preset
+    from deconfounded.benchmarks.output import score
 
     folder = args.out or Path("results") / f"cost-{task.name}"
     full = changed(preset(args.preset, task, args.device), args.set)

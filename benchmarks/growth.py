@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.envs.console import Parser, check_folder, run_command, write_json
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.envs.files import check_folder, write_json
 
 STEPS = (200, 400, 800, 1600, 3200)
 VALUES = (5, 11, 21, 41, 81)

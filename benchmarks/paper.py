@@ -14,16 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks import commands, score
-from deconfounded.benchmarks.figures import figure_2, figure_3
-from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Context, stream
-from deconfounded.benchmarks.pool import Finished, Job, JobMonitor, by_method
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.methods import EVALUATION, MAKERS, Context, stream
+from deconfounded.benchmarks.engine.pool import Finished, Job, JobMonitor, by_method
+from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output.figures import figure_2, figure_3
 from deconfounded.deconf.data import Batch
 from deconfounded.deconf.deconfounded import DeconfoundedAgent
 from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.recurrent import RecurrentAgent
-from deconfounded.envs.console import run_command, write_atomically, write_json
+from deconfounded.envs.files import write_atomically, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, run_trials

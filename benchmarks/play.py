@@ -12,8 +12,9 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks import jobs
-from deconfounded.envs.console import Parser, check_folder, run_command
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine import jobs
+from deconfounded.envs.files import check_folder
 from deconfounded.experts import saved
 from deconfounded.experts.demos import Agent
 

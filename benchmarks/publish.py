@@ -15,9 +15,9 @@ import numpy as np
 from PIL import Image
 
 from deconfounded import envs
-from deconfounded.benchmarks import pages
-from deconfounded.benchmarks.pages import DOCS
-from deconfounded.envs.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.output import pages
+from deconfounded.benchmarks.output.pages import DOCS
 
 
 def gif(video: Path, file: Path) -> None:

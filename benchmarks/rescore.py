@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from deconfounded import envs
-from deconfounded.benchmarks import score
-from deconfounded.benchmarks.methods import EVALUATION, stream
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.methods import EVALUATION, stream
+from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
-from deconfounded.envs.console import Parser, check_folder, run_command, write_json
+from deconfounded.envs.files import check_folder, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
 from deconfounded.experts.policy import Expert

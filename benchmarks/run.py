@@ -12,8 +12,9 @@ from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.catalogue import DEFAULT, METHODS, REFERENCES
-from deconfounded.envs.console import run_command, write_atomically, write_json
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.envs.files import write_atomically, write_json
 from deconfounded.experts import policy
 
 
@@ -38,8 +39,8 @@ def main() -> None:
     wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
     envs.check_task(task)
     policy.load(task, args.expert)
-    from deconfounded.benchmarks import report, score  # these take seconds; bad input is told at once
-    from deconfounded.benchmarks.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.output import report, score  # these take seconds; bad input is told at once
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, results = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)

@@ -14,11 +14,12 @@ from typing import Any
 import torch
 
 from deconfounded import envs
-from deconfounded.benchmarks import catalogue, commands
-from deconfounded.benchmarks.methods import MAKERS, Context, Preset
-from deconfounded.benchmarks.presets import preset
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine.methods import MAKERS, Context, Preset
+from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.deconf.agents import Monitor
-from deconfounded.envs.console import Parser, run_command
 from deconfounded.experts.demos import Agent
 
 TIMED = ("naive_rnn", "deconfounded", "deconfounded_discrete")

@@ -21,7 +21,9 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from deconfounded import envs
-from deconfounded.envs.console import Parser, Progress, check_folder, run_command, write_json
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.envs.files import check_folder, write_json
 from deconfounded.envs.physics import Physics, cores
 
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)

@@ -10,8 +10,8 @@ import sys
 
 COMMANDS = {
     "run": ("benchmarks.run", "train, deploy and score methods on a task"),
-    "train": ("experts.train", "train a task's expert (PPO)"),
-    "check": ("envs.check", "does a task hold together? the contract tests"),
+    "train": ("benchmarks.train", "train a task's expert (PPO)"),
+    "check": ("benchmarks.check", "does a task hold together? the contract tests"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),

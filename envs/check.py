@@ -1,13 +1,7 @@
-"""Does a task hold together? `check_task` asks before anything is trained or measured: a slip is one line then.
-
-The command asks that, and then every check of the contract (envs/contract.py), a line for each; it exits with 1 if any
-failed: `python -m deconfounded.envs.check --task slippery_cartpole`
-"""
+"""Does a task hold together? Asked before anything is trained or measured: a slip in a task file is one line then."""
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -17,15 +11,12 @@ from gymnasium import spaces
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.outside import told
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.probe import Skipped, actions, beyond_bounds
+from deconfounded.envs.probe import actions, beyond_bounds
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import InputError, Task
 
-# `python -m` finds this module loaded already, by its package, and warns of it; nothing here is made twice.
-warnings.filterwarnings("ignore", r"'deconfounded\.envs\.check' found in sys\.modules", RuntimeWarning)
 
-
-def _sentence(error: Exception) -> str:
+def sentence(error: Exception) -> str:
     """One line: what an error says and, unless it is a check's own, its type and where it was raised."""
     ours = isinstance(error, InputError | AssertionError) and str(error)
     return " ".join(str(error).split()) if ours else told(error)
@@ -38,7 +29,7 @@ def _part(task: Task, name: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        raise InputError(f"{name} of {task.name}: {_sentence(error)}") from error
+        raise InputError(f"{name} of {task.name}: {sentence(error)}") from error
 
 
 def check_task(task: Task) -> None:
@@ -120,31 +111,3 @@ def _check_episodes(task: Task) -> None:
             raise InputError(f"reward of {task.name} was {reward:g}; it must be at most 1 a step")
         if not env.alive.any():
             return
-
-
-def main() -> None:
-    """The command line."""
-    from deconfounded import envs
-    from deconfounded.envs.console import Parser
-    from deconfounded.envs.contract import CONTRACT
-
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True)
-    task, failed = envs.get(parser.parse_args().task), False
-    for name, check in {"check_task": check_task, **CONTRACT}.items():
-        try:
-            check(task)
-        except Skipped as why:
-            print(f"skip {name}: {why}", flush=True)
-        except Exception as error:
-            failed = True
-            print(f"FAIL {name}: {_sentence(error)}", flush=True)
-        else:
-            print(f"ok   {name}", flush=True)
-    sys.exit(failed)
-
-
-if __name__ == "__main__":
-    from deconfounded.envs.console import run_command
-
-    run_command(main)

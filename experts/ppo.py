@@ -11,7 +11,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from deconfounded import envs
-from deconfounded.envs.console import Progress
 from deconfounded.experts.sb3 import Sb3VecEnv
 
 PPO_SETTINGS: dict[str, Any] = {
@@ -24,20 +23,25 @@ PPO_SETTINGS: dict[str, Any] = {
 }
 
 
+Report = Callable[[int, str], None]
+"""Is told how many more steps are done, and how it goes."""
+
+
 class _Progress(BaseCallback):
-    def __init__(self, total: int) -> None:
+    def __init__(self, report: Report) -> None:
         super().__init__()
-        self._bar = Progress(total, "training")
+        self._report, self._done = report, 0
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
         returns = [episode["r"] for episode in self.model.ep_info_buffer or []]
-        self._bar.update(self.num_timesteps - self._bar.done, f"return {np.mean(returns):.1f}" if returns else "")
+        self._report(self.num_timesteps - self._done, f"return {np.mean(returns):.1f}" if returns else "")
+        self._done = self.num_timesteps
 
 
-def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.ndarray]:
+def train(task: envs.Task, steps: int, seed: int, report: Report, n: int = 64) -> dict[str, np.ndarray]:
     """PPO for `steps` control steps in n environments -> the weights of the policy's mean, layer by layer."""
     torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
     rate = PPO_SETTINGS["learning_rate"]
@@ -50,7 +54,7 @@ def train(task: envs.Task, steps: int, seed: int, n: int = 64) -> dict[str, np.n
         seed=seed,
         device="cpu",
     )
-    model.learn(steps, callback=_Progress(steps))
+    model.learn(steps, callback=_Progress(report))
     layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
     weights = {}
     for i, layer in enumerate(layer for layer in layers if isinstance(layer, torch.nn.Linear)):

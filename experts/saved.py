@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
 from deconfounded.envs import InputError, outside
-from deconfounded.envs.console import check_folder, write_atomically, write_json
+from deconfounded.envs.files import check_folder, write_atomically, write_json
 from deconfounded.experts.demos import Agent
 
 CODE = "agent.py"  # of an agent from outside, kept beside its arrays

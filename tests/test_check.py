@@ -14,14 +14,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks import certify, run
-from deconfounded.envs import check, contract
+from deconfounded.benchmarks import certify, check, run, train
 from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.physics import Edit, ModelEdit
 from deconfounded.envs.slippery_cartpole import SlipperyCartpole
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
-from deconfounded.experts import train
 
 
 class MissingFile(SlipperyCartpole):
@@ -262,7 +260,7 @@ def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> N
 def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """A line for each check, and exit code 1 if any failed."""
     names = ("effect", "reset_options", "bounds_are_wide_enough")
-    monkeypatch.setattr(contract, "CONTRACT", {name: CONTRACT[name] for name in names})
+    monkeypatch.setattr(check, "CONTRACT", {name: CONTRACT[name] for name in names})
     monkeypatch.setitem(envs.TASKS, "slippery_cartpole", NoEffect)
     outputs = []
     for name in ("bandit", "slippery_cartpole"):
@@ -280,7 +278,7 @@ def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
 
 def test_check_command_says_one_line() -> None:
     """Of a task that is not there, without a word of the interpreter's; and nothing is lost under `python -O`."""
-    command = [sys.executable, "-O", "-m", "deconfounded.envs.check", "--task", "nowhere"]
+    command = [sys.executable, "-O", "-m", "deconfounded.benchmarks.check", "--task", "nowhere"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import certify, pages, pool, publish, score
+from deconfounded.benchmarks import certify, publish
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.output import pages, score
 from deconfounded.envs.cartpole import Cartpole
-from deconfounded.envs.console import run_command
 from deconfounded.envs.task import Array
 from deconfounded.experts.policy import Expert
 
@@ -47,7 +49,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
-        (("-m", "deconfounded.experts.train", "--task", "bandit"), "nothing to train"),
+        (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
     ],
 )

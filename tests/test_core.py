@@ -14,8 +14,8 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from deconfounded import envs
-from deconfounded.benchmarks import score
-from deconfounded.benchmarks.methods import MAKERS, Context
+from deconfounded.benchmarks.engine.methods import MAKERS, Context
+from deconfounded.benchmarks.output import score
 from deconfounded.deconf import cloning, deconfounded, naive_rnn, offline
 from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.data import Batch, Draws, Signature

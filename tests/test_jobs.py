@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import figures, paper, pool
-from deconfounded.benchmarks.jobs import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks import paper
+from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.output import figures
 from deconfounded.benchmarks.paper import FigureJob
-from deconfounded.benchmarks.presets import preset
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.experts.demos import Agent

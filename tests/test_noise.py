@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.benchmarks import pages
+from deconfounded.benchmarks.output import pages
 from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.noise import ProcessNoise
 from deconfounded.envs.physics import Edit

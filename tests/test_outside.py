@@ -15,13 +15,13 @@ import pytest
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks import catalogue, certify, play, pool, presets
-from deconfounded.benchmarks.guest import Guest
-from deconfounded.benchmarks.jobs import BenchmarkJob, evaluate
-from deconfounded.benchmarks.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks import certify, check, play
+from deconfounded.benchmarks.engine import catalogue, pool, presets
+from deconfounded.benchmarks.engine.guest import Guest
+from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
+from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Allowed, Context, stream
 from deconfounded.deconf import naive_rnn
 from deconfounded.deconf.agents import LearnedAgent
-from deconfounded.envs import check
 from deconfounded.experts import policy, saved
 from deconfounded.experts.demos import Trials, run_trials
 from tests.tools import tiny_preset

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.methods import MAKERS, Context
-from deconfounded.benchmarks.presets import preset
-from deconfounded.benchmarks.score import normalise
+from deconfounded.benchmarks.engine.methods import MAKERS, Context
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig

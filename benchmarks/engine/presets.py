@@ -10,7 +10,7 @@ from typing import Any, get_args, get_type_hints
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.benchmarks.methods import Preset
+from deconfounded.benchmarks.engine.methods import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig

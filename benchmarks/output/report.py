@@ -18,10 +18,10 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks import score
-from deconfounded.benchmarks.catalogue import EXACT, REFERENCES
-from deconfounded.benchmarks.jobs import CLIPPED
-from deconfounded.benchmarks.pool import Finished
+from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES
+from deconfounded.benchmarks.engine.jobs import CLIPPED
+from deconfounded.benchmarks.engine.pool import Finished
+from deconfounded.benchmarks.output import score
 
 COLOURS = {
     "expert": "black",

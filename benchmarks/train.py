@@ -12,7 +12,9 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from deconfounded import envs
-from deconfounded.envs.console import Parser, check_folder, run_command, write_json
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.envs.files import check_folder, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
 
@@ -42,7 +44,9 @@ def main() -> None:
     from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
 
     start = time.time()
-    weights = train(task, args.steps, args.seed)
+    progress = Progress(args.steps, "training")
+    weights = train(task, args.steps, args.seed, progress.update)
+    progress.close()
     partial = file.with_suffix(".partial")
     save_file(weights, partial)
     os.replace(partial, file)

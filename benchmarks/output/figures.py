@@ -13,9 +13,9 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 
 from deconfounded import envs
-from deconfounded.benchmarks.catalogue import EXACT
-from deconfounded.benchmarks.pool import Finished, by_method
-from deconfounded.benchmarks.report import COLOURS
+from deconfounded.benchmarks.engine.catalogue import EXACT
+from deconfounded.benchmarks.engine.pool import Finished, by_method
+from deconfounded.benchmarks.output.report import COLOURS
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.methods import Context
+from deconfounded.benchmarks.engine.methods import Context
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts.demos import Agent, Trials

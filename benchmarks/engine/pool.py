@@ -24,11 +24,12 @@ import numpy as np
 import torch
 
 from deconfounded import envs
-from deconfounded.benchmarks.catalogue import METHODS, Method
-from deconfounded.benchmarks.guest import die_with_parent
-from deconfounded.benchmarks.methods import Context, Preset
+from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.guest import die_with_parent
+from deconfounded.benchmarks.engine.methods import Context, Preset
+from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.deconf.agents import Monitor, Training
-from deconfounded.envs.console import Progress, check_folder, write_atomically, write_json
+from deconfounded.envs.files import check_folder, write_atomically, write_json
 from deconfounded.envs.physics import cores
 from deconfounded.experts.demos import Agent
 

@@ -11,10 +11,10 @@ from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks import score
-from deconfounded.benchmarks.guest import Guest
-from deconfounded.benchmarks.methods import EVALUATION, MAKERS, Allowed, Context, stream
-from deconfounded.benchmarks.pool import Job, JobMonitor
+from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine.guest import Guest
+from deconfounded.benchmarks.engine.methods import EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks.engine.pool import Job, JobMonitor
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved
@@ -136,9 +136,9 @@ def evaluate(
     recorder = Recorder(agent, context.env)
     trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed, salt) for seed in seeds])
     recorder.note()
-    objective = score.objective(context.expert, trials, context.env.theta)
+    objective = measure.objective(context.expert, trials, context.env.theta)
     features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = np.array([[score.probe(known[rows], theta[rows]) for known in features] for rows in groups])
+    probes = np.array([[measure.probe(known[rows], theta[rows]) for known in features] for rows in groups])
     clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
     return {"returns": returns, "objective": objective}, probes, clip

@@ -1,0 +1,36 @@
+"""Does a task hold together? `deconf check --task slippery_cartpole`, or path/file.py:Class
+
+`check_task`, and then every check of the contract that all tasks are held to, a line for each; 1 if any failed.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.envs.check import check_task, sentence
+from deconfounded.envs.contract import CONTRACT
+from deconfounded.envs.probe import Skipped
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--task", required=True)
+    task, failed = envs.get(parser.parse_args().task), False
+    for name, check in {"check_task": check_task, **CONTRACT}.items():
+        try:
+            check(task)
+        except Skipped as why:
+            print(f"skip {name}: {why}", flush=True)
+        except Exception as error:
+            failed = True
+            print(f"FAIL {name}: {sentence(error)}", flush=True)
+        else:
+            print(f"ok   {name}", flush=True)
+    sys.exit(failed)
+
+
+if __name__ == "__main__":
+    run_command(main)

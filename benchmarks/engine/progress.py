@@ -1,0 +1,43 @@
+"""How far long work has come: a bar on a terminal, lines in a log."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import Any
+
+
+class Progress:
+    """A bar with an ETA on a terminal; elsewhere a plain line now and then."""
+
+    def __init__(self, total: int, label: str, every_s: float = 15) -> None:
+        self.total, self.done, self._label, self._every = total, 0, label, every_s
+        self._start = self._last = time.monotonic()
+        self._bar: Any = None
+        if sys.stderr.isatty():
+            from tqdm import tqdm  # who has the environments alone has no bars
+
+            self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False)
+
+    def update(self, n: int, note: str = "") -> None:
+        """n more are done."""
+        self.done += n
+        if self._bar is not None:
+            self._bar.set_postfix_str(note, refresh=False)
+            self._bar.update(n)
+        elif time.monotonic() - self._last > self._every:
+            self._last, share = time.monotonic(), self.done / self.total
+            left = f"{(self._last - self._start) * (1 / share - 1):.0f} s left" if share > 0.01 else "just begun"
+            print(f"{self._label}: {share:4.0%}, {left} {note}".rstrip(), flush=True)
+
+    def line(self, text: str) -> None:
+        """Print a line that stays."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            print(text, flush=True)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.close()

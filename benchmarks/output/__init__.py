@@ -1,0 +1,1 @@
+"""What a benchmark leaves: scores, tables, pictures, reports and pages. It knows nothing of commands."""
