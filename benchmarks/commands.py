@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
-import os
-import platform
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
-from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
 from deconfounded.envs import outside
+from deconfounded.envs.files import check_folder
 from deconfounded.experts import policy
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
     from deconfounded.benchmarks.engine.methods import Preset
     from deconfounded.benchmarks.engine.pool import Finished, Job
 
-LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 KEPT = "what was finished is kept, and --resume goes on"
 
 
@@ -62,66 +58,65 @@ def check_device(device: str) -> None:
 
     try:
         torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError, NotImplementedError):
+    except Exception:  # torch tells in many ways
         raise envs.InputError(f"--device {device} cannot be used here; cpu always can") from None
 
 
-def about(task: envs.Task, name: str, settings: Preset, expert: str | None = None, salt: str = "") -> dict[str, Any]:
-    """What a run must agree in for its jobs to be kept."""
+def about(
+    kind: type[Job],
+    task: envs.Task,
+    name: str,
+    settings: Preset,
+    changes: Sequence[str],
+    expert: str | None = None,
+    salt: str = "",
+) -> dict[str, Any]:
+    """What a folder is for: whoever asks for another one is not to write there. What else matters, each job checks."""
     return {
+        "kind": kind.__name__,
         "task": task.name,
         "task_version": task.version,
+        "reference": task.reference,
         "preset": name,
+        "set": list(changes),
         "settings": asdict(settings),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "versions": identity.versions(),
         "expert": policy.fingerprint(task, expert),
         "salt": salt,
-        "code": code(task),
+        "episodes": task.episodes,
     }
-
-
-def code(task: envs.Task) -> str:
-    """SHA-256 of the source and the MJCF that a run's numbers depend on, those of a task or method from outside too."""
-    root, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
-    sources = (file for name in ("envs", "experts", "deconf") for file in sorted((root / name).glob("*.py")))
-    own = (root / "benchmarks" / f"{name}.py" for name in ("engine/methods", "engine/jobs", "engine/measure", "paper"))
-    named = [task.reference, *(method.reference for method in METHODS.values())]
-    files = (outside.source(outside.find("code", name)) for name in named if outside.is_outside(name))
-    for file in (*sources, *own, task.home / f"{task.name}.xml", *files):
-        digest.update(file.read_bytes() if file and file.exists() else b"")
-    return digest.hexdigest()
 
 
 def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
-    """Run what is not finished in the folder; returns all that is, and the head of its results.json."""
-    from deconfounded.benchmarks.engine.pool import prepare, run_all, worked
+    """Run what is not finished in the folder; returns all that is, and what the folder is for."""
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
     from deconfounded.benchmarks.engine.presets import changed, preset
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
     expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
-    described = about(task, args.preset, settings, expert, salt)
-    prepare(folder, described, args.resume)
-    start, label = time.time(), f"{task.name}, {args.preset}"
-    jobs = [
-        kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest)
-        for method in methods
-        for guest in [METHODS[method] if METHODS[method].reference else None]
-    ]
-    finished, resumed = run_all(jobs, args.device, label)
-    return finished, {
-        "task": task.name,
-        "task_version": task.version,
-        "preset": args.preset,
-        **({"set": args.set} if args.set else {}),
-        **({"expert": expert} if expert else {}),
-        **({"salt": salt} if salt else {}),
-        "seeds": list(range(seeds)),
-        "eval_trials": settings.eval_trials,
-        "versions": described["versions"],
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, trained on {args.device}",
-        "wall_s": round(worked(start, finished), 1),
-        "resumed": resumed,
-    }
+    described = about(kind, task, args.preset, settings, args.set, expert, salt)
+    with locked(folder):
+        prepare(folder, described, args.resume)
+        jobs = [
+            kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest)
+            for method in methods
+            for guest in [METHODS[method] if METHODS[method].reference else None]
+        ]
+        finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}")
+    return finished, {**described, "resumed": resumed}
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Nobody else is at work in the folder meanwhile; a lock dies with its owner. Raises InputError if somebody is."""
+    from filelock import FileLock, Timeout
+
+    check_folder(folder)
+    try:
+        with FileLock(folder / ".lock", timeout=0):
+            yield
+    except Timeout:
+        raise envs.InputError(f"another command is at work in {folder}; wait for it, or give another --out") from None

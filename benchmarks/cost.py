@@ -69,7 +69,7 @@ def main() -> None:
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
     from deconfounded.benchmarks.engine.pool import prepare, run_all
     from deconfounded.benchmarks.engine.presets import CONFIGS, changed, preset
-    from deconfounded.benchmarks.output import score
+    from deconfounded.benchmarks.output import records, score
 
     folder = args.out or Path("results") / f"cost-{task.name}"
     full = changed(preset(args.preset, task, args.device), args.set)
@@ -77,12 +77,13 @@ def main() -> None:
     for share in SHARES:
         settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})
         own = folder / f"{share:g}"
-        prepare(own, commands.about(task, args.preset, settings), args.resume)
+        prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]
         jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
         finished, _ = run_all(jobs, args.device, label)
-        results = score.summarise(finished, task.episodes)
+        made = [one for *_, data in finished for one in records.of_job(data, args.preset, args.set, task.episodes)]
+        results = records.gather(made)["methods"]
         zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
         for method in methods:
             last = score.normalise(np.array(results[method]["return"])[:, -1], zero, one)

@@ -163,7 +163,7 @@ def summarise(finished: Finished, references: dict[str, dict[str, Any]]) -> dict
             "loss": round(float(np.mean([entry["loss_curve"][-1] for entry in data])), 4),
             "online": curve.round(4).tolist(),
             "on_expert": np.mean([entry["on_expert"] for entry in data], 0).round(4).tolist(),
-            "budget": score.mean_budget(data),
+            "budget": score.mean_budget([entry["meta"]["budget"] for entry in data]),
             "train_s": round(float(np.mean([entry["meta"]["train_s"] for entry in data])), 1),
         }
     return found

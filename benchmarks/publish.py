@@ -1,13 +1,14 @@
 """Keep a finished run in docs/: `python benchmarks/publish.py results/slippery_cartpole-default`
 
-Copies results.json, the adaptation picture and, from `certificates` beside the run's folder, the task's certificate;
-makes a small GIF of the video; and brings the pages up to date that show them (`pages.py`).
+Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
+certificate; makes a small GIF of the video; and brings the pages up to date that show them (`pages.py`). All of it is
+looked at before anything is changed.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
+import tempfile
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -16,8 +17,10 @@ from PIL import Image
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
-from deconfounded.benchmarks.output import pages
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.output import pages, records
 from deconfounded.benchmarks.output.pages import DOCS
+from deconfounded.envs import outside
 
 
 def gif(video: Path, file: Path) -> None:
@@ -29,26 +32,33 @@ def gif(video: Path, file: Path) -> None:
 
 
 def keep(run: Path) -> None:
-    """Copy what is worth keeping of a finished run. Raises InputError if there is none."""
-    wanted = [run / name for name in ("results.json", "adaptation.png")]
-    if not all(file.is_file() for file in wanted):
-        raise envs.InputError(f"{run} holds no results.json and adaptation.png of a finished run of run.py")
-    try:
-        results = json.loads(wanted[0].read_text())
-        pages.section(envs.get(results["task"]), results)
-    except envs.InputError:  # another task's
-        raise
-    except (ValueError, KeyError):
-        raise envs.InputError(f"{wanted[0]} is damaged; run the benchmark again") from None
-    if results["preset"] == "smoke":
-        raise envs.InputError(f"{run} is a smoke run, whose figures mean nothing; give one of another preset")
-    name, certificates = results["task"], run.parent / "certificates"
-    for file, suffix in zip(wanted, ("json", "png"), strict=True):
-        shutil.copy(file, DOCS / f"{name}.{suffix}")
-    (DOCS / f"{name}.gif").unlink(missing_ok=True)
-    if (run / "video.mp4").exists():
-        gif(run / "video.mp4", DOCS / f"{name}.gif")
-    for file in certificates.glob(f"{name}.*"):
+    """Copy what is worth keeping of a finished run. Raises InputError, and changes nothing, if something is amiss."""
+    files = [file for file in sorted((run / "records").glob("*/*/*.json")) if not file.is_symlink()]
+    if not files or not (run / "adaptation.png").is_file():
+        raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
+    found = [records.read(file) for file in files]
+    results = records.gather(found, list(METHODS))
+    if results["preset"] != "default" or {"set", "salt"} & set(results):
+        raise envs.InputError(
+            f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
+        )
+    task = envs.get(results["task"])
+    if results["task_version"] != task.version:
+        raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")
+    with tempfile.TemporaryDirectory() as scratch:
+        clip = Path(scratch) / "clip.gif"
+        if (run / "video.mp4").exists():
+            try:
+                gif(run / "video.mp4", clip)
+            except Exception as error:
+                raise envs.InputError(f"{run / 'video.mp4'} is no video ({outside.told(error)})") from None
+        for record in found:
+            records.write(DOCS / "records", record)
+        shutil.copy(run / "adaptation.png", DOCS / f"{task.name}.png")
+        (DOCS / f"{task.name}.gif").unlink(missing_ok=True)
+        if clip.exists():
+            shutil.copy(clip, DOCS / f"{task.name}.gif")
+    for file in (run.parent / "certificates").glob(f"{task.name}.*"):
         shutil.copy(file, DOCS / "certificates")
 
 

@@ -14,7 +14,6 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
-from deconfounded.envs.files import write_atomically, write_json
 from deconfounded.experts import policy
 
 
@@ -40,17 +39,11 @@ def main() -> None:
     envs.check_task(task)
     policy.load(task, args.expert)
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
-    from deconfounded.benchmarks.output import report, score  # these take seconds; bad input is told at once
+    from deconfounded.benchmarks.output import report  # it takes seconds; bad input is told at once
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
-    finished, results = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
-    results["methods"] = score.summarise(finished, task.episodes)
-    write_json(folder / "results.json", results)
-    write_atomically(folder / "rows.csv", score.csv_rows(task, results, finished))
-    report.pictures(task, results, finished, folder)
-    write_atomically(folder / "report.html", report.page(results, folder))
-    print(f"\n{task.name}: 0 = random actions, 1 = the expert that sees theta\n\n{score.table(results)}\n")
-    print(f"{results['wall_s']:.0f} s -> {folder / 'report.html'}")
+    finished, about = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
+    print(report.write(task, about, finished, folder))
 
 
 if __name__ == "__main__":

@@ -32,11 +32,13 @@ def main() -> None:
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
-    if args.steps < 1 or args.seed < 0:
-        raise envs.InputError(f"--steps was {args.steps} and --seed {args.seed}; they must be at least 1 and 0")
+    if not (1 <= args.steps < 2**40 and 0 <= args.seed < 2**32):
+        raise envs.InputError(f"--steps was {args.steps} and --seed {args.seed}; they must be from 1 and from 0 up")
     file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
+    if file.is_dir():
+        raise envs.InputError(f"--out was {file}, a folder; it must be a file")
     if args.out is None and file.exists():
         raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
     envs.check_task(task)
@@ -56,6 +58,7 @@ def main() -> None:
     card = {
         "task": task.name,
         "task_version": task.version,
+        "sha256": policy.fingerprint(task, file),
         "command": f"deconf train --task {args.task} --steps {args.steps} --seed {args.seed}",
         "algorithm": "PPO (stable-baselines3), privileged view, 64 environments, tanh networks of 64 x 64",
         "settings": PPO_SETTINGS,

@@ -15,6 +15,8 @@ COMMANDS = {
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
+    "report": ("benchmarks.report", "make a run's report again, without training"),
+    "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
     "publish": ("benchmarks.publish", "keep a finished run in docs/"),
     "pages": ("benchmarks.pages", "write the pages of docs/ anew"),
     "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),
@@ -39,6 +41,9 @@ def main() -> None:
     sys.argv = [f"deconf {name}", *sys.argv[2:]]
     try:
         runpy.run_module(f"deconfounded.{COMMANDS[name][0]}", run_name="__main__", alter_sys=True)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise

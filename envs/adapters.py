@@ -105,8 +105,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self, task: Task, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
     ) -> None:
         for what, given in (("environments", n), ("episodes", episodes)):
-            if given < 1:
-                raise InputError(f"the number of {what} was {given}; it must be at least 1")
+            if not isinstance(given, int | np.integer) or given < 1:
+                raise InputError(f"the number of {what} was {given!r}; it must be a whole number from 1 up")
         self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode.NEXT_STEP}
         self.task, self.num_envs, self.episodes, self.render_mode = task, n, episodes, render_mode
         self.batch = BatchEnv(task, n, privileged)

@@ -40,7 +40,8 @@ class BatchEnv:
             seed = [None] * self.n
         elif isinstance(seed, int | np.integer):
             seed = [int(seed) + i for i in range(self.n)]
-        if len(seed) != self.n or any(one is not None and one < 0 for one in seed):
+        whole = isinstance(seed, list | tuple | np.ndarray) and len(seed) == self.n
+        if not whole or not all(one is None or (isinstance(one, int | np.integer) and one >= 0) for one in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [
             [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seed

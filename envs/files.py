@@ -24,10 +24,18 @@ def check_folder(folder: Path) -> None:
 def write_atomically(file: Path, data: str | bytes) -> None:
     """The file holds all of data, or what it held before."""
     partial = file.with_name(f".{file.name}.{os.getpid()}")
-    partial.write_bytes(data.encode() if isinstance(data, str) else data)
-    os.replace(partial, file)
+    try:
+        partial.write_bytes(data.encode() if isinstance(data, str) else data)
+        os.replace(partial, file)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(file)) from None
 
 
 def write_json(file: Path, data: Any) -> None:
-    """JSON, atomically."""
-    write_atomically(file, json.dumps(data, indent=2) + "\n")
+    """JSON, atomically. Raises InputError for NaN or infinity, which JSON does not have."""
+    try:
+        text = json.dumps(data, indent=2, allow_nan=False)
+    except ValueError:
+        raise InputError(f"{file} would hold NaN or infinity; nothing was written") from None
+    write_atomically(file, text + "\n")

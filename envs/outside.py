@@ -58,6 +58,15 @@ def absolute(reference: str) -> str:
     return f"{Path(where).resolve()}:{name}" if where.endswith(".py") else f"{where}{colon}{name}"
 
 
+def file(reference: str) -> Path | None:
+    """Where it is defined, without running it; None for a module that has no file."""
+    where, _, _ = reference.rpartition(":")
+    if where.endswith(".py"):
+        return Path(where).resolve()
+    spec = importlib.util.find_spec(where)
+    return Path(spec.origin).resolve() if spec is not None and spec.origin else None
+
+
 def source(of: Any) -> Path | None:
     """The file that defines a class or function, or the class of an object; None if it has none."""
     try:

@@ -48,11 +48,10 @@ class Edit(Protocol):
 
 
 def cores() -> int:
-    """How many threads to use: OMP_NUM_THREADS if it is a number, else the cores this process may run on."""
+    """How many threads to use: the cores this process may run on, or OMP_NUM_THREADS if that is fewer."""
     wanted = os.environ.get("OMP_NUM_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(there, int(wanted)) if wanted.isdecimal() and int(wanted) > 0 else there
 
 
 def _tilt(angle: float) -> list[float]:

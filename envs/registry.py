@@ -55,6 +55,8 @@ def get(name: str) -> Task:
 
     Raises InputError, naming the nearest, if there is none.
     """
+    if not isinstance(name, str):
+        raise InputError(f"task was {name!r}; it must be a name, or path/file.py:Class")
     if name in TASKS:
         return TASKS[name]()
     for point in entry_points(group=GROUP):

@@ -241,7 +241,10 @@ class Task(ABC):
         """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist."""
         width = 1 if isinstance(self.action_space, spaces.Discrete) else self.action_space.shape[0]
         try:
-            array = np.asarray(action, float)
+            array = np.asarray(action)
+            if array.dtype.kind in "USO":
+                raise TypeError
+            array = array.astype(float)
         except (TypeError, ValueError):
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
         if array.shape != (n, width):

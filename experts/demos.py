@@ -71,8 +71,8 @@ class Trials:
         try:
             with np.load(file, allow_pickle=False) as data:
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
-        except (OSError, KeyError, ValueError, EOFError) as error:
-            raise InputError(f"no trials could be read from {file}: {error}") from None
+        except Exception as error:  # a file that is no zip, or half of one, fails in many ways
+            raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
 
 
 def joined(parts: Sequence[Trials]) -> Trials:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
@@ -154,6 +155,12 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:
+        told = json.loads(file.with_suffix(".json").read_text()).get("sha256")
+    except (OSError, ValueError, AttributeError):  # weights of one's own may go without a card
+        told = None
+    try:
+        if told not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
+            raise OSError(f"their sha256 is not that of {file.with_suffix('.json').name}")
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None

@@ -15,8 +15,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import certify, publish
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import pool
-from deconfounded.benchmarks.output import pages, score
+from deconfounded.benchmarks.output import pages, records, score
 from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.task import Array
 from deconfounded.experts.policy import Expert
@@ -47,7 +46,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
         (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
         (("benchmarks/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
         (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
-        (("benchmarks/publish.py", "nowhere"), "holds no results.json and adaptation.png"),
+        (("benchmarks/publish.py", "nowhere"), "holds no records and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
         (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
@@ -121,7 +120,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
 
 
 def test_time_worked_counts_overlaps_once() -> None:
-    assert pool.covered([(5, 6), (0, 2), (1, 3)]) == 4
+    assert records.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
 
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
@@ -136,13 +135,16 @@ def test_no_gl_is_only_a_note(backend: str) -> None:
 class TestScore:
     def test_by_hand(self) -> None:
         """Random 10, expert 30: a return of 25 scores .75, and the interval of two seeds .7 and .8 holds both."""
-        finished = []
+        by_method = {}
         for name, by_seed in {"random": (10.0, 10.0), "expert": (30.0, 30.0), "other": (24.0, 26.0)}.items():
-            for seed, value in enumerate(by_seed):
-                arrays = {"returns": np.full((4, 2), value), "objective": np.full((4, 2), -value), "probe": np.ones(2)}
-                wrote = {f"{name}/{key}": array for key, array in arrays.items()}
-                finished.append((name, seed, {**wrote, "meta": {"agents": [name], "budget": {}, "cpu_s": 1.5}}))
-        methods = score.summarise(finished, 2)
+            by_method[name] = [
+                {
+                    **{"seed": seed, "returns": [value] * 2, "objective": [-value] * 2, "theta_r2": [1.0] * 2},
+                    **{"budget": {}, "cpu_s": 1.5, "tier": "1"},
+                }
+                for seed, value in enumerate(by_seed)
+            ]
+        methods = score.summarise(by_method, 2)
         assert methods["other"]["objective"] == [-25, -25]
         assert methods["other"]["score"] == [0.75, 0.75]
         assert methods["other"]["return"] == [[24.0, 24.0], [26.0, 26.0]]
@@ -208,21 +210,45 @@ def test_certificate_fails_what_deserves_it() -> None:
 
 
 def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures, picture and certificate go to docs; a clip of an older run does not stay beside them."""
+    """Records, picture and certificate go to docs; a clip of an older run does not stay beside them.
+
+    What is amiss is told in a line, and nothing is changed.
+    """
     run, docs = tmp_path / "results" / "bandit-default", tmp_path / "docs"
     for folder in (run, docs / "certificates", run.parent / "certificates"):
         folder.mkdir(parents=True)
-    (run / "results.json").write_text((ROOT / "docs" / "bandit.json").read_text())
+    shown = records.of_task(ROOT / "docs" / "records", "bandit", 0)
+    for record in shown:
+        records.write(run / "records", record)
     (run / "adaptation.png").write_bytes(b"a picture")
     (run.parent / "certificates" / "bandit.json").write_text("{}")
     (docs / "bandit.gif").write_bytes(b"an old clip")
+    (run / "video.mp4").write_bytes(b"junk")
     monkeypatch.setattr(publish, "DOCS", docs)
+
+    def kept() -> list[str]:
+        return sorted(str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file())
+
+    for says, record in (("is no video", shown[0]), ("is no record", {**shown[0], "returns": [float("nan")]})):
+        file = run / "records" / records.place(shown[0])
+        file.write_text(json.dumps(record))
+        with pytest.raises(envs.InputError, match=says):
+            publish.keep(run)
+        assert kept() == ["bandit.gif"]
+    file.write_text(json.dumps(shown[0]))
+    (run / "video.mp4").unlink()
     publish.keep(run)
-    kept = sorted(str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file())
-    assert kept == ["bandit.json", "bandit.png", "certificates/bandit.json"]
-    (run / "results.json").write_text('{"task": "bandit"}')
-    with pytest.raises(envs.InputError, match="damaged"):
-        publish.keep(run)
+    assert kept() == sorted(
+        [*(f"records/{records.place(one)}" for one in shown), "bandit.png", "certificates/bandit.json"]
+    )
+    with pytest.raises(envs.InputError, match="holds no records"):
+        publish.keep(tmp_path)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "docs" / "records").rglob("*.json")), ids=lambda file: file.stem)
+def test_records_hold_the_schema(file: Path) -> None:
+    """And lie where they belong."""
+    assert file == ROOT / "docs" / "records" / records.place(records.read(file))
 
 
 def test_pages_are_up_to_date() -> None:
@@ -236,8 +262,9 @@ def test_pages_are_up_to_date() -> None:
     ):
         assert text == now, "run `python benchmarks/pages.py`"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)
-    kept = [*docs.glob("*.json"), *(docs / "certificates").glob("*.json")]
-    assert sorted(name for name in rows if name != "task") == sorted(file.stem for file in kept)
+    tasks = {file.parents[1].name.rpartition("-v")[0] for file in (docs / "records").rglob("*.json")}
+    kept = [*tasks, *(file.stem for file in (docs / "certificates").glob("*.json"))]
+    assert sorted(name for name in rows if name != "task") == sorted(kept)
 
 
 @pytest.mark.parametrize("marked", ["envs.make_vec", "def simulate"])

@@ -14,11 +14,13 @@ from deconfounded.envs import outside
 class Method:
     """uses: what it is handed (`deconf.given.USES`); references are handed the environment.
 
-    cost: about, where blind BC is 1, for the ETA alone. default: whether it runs if nobody asks for it. reference:
-    where a method from outside is.
+    module: where its code is, under the root. part: of a preset, that has its configuration. cost: about, where blind
+    BC is 1, for the ETA alone. default: whether it runs if nobody asks for it. reference: where one from outside is.
     """
 
     uses: tuple[str, ...] = ("demonstrations",)
+    module: str = ""
+    part: str = ""
     cost: int = 1
     default: bool = True
     exact: bool = False
@@ -41,16 +43,16 @@ class Method:
 
 _EXPLORES = ("demonstrations", "exploration")
 METHODS = {
-    "deconfounded": Method(_EXPLORES, 4),
-    "deconfounded_gru": Method(_EXPLORES, 14, default=False),
-    "deconfounded_discrete": Method(_EXPLORES, 7, default=False),
-    "deconfounded_offline": Method(cost=7, default=False),
-    "dagger": Method(("queries",), 4, default=False),
-    "naive_rnn": Method(cost=2),
-    "oracle_bc": Method(("demonstrations", "theta")),
-    "blind_bc": Method(),
-    "conditional": Method(("environment",), exact=True),
-    "interventional": Method(("environment",), exact=True),
+    "deconfounded": Method(_EXPLORES, "deconf/deconfounded", "deconfounded", 4),
+    "deconfounded_gru": Method(_EXPLORES, "deconf/deconfounded", "deconfounded", 14, default=False),
+    "deconfounded_discrete": Method(_EXPLORES, "deconf/deconfounded", "discrete", 7, default=False),
+    "deconfounded_offline": Method(module="deconf/offline", part="offline", cost=7, default=False),
+    "dagger": Method(("queries",), "deconf/dagger", "dagger", 4, default=False),
+    "naive_rnn": Method(module="deconf/naive_rnn", part="naive", cost=2),
+    "oracle_bc": Method(("demonstrations", "theta"), "deconf/cloning", "cloning"),
+    "blind_bc": Method(module="deconf/cloning", part="cloning"),
+    "conditional": Method(("environment",), "deconf/exact", exact=True),
+    "interventional": Method(("environment",), "deconf/exact", exact=True),
     "expert": Method(("environment",)),
     "random": Method(()),
 }
@@ -78,6 +80,7 @@ DEFAULT = tuple(name for name, method in METHODS.items() if method.default)  # t
 EXACT = tuple(name for name, method in METHODS.items() if method.exact)
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
 
+MOST_SEEDS = 1000
 PRESETS = {
     "smoke": "a minute: does everything work?",
     "default": "minutes on two cores: the figures in README",
@@ -92,5 +95,5 @@ def check(name: str, methods: Sequence[str] | None, seeds: int | None, known: Se
             raise envs.closest("method", method, list(known))
     if name not in PRESETS:
         raise envs.closest("preset", name, list(PRESETS))
-    if seeds is not None and seeds < 1:
-        raise envs.InputError(f"--seeds was {seeds}; it must be at least 1")
+    if seeds is not None and not 1 <= seeds <= MOST_SEEDS:
+        raise envs.InputError(f"--seeds was {seeds}; it must be at least 1, and at most {MOST_SEEDS:,}")

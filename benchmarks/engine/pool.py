@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import multiprocessing
@@ -26,6 +27,7 @@ import torch
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.guest import die_with_parent
+from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.methods import Context, Preset
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.deconf.agents import Monitor, Training
@@ -77,18 +79,46 @@ class Job(ABC):
         i = self.seeds.index(seed)
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
-        whole = {**meta, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
+        known = {"identity": identity(self), "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
+        whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
     def load(self, seed: int) -> dict[str, Any] | None:
-        """What was written of a seed: arrays, and `meta` decoded. None if its file is missing or damaged."""
-        try:
-            with np.load(self.file(seed), allow_pickle=False) as data:
-                arrays = {key: data[key] for key in data.files}
-            return {**arrays, "meta": json.loads(str(arrays["meta"]))}
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
+        """What was written of a seed: arrays, and `meta` decoded. None if there is nothing that fits: see `unfit`."""
+        found = read(self.file(seed))
+        return None if found is None or self.unfit(seed, found) else found
+
+    def unfit(self, seed: int, found: dict[str, Any]) -> str:
+        """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
+        meta, expected = found["meta"], json.loads(json.dumps(identity(self)))
+        told = meta.get("identity")
+        if not isinstance(told, dict) or not set(meta) >= REQUIRED:
+            return "it does not say what it was made of"
+        if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
+            return f"it was made with another {differ[0].replace('_', ' ')}"
+        if meta["seed"] != seed:
+            return f"it is of seed {meta['seed']}"
+        for key, value in found.items():
+            if key.endswith("/returns") and (value.ndim != 2 or len(value) != self.preset.eval_trials):
+                return f"{key} has shape {value.shape}, for {self.preset.eval_trials} trials"
+            if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
+                return f"{key} holds NaN or infinity"
+        return ""
+
+
+REQUIRED = {"identity", "seed", "budget", "spans", "cpu_s"}  # of a file's meta
+
+
+def read(file: Path) -> dict[str, Any] | None:
+    """A job's file: arrays, and `meta` decoded. None if it is missing, or damaged (a zip has checksums)."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        meta = json.loads(str(arrays["meta"]))
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+        return None
+    return {**arrays, "meta": meta} if isinstance(meta, dict) else None
 
 
 class DemonstrationJob(Job):
@@ -159,13 +189,16 @@ class JobMonitor(Monitor):
             buffer = io.BytesIO()
             known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
             torch.save({"training": state(), **known}, buffer)
-            write_atomically(self.file, buffer.getvalue())
+            write_atomically(self.file, hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
             self.saved = time.monotonic()
 
     def load(self) -> Training | None:
         try:
-            state = torch.load(self.file, self.device, weights_only=True)
-        except Exception:  # missing, or damaged, which torch tells in many ways: begin again
+            content = self.file.read_bytes()
+            if hashlib.sha256(content[32:]).digest() != content[:32]:
+                return None
+            state = torch.load(io.BytesIO(content[32:]), self.device, weights_only=True)
+        except Exception:  # missing, or of other code, which torch tells in many ways: begin again
             return None
         self.kept, self.before, self.budget = state["kept"], state["spans"], state["budget"]
         self.cpu_before = state["cpu"]
@@ -188,6 +221,10 @@ def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, in
     every: a job for each method, with all seeds, in one folder.
     """
     folder = every[0].folder
+    for job in every:
+        for seed in job.seeds:
+            if (found := read(job.file(seed))) and (why := job.unfit(seed, found)):
+                print(f"{job.file(seed).name} is made again: {why}")
     left = [[seed for seed in job.seeds if job.load(seed) is None] for job in every]
     parts = [
         replace(job, seeds=part)
@@ -211,10 +248,23 @@ def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, in
 def written(like: Job, folder: Path) -> list[Job]:
     """A job for each file in the folder, those of other methods and seeds than this command's too; in order."""
     named = [re.fullmatch(r"(\w+)-(\d+)", file.stem) for file in folder.glob("*.npz")]
-    pairs = [(match[1], int(match[2])) for match in named if match and match[1] in METHODS]
+    pairs = [(m[1], int(m[2])) for m in named if m and m[1] in METHODS and m[2] == str(int(m[2]))]
     order = list(METHODS)
     pairs.sort(key=lambda pair: (order.index(pair[0]), pair[1]))
-    return [replace(like, method=method, seeds=(seed,)) for method, seed in pairs]
+    return [
+        replace(like, method=method, seeds=(seed,), guest=METHODS[method] if METHODS[method].reference else None)
+        for method, seed in pairs
+    ]
+
+
+def left_in(folder: Path) -> Finished:
+    """What jobs left in a folder, whatever code made it: each file is what it says it is."""
+    found = []
+    for file in sorted(folder.glob("*-*.npz")):
+        data = read(file)
+        if data is not None and set(data["meta"]) >= REQUIRED and "agents" in data["meta"]:
+            found.append((str(data["meta"]["identity"]["method"]), int(data["meta"]["seed"]), data))
+    return found
 
 
 def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
@@ -291,21 +341,6 @@ def run_jobs(jobs: list[Job], label: str) -> None:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     progress.close()
-
-
-def worked(start: float, finished: Finished) -> float:
-    """Seconds that this command, begun at `start`, and the jobs of those before it took; what overlaps counts once."""
-    spans = (tuple(span) for *_, data in finished for span in data["meta"]["spans"])
-    return covered([(start, time.time()), *spans])
-
-
-def covered(spans: list[tuple[float, float]]) -> float:
-    """Length of the union of spans of time."""
-    total, until = 0.0, -np.inf
-    for start, end in sorted(spans):
-        total += max(0.0, end - max(start, until))
-        until = max(until, end)
-    return total
 
 
 def listed(seeds: tuple[int, ...]) -> str:

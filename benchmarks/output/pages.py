@@ -1,7 +1,7 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
-Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md (of the runs that
-`publish.py` kept) and the tables in README and docs/speed.md.
+Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md (of the records
+that `publish.py` kept) and the tables in README and docs/speed.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output import records, score
 from deconfounded.envs.files import write_atomically
 
 README = Path(__file__).resolve().parents[2] / "README.md"
@@ -44,11 +44,19 @@ def _kept(folder: Path, name: str) -> dict[str, Any] | None:
     return json.loads(file.read_text()) if file.is_file() else None
 
 
-def _published(folder: Path) -> Iterator[tuple[envs.Task, dict[str, Any]]]:
-    """In the registry's order, the tasks that have a file in the folder, and what it holds."""
+def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
+    """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
     for name in envs.names():
-        if found := _kept(folder, name):
+        if found := _kept(DOCS / "certificates", name):
             yield envs.get(name), found
+
+
+def _published() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
+    """In the registry's order, the tasks that have records in docs/, and what these come to."""
+    for name in envs.names():
+        task = envs.get(name)
+        if found := records.of_task(DOCS / "records", name, task.version):
+            yield task, records.gather(found, list(METHODS))
 
 
 def command(task: envs.Task, results: dict[str, Any]) -> str:
@@ -59,7 +67,8 @@ def command(task: envs.Task, results: dict[str, Any]) -> str:
     chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     seeds = len(results["seeds"])
     counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
-    return f"python benchmarks/run.py --task {task.name}{chosen}{counted}{named}"
+    changed = f" --set {' '.join(results['set'])}" if "set" in results else ""
+    return f"python benchmarks/run.py --task {task.name}{chosen}{changed}{counted}{named}"
 
 
 def section(task: envs.Task, results: dict[str, Any]) -> str:
@@ -74,10 +83,16 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"## {task.name}",
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {machine}; {versions}"
-        f" ([json]({task.name}.json)).",
+        f" ([records](records/{task.name}-v{task.version}), of {', '.join(one[:7] for one in results['commits'])}).",
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
+    if old := sorted(
+        folder.name
+        for folder in (DOCS / "records").glob(f"{task.name}-v*")
+        if folder.name != f"{task.name}-v{task.version}"
+    ):
+        parts.append(f"Superseded, and not to be compared: the records of {', '.join(old)}.")
     if (DOCS / f"{task.name}.gif").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.gif)")
     return "\n\n".join(parts)
@@ -87,18 +102,18 @@ def results_page() -> str:
     """docs/results.md."""
     head = """# Results
 
-Made by `python benchmarks/pages.py` from the json files beside it. Scores: 0 = random actions, 1 = the expert that sees
-theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees theta (more is
-better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out. Intervals are 95%
-bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times in four. *After as
-many again*: the last score in a trial twice as long as those of training."""
-    return "\n\n".join([head, *(section(*found) for found in _published(DOCS))]) + "\n"
+Made by `python benchmarks/pages.py` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
+expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
+theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
+Intervals are 95% bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times
+in four. *After as many again*: the last score in a trial twice as long as those of training."""
+    return "\n\n".join([head, *(section(*found) for found in _published())]) + "\n"
 
 
 def summary() -> str:
     """README's table: scores in the last episode."""
     rows, column = [], score.COLUMNS.index("last")
-    for task, results in _published(DOCS):
+    for task, results in _published():
         last = {row[0]: row[column] for row in score.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
@@ -109,7 +124,7 @@ def summary() -> str:
 def certificates() -> str:
     """README's table of certificates."""
     rows, asked = [], list[str]()
-    for task, found in _published(DOCS / "certificates"):
+    for task, found in _certified():
         measured = (f"{check['measured']:.2f}" for check in found["checks"].values())
         rows.append((task.name, *measured, *_nats(found), found["verdict"]))
         asked = [f"{name} ({check['required']})" for name, check in found["checks"].items()]
@@ -119,7 +134,7 @@ def certificates() -> str:
 def costs() -> str:
     """The table of docs/speed.md: CPU seconds a seed, before and now, of the tasks that were timed before."""
     before = json.loads((DOCS / "speed" / "before.json").read_text())
-    shown = [(task.name, results["methods"]) for task, results in _published(DOCS) if task.name in before]
+    shown = [(task.name, results["methods"]) for task, results in _published() if task.name in before]
     head, rows = ["method"], []
     for name, _ in shown:
         head += [f"{name}, before", "now"]
@@ -147,6 +162,8 @@ def _filled(text: str, *tables: Callable[[], str]) -> str:
     """The text with each table between `<!-- name -->` and `<!-- /name -->`."""
     for table in tables:
         marks = [f"<!-- {slash}{table.__name__} -->" for slash in ("", "/")]
+        if [text.count(mark) for mark in marks] != [1, 1]:
+            raise envs.InputError(f"a page lacks its marks {' and '.join(marks)}, each once; put them back")
         before, rest = text.split(marks[0])
         text = "\n".join([before + marks[0], table(), marks[1] + rest.split(marks[1])[1]])
     return text

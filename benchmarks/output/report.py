@@ -18,10 +18,12 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.jobs import CLIPPED
 from deconfounded.benchmarks.engine.pool import Finished
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output import records, score
+from deconfounded.envs import outside
+from deconfounded.envs.files import write_atomically, write_json
 
 COLOURS = {
     "expert": "black",
@@ -37,6 +39,26 @@ COLOURS = {
     "blind_bc": "tab:brown",
     "random": "lightgray",
 }
+
+
+def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
+    """Everything that a folder shows, from what its jobs left there; returns the table. No training happens here.
+
+    about: what the folder is for, as its settings.json says. Numbers come first: they stand, whatever pictures do.
+    """
+    made = [one for *_, data in finished for one in records.of_job(data, about["preset"], about["set"], task.episodes)]
+    for record in made:
+        records.write(folder / "records", record)
+    results = {**records.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
+    write_json(folder / "results.json", results)
+    write_atomically(folder / "rows.csv", score.csv_rows(task, results, finished))
+    try:
+        pictures(task, results, finished, folder)
+    except Exception as error:  # a GL, a font or an encoder can fail in many ways
+        print(f"no pictures: {outside.told(error)}")
+    write_atomically(folder / "report.html", page(results, folder))
+    head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
+    return f"\n{head}\n\n{score.table(results)}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
@@ -55,8 +77,8 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
     learning(curves, task.name, folder / "learning.png")
     try:
         video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
-    except (envs.InputError, OSError, RuntimeError) as error:  # no GL, or no encoder: the run is good all the same
-        print(f"no video: {error}")
+    except Exception as error:  # no GL, or no encoder: the run is good all the same
+        print(f"no video: {error if isinstance(error, envs.InputError) else outside.told(error)}")
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
@@ -144,7 +166,9 @@ def page(results: dict[str, Any], folder: Path) -> str:
     def encoded(file: Path) -> str:
         return base64.b64encode(file.read_bytes()).decode()
 
-    pictures = [(p.stem.capitalize(), encoded(p)) for p in (folder / "adaptation.png", folder / "learning.png")]
+    pictures = [
+        (p.stem.capitalize(), encoded(p)) for p in (folder / "adaptation.png", folder / "learning.png") if p.exists()
+    ]
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
     how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
     template = jinja2.Environment(autoescape=True).from_string(_PAGE)

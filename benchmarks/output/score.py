@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.envs.task import Array
 
 
@@ -33,41 +33,36 @@ def bootstrap(values: Array) -> list[float] | None:
     return [float(interval.low), float(interval.high)]
 
 
-def mean_budget(jobs: Sequence[dict[str, Any]]) -> dict[str, int]:
-    """What a seed used, by kind of data: the mean over jobs."""
-    budgets = [job["meta"]["budget"] for job in jobs]
+def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
+    """What a seed used, by kind of data: the mean over seeds."""
     return {kind: round(float(np.mean([budget[kind] for budget in budgets]))) for kind in budgets[0]}
 
 
-def summarise(finished: Sequence[tuple[str, int, dict[str, Any]]], episodes: int) -> dict[str, Any]:
-    """What jobs wrote (method, seed, arrays and meta) -> the `methods` entry of results.json.
+def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict[str, Any]:
+    """Records by method, random and expert among them -> the `methods` entry of results.json.
 
     `episodes` is the length of the trials trained on; what agents did in later ones, if any, is told apart.
     """
-    by_agent: dict[str, list[tuple[int, dict[str, Any]]]] = {}
-    for _, seed, data in finished:
-        for name in data["meta"]["agents"]:
-            by_agent.setdefault(name, []).append((seed, data))
 
     def means(name: str, key: str) -> Array:
-        return np.array([data[f"{name}/{key}"].mean(0) for _, data in by_agent[name]])
+        return np.array([record[key] for record in by_method[name]])
 
-    random, expert = (float(means(name, "returns")[:, :episodes].mean()) for name in ("random", "expert"))
+    random, expert = (float(means(name, "returns")[:, :episodes].mean()) for name in REFERENCES)
     methods = {}
-    for name, jobs in by_agent.items():
+    for name, seeds in by_method.items():
         returns = means(name, "returns")
-        scores, probes = normalise(returns, random, expert), np.array([data[f"{name}/probe"] for _, data in jobs])
+        scores = normalise(returns, random, expert)
         methods[name] = {
-            "seeds": [seed for seed, _ in jobs],
+            "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
             "score_last": round(float(scores[:, episodes - 1].mean()), 4),
             "ci95": bootstrap(scores[:, episodes - 1]),
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
-            "theta_r2": probes[:, :episodes].mean(0).round(4).tolist(),
-            "tier": jobs[0][1]["meta"].get("tier", ""),
-            "budget": mean_budget([data for _, data in jobs]),
-            "cpu_s": round(float(np.mean([data["meta"]["cpu_s"] for _, data in jobs])), 1),
+            "theta_r2": means(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
+            "tier": seeds[0]["tier"],
+            "budget": mean_budget([record["budget"] for record in seeds]),
+            "cpu_s": round(float(np.mean([record["cpu_s"] for record in seeds])), 1),
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
@@ -103,12 +98,6 @@ def two_decimals(value: float) -> str:
     return f"{np.round(value, 2):z.2f}"
 
 
-def tier(name: str, entry: dict[str, Any]) -> str:
-    """What a method may use, in the paper's terms; one that is not ours says so in its results."""
-    method = METHODS.get(name.removesuffix("_episode"))
-    return entry.get("tier", "") if method is None else method.tier
-
-
 def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     """The `methods` of results.json as rows of COLUMNS, best first; return and Eq. (1) are of the last episode."""
     found: list[tuple[str, ...]] = []
@@ -120,7 +109,7 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
         value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
         cost = f"{entry['cpu_s']:.0f}" if "cpu_s" in entry else ""  # not noted by older runs
         numbers = (value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known)
-        found.append((name, tier(name, entry), *numbers, data, cost))
+        found.append((name, entry["tier"], *numbers, data, cost))
     return found
 
 

@@ -1,0 +1,133 @@
+"""What a result depends on: kept as long as none of that has changed, made again as soon as some of it has.
+
+Of the code, that is the task's own, the method's own, what these import, and what makes trials and measures them; a
+change in another task's or method's file is none of its business.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import platform
+import subprocess
+import sysconfig
+from collections.abc import Iterable
+from dataclasses import asdict
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deconfounded import envs
+from deconfounded.envs import outside
+from deconfounded.experts import policy
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.pool import Job
+
+ROOT = Path(__file__).resolve().parents[2]
+LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
+FRAMEWORK = tuple(
+    ROOT / f"{name}.py"
+    for name in (
+        *("envs/task", "envs/batch", "envs/streams", "experts/demos", "experts/policy"),
+        *("benchmarks/engine/methods", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
+    )
+)
+ASIDE = {ROOT / f"{name}.py" for name in ("envs/render", "envs/files", "envs/outside", "experts/saved")}  # no number's
+AMOUNTS = {  # of a preset, by what a method uses
+    "demonstrations": ("expert_trials", "fresh"),
+    "exploration": ("explore_trials",),
+    "queries": ("query_trials",),
+    "environment": ("grid",),
+}
+
+
+def identity(job: Job) -> dict[str, Any]:
+    """All that the results of a job's seeds depend on, but for the seed."""
+    task, method, settings = envs.get(job.task), job.about, asdict(job.preset)
+    amounts = [name for use in method.uses for name in AMOUNTS.get(use, ())]
+    return {
+        "kind": type(job).__name__,
+        "task": task.name,
+        "task_version": task.version,
+        "method": job.method,
+        "settings": {name: settings[name] for name in ("eval_trials", *amounts, *([method.part] * bool(method.part)))},
+        "expert": policy.fingerprint(task, job.expert),
+        "salt": job.salt,
+        "versions": versions(),
+        "code": code(task, method.module, method.reference),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of Python, and of what is installed of the libraries that results depend on."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def machine(device: str) -> str:
+    """What it ran on."""
+    return f"{platform.machine()}, {os.cpu_count()} cores, trained on {device}"
+
+
+@cache
+def commit() -> str | None:
+    """Of this checkout, with a + if files differ from it; None outside of one."""
+    try:
+        run = lambda *what: subprocess.run(["git", *what], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: E731
+        top = run("rev-parse", "--show-toplevel").stdout.strip()
+        if Path(top).resolve() != ROOT:
+            return None
+        return run("rev-parse", "HEAD").stdout.strip() + ("+" if run("status", "--porcelain", "-uno").stdout else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def code(task: envs.Task, module: str, reference: str = "") -> str:
+    """SHA-256 of the sources and the MJCF that a result depends on. module: the method's, as path under the root."""
+    own = [ROOT / f"{module}.py"] if module else []
+    if reference and (file := outside.file(reference)):
+        own.append(file)
+    bases = [file for cls in type(task).__mro__ if (file := outside.source(cls)) and _counts(file)]
+    files = {*FRAMEWORK, *closure([*own, *bases])}
+    digest = hashlib.sha256()
+    for file in sorted(files, key=lambda file: (file.name, str(file))):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    mjcf = task.home / f"{task.name}.xml"
+    digest.update(mjcf.read_bytes() if mjcf.is_file() else b"")
+    return digest.hexdigest()
+
+
+def _counts(file: Path) -> bool:
+    """Ours, or somebody's own: not Python's or an installed library's."""
+    return file.is_relative_to(ROOT) or not file.is_relative_to(Path(sysconfig.get_paths()["stdlib"]).resolve())
+
+
+def closure(files: Iterable[Path]) -> set[Path]:
+    """The files, and those of this package that they import, and so on; what only hands names on is left out."""
+    found: set[Path] = set()
+    left = [file.resolve() for file in files]
+    while left:
+        file = left.pop()
+        if file not in found and file not in ASIDE:
+            found.add(file)
+            left += _imports(file)
+    return found
+
+
+@cache
+def _imports(file: Path) -> tuple[Path, ...]:
+    found = []
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("deconfounded"):
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+            paths = [ROOT / Path(*str(name).split(".")[1:]).with_suffix(".py") for name in names]
+            found += [path for path in paths if path.is_file() and path not in ASIDE]
+    return tuple(found)

@@ -1,0 +1,34 @@
+"""Make a run's tables, pictures and report again from what its jobs left: `deconf report results/bandit-default`
+
+Nothing is trained, and nothing is made that is not there.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.output import report
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("run", type=Path, help="output folder of a run")
+    folder = parser.parse_args().run
+    try:
+        about = json.loads((folder / "settings.json").read_text())
+        task, kind = envs.get(about["reference"]), about["kind"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
+    finished = pool.left_in(folder / "jobs")
+    if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
+        raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
+    print(report.write(task, about, finished, folder))
+
+
+if __name__ == "__main__":
+    run_command(main)

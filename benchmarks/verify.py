@@ -1,0 +1,89 @@
+"""Run the seed of a record again, and compare: `deconf verify docs/records/bandit-v0/default/blind_bc-0.json`
+
+Says `same bits`, `inside the interval` (the mean return of every episode within three standard errors of the trials) or
+`not the same`, and what differs in version, machine and code. Exit code 1 for `not the same`.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.output import records
+
+COMPARED = ("commit", "machine", "expert", "code")
+
+
+def verdict(record: records.Record, again: records.Record) -> tuple[str, list[str]]:
+    """What to say of a record whose seed was run again, and what differs in how they were made."""
+    differs = [f"{key}: {record[key]}, now {again[key]}" for key in COMPARED if record[key] != again[key]]
+    for name in sorted({*record["versions"], *again["versions"]}):
+        was, now = record["versions"].get(name, "none"), again["versions"].get(name, "none")
+        differs += [f"{name}: {was}, now {now}"] * (was != now)
+    if record["bits"] == again["bits"]:
+        return "same bits", differs
+    mean, sd = (np.array([one[key] for one in (record, again)]) for key in ("returns", "returns_sd"))
+    if mean.shape[1:] != sd.shape[1:] or len(record["returns"]) != len(again["returns"]):
+        return "not the same", differs
+    error = np.sqrt((sd**2).sum(0) / record["eval_trials"]) + 1e-9
+    return ("inside the interval" if (np.abs(mean[0] - mean[1]) <= 3 * error).all() else "not the same"), differs
+
+
+def rerun(record: records.Record, task: envs.Task, method: str, expert: str | None, device: str) -> records.Record:
+    """The same seed, made again in a folder that goes away."""
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.pool import run_all
+    from deconfounded.benchmarks.engine.presets import changed, preset
+
+    settings = changed(preset(record["preset"], task, device), record["set"])
+    guest = METHODS[method] if METHODS[method].reference else None
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "jobs"
+        folder.mkdir()
+        job = BenchmarkJob(task.reference, settings, method, (record["seed"],), folder, expert, record["salt"], guest)
+        finished, _ = run_all([job], device, f"{task.name}, {method}")
+        made = [
+            one
+            for *_, data in finished
+            for one in records.of_job(data, record["preset"], record["set"], task.episodes)
+            if one["method"] == record["method"]
+        ]
+    if not made:
+        raise envs.InputError(f"{method} left no {record['method']} to compare with")
+    return made[0]
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("record", type=Path)
+    parser.add_argument("--task", help="where the task is, if it is not ours: path/file.py:Class")
+    parser.add_argument("--method", help="where the method is, if it is not ours: path/file.py:fit")
+    parser.add_argument("--expert", help="the expert, if it is not the task's own")
+    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    args = parser.parse_args()
+    record = records.read(args.record)
+    task = envs.get(args.task or record["task"])
+    if (task.name, task.version) != (record["task"], record["task_version"]):
+        raise envs.InputError(
+            f"{args.record} is of {record['task']} v{record['task_version']}; here is {task.name} v{task.version}"
+        )
+    method = catalogue.add(args.method) if args.method else record["job"]
+    if method != record["job"] or method not in METHODS:
+        raise envs.InputError(f"{args.record} is of method {record['job']}; give its file as --method path/file.py:fit")
+    commands.check_device(args.device)
+    said, differs = verdict(record, rerun(record, task, method, args.expert, args.device))
+    print(f"{args.record}: {said}" + "".join(f"\n    {line}" for line in differs))
+    if said == "not the same":
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    run_command(main)
