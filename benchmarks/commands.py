@@ -15,7 +15,6 @@ from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
 from deconfounded.envs import outside
 from deconfounded.envs.files import check_folder
-from deconfounded.experts import policy
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
     from deconfounded.benchmarks.engine.methods import Preset
@@ -41,7 +40,8 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
 
 def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
     """The methods asked for; guests: from outside too. Raises InputError for anything that cannot be run."""
-    methods = list(known) if args.methods == ["all"] else args.methods or list(default)
+    asked = args.methods or list(default)
+    methods = [name for one in asked for name in (known if one == "all" else [one])]
     if guests:
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
         known = [*known, *(name for name, method in METHODS.items() if method.reference)]
@@ -81,7 +81,7 @@ def about(
         "set": list(changes),
         "settings": asdict(settings),
         "versions": identity.versions(),
-        "expert": policy.fingerprint(task, expert),
+        "expert": identity.expert(task, expert),
         "salt": salt,
         "episodes": task.episodes,
     }

@@ -14,6 +14,9 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import jobs
+from deconfounded.benchmarks.engine.guest import Stranger
+from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.deconf.cloning import MemorylessAgent
 from deconfounded.envs.files import check_folder
 from deconfounded.experts import saved
 from deconfounded.experts.demos import Agent
@@ -21,13 +24,13 @@ from deconfounded.experts.demos import Agent
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    about = saved.describe(folder)
+    about, agent = saved.describe(folder), deconfounded.load(folder)
     ours, theirs = jobs.spaces(task), about.get("spaces")
     if theirs not in (None, ours):
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
-    if about["settings"].get("shape", {}).get("theta"):
+    if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
-    return deconfounded.load(folder)
+    return agent if isinstance(agent, LearnedAgent) else Stranger(agent)
 
 
 def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = None) -> tuple[list[float], list[Any]]:

@@ -42,6 +42,10 @@ def keep(run: Path) -> None:
         raise envs.InputError(
             f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
         )
+    if results["task"] not in envs.suite():
+        raise envs.InputError(
+            f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.suite())}"
+        )
     task = envs.get(results["task"])
     if results["task_version"] != task.version:
         raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")

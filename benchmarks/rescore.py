@@ -36,6 +36,9 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
         known = {lat.name: lat for lat in task.latents}
         if name not in known:
             raise envs.closest("latent", name, list(known))
+        inside = known[name].low <= low <= high <= known[name].high
+        if known[name].distribution == "categorical" and not inside:
+            raise envs.InputError(f"--range was {text!r}; {name} has {known[name].low:g} to {known[name].high:g} alone")
         moved[name] = replace(known[name], low=low, high=high)
     other = type(task)()
     other.latents = tuple(moved.get(lat.name, lat) for lat in task.latents)  # type: ignore[misc]
@@ -78,6 +81,8 @@ def main() -> None:
     if args.trials < 2 or args.seed < 0:
         raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be at least 2 and 0")
     if args.out is not None:
+        if args.out.is_dir():
+            raise envs.InputError(f"--out was {args.out}, a folder; it must be a file")
         check_folder(args.out.parent)
     found = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
     low, high = found["ci95_last"]

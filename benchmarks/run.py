@@ -27,7 +27,11 @@ def main() -> None:
     args = parser.parse_args()
     if args.list:
         for name in envs.names():
-            task = envs.get(name)
+            try:
+                task = envs.get(name)
+            except envs.InputError as error:  # of somebody else's package
+                print(f"{name}: {error}")
+                continue
             latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
             print(f"{name}: {', '.join(latents)}")
         print(f"methods: {', '.join(METHODS)}\n    by default: {', '.join(DEFAULT)}")

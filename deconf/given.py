@@ -1,11 +1,14 @@
 """What a method from outside is handed: the data it declared that it uses, and nothing else.
 
 The method runs in a process of its own. Environments, their seeds, theta and the expert are in another one, and come no
-nearer than the arrays that this object asks for; what it asks for is counted.
+nearer than the arrays that this object asks for; what it asks for is counted. That keeps theta from who does not look
+for it, and from who walks through all that is at hand; it is no prison: files on the disk are not out of reach, and the
+seeds of a run without a salt are everybody's.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from multiprocessing.connection import Connection
 from typing import Any
@@ -14,9 +17,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from deconfounded.deconf.wire import pack
 from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Agent, Trials
 
+ANSWERED = ("act", "features")
 USES = {
     "demonstrations": "expert trials, without theta",
     "exploration": "roll-outs of a behaviour that is blind to theta",
@@ -78,14 +83,14 @@ class Given:
     def progress(self, share: float, **losses: float) -> None:
         """So much of the training is done, from 0 to 1; losses are for the learning curve."""
         if self._channel is not None:
-            self._channel.send(("progress", float(share), {name: float(loss) for name, loss in losses.items()}))
+            self._channel.send_bytes(pack(["progress", share, losses]))
 
     def _ask(self, kind: str, agent: Agent | None = None, *rest: Any) -> Any:
         channel, self._channel = self._channel, None
         if channel is None:
             raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
         try:
-            channel.send((kind, agent is not None, *rest))
+            channel.send_bytes(pack([kind, agent is not None, *rest]))
             return serve(channel, agent)
         finally:
             self._channel = channel
@@ -105,4 +110,5 @@ def serve(channel: Connection, agent: Agent | None) -> Any:
             raise InputError(given[0])
         if asked == "reset":
             given = [[np.random.default_rng(seed) for seed in given[0]]]
-        channel.send(("done", getattr(agent, asked)(*given)))
+        answer = getattr(agent, asked)(*given)
+        channel.send_bytes(pack(["done", answer if asked in ANSWERED else None, time.process_time()]))

@@ -34,6 +34,7 @@ from deconfounded.envs.registry import (
     make_vec,
     names,
     register,
+    suite,
 )
 from deconfounded.envs.slippery_cartpole import SlipperyCartpole
 from deconfounded.envs.slippery_walker import SlipperyWalker
@@ -59,6 +60,7 @@ __all__ = [
     "make_vec",
     "names",
     "register",
+    "suite",
 ]
 
 for _task in (

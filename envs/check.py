@@ -18,7 +18,7 @@ from deconfounded.envs.task import InputError, Task
 
 def sentence(error: Exception) -> str:
     """One line: what an error says and, unless it is a check's own, its type and where it was raised."""
-    ours = isinstance(error, InputError | AssertionError) and str(error)
+    ours = isinstance(error, AssertionError) and str(error)
     return " ".join(str(error).split()) if ours else told(error)
 
 

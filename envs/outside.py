@@ -29,15 +29,13 @@ def find(kind: str, reference: str) -> Any:
     where, _, name = reference.rpartition(":")
     if not where or not name:
         raise InputError(f"{kind} was {reference!r}; from outside it must be path/file.py:name or package.module:name")
+    if where.endswith(".py") and not Path(where).is_file():
+        raise InputError(f"{kind} {reference!r}: there is no file {where}")
     try:
         module = _run(Path(where)) if where.endswith(".py") else importlib.import_module(where)
-    except FileNotFoundError:
-        raise InputError(f"{kind} {reference!r}: there is no file {where}") from None
-    except ModuleNotFoundError as error:
-        raise InputError(f"{kind} {reference!r}: module {error.name} was not found") from None
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"{kind} {reference!r}: {told(error)}") from error
     if not hasattr(module, name):
         known = [key for key in vars(module) if not key.startswith("_")]
@@ -45,9 +43,13 @@ def find(kind: str, reference: str) -> Any:
     return getattr(module, name)
 
 
-def told(error: Exception) -> str:
-    """An error as part of one line: what it says, its type, and where it came from."""
-    text = " ".join(str(error.args[0] if error.args else error).split())
+def told(error: BaseException) -> str:
+    """An error as part of one line: what it says, its type, and where it came from. One of ours says enough."""
+    text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
+    if isinstance(error, InputError):
+        return text
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
     frame = traceback.extract_tb(error.__traceback__)[-1]
     return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
 
@@ -77,8 +79,6 @@ def source(of: Any) -> Path | None:
 
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
-    if not path.is_file():
-        raise FileNotFoundError(file)
     name = f"outside_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)

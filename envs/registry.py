@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -18,11 +19,21 @@ GROUP = "deconfounded.tasks"  # entry points of installed packages: name = "pack
 
 def register(cls: type[Task]) -> type[Task]:
     """Add a task by its name, for `get` and for gymnasium; usable as a decorator. Raises InputError if it is taken."""
-    known = TASKS.setdefault(cls.name, cls)
-    if known is not cls:
-        raise InputError(f"task name {cls.name!r} of {_where(cls)} is taken by {_where(known)}; give it another name")
+    name, where = getattr(cls, "name", None), _where(cls)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise InputError(
+            f"name of {cls.__name__} in {where} was {name!r}; it must be of a-z, 0-9 and _, from a letter on"
+        )
+    if missing := sorted(cls.__abstractmethods__):
+        raise InputError(f"task {name} of {where} lacks {', '.join(missing)}")
+    for part in ("latents", "horizon", "action_space", "observation"):
+        if not hasattr(cls, part):
+            raise InputError(f"task {name} of {where} does not state its {part}")
+    if TASKS.get(name, cls) is not cls:
+        raise InputError(f"task name {name!r} of {where} is taken by {_where(TASKS[name])}; give it another name")
     if "reference" not in vars(cls):
-        cls.reference = cls.name
+        cls.reference = name
+    TASKS[name] = cls
     gymnasium.registry.pop(cls().gym_id, None)
     gymnasium.register(
         cls().gym_id,
@@ -36,6 +47,11 @@ def register(cls: type[Task]) -> type[Task]:
 
 def _where(cls: type[Task]) -> str:
     return str(outside.source(cls) or cls.__module__)
+
+
+def suite() -> list[str]:
+    """The tasks that are ours."""
+    return [name for name, cls in TASKS.items() if cls.__module__.startswith(__package__)]
 
 
 def names() -> list[str]:

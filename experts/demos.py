@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs import BatchEnv, InputError
+from deconfounded.envs.files import write_atomically
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.policy import Expert
 
@@ -61,9 +61,9 @@ class Trials:
 
     def save(self, file: Path) -> None:
         """Write an .npz file, atomically."""
-        with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:
-            np.savez_compressed(handle, obs=self.obs, action=self.action, mask=self.mask, actions=self.actions)
-        os.replace(handle.name, file)
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, obs=self.obs, action=self.action, mask=self.mask, actions=self.actions)
+        write_atomically(file, buffer.getvalue())
 
     @staticmethod
     def load(file: Path) -> Trials:

@@ -111,8 +111,9 @@ class OwnExpert(BoxExpert):
 
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
         """Clipped to [-1, 1]. Raises InputError for what is not one finite row for each observation."""
-        try:
-            given = np.asarray(self.call(obs, theta), float)
+        parts = zip(np.split(obs, groups), np.split(theta, groups), strict=True)
+        try:  # on copies: what it does to them is its own business
+            given = np.concatenate([np.asarray(self.call(np.array(o), np.array(t)), float) for o, t in parts])
         except InputError:
             raise
         except Exception as error:
@@ -179,8 +180,6 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
 
 
 def fingerprint(task: Task, source: str | Path | None = None) -> str:
-    """SHA-256 of the weights, or of the file that holds the callable; or `closed form`."""
-    file: Path | None = Path(source) if source else path(task)
-    if isinstance(source, str) and outside.is_outside(source) and not source.endswith(".safetensors"):
-        file = outside.source(outside.find("expert", source))
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file and file.is_file() else "closed form"
+    """SHA-256 of a file of weights, by default the task's own; or `closed form`."""
+    file = Path(source) if source else path(task)
+    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "closed form"

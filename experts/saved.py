@@ -9,7 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from safetensors.numpy import save as to_bytes
 
@@ -26,6 +25,8 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     Of a class that a file brought from outside, the file is kept too, so that the folder is whole; what else that file
     imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept.
     """
+    if "." in type(agent).__qualname__:
+        raise InputError(f"{type(agent).__qualname__} cannot be saved; its class must stand at the top of its file")
     settings, arrays = agent.state()
     check_folder(folder)
     cls, code = type(agent), outside.source(type(agent))
@@ -41,10 +42,13 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
 def describe(folder: Path) -> dict[str, Any]:
     """agent.json. Raises InputError if there is none, or it is damaged."""
     try:
-        return json.loads((folder / "agent.json").read_text())
+        about = json.loads((folder / "agent.json").read_text())
+        if [type(about[key]) for key in ("class", "settings")] != [str, dict]:
+            raise TypeError
+        return about
     except OSError:
         raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
-    except ValueError:
+    except (ValueError, TypeError, KeyError):
         raise InputError(f"{folder / 'agent.json'} is damaged; run the benchmark again") from None
 
 
@@ -61,5 +65,7 @@ def load(folder: Path | str) -> Agent:
         if not (inspect.isclass(cls) and issubclass(cls, Agent)):
             raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
         return cls.from_state(about["settings"], load_file(folder / "agent.safetensors"))
-    except (SafetensorError, OSError, KeyError, RuntimeError, TypeError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever its class makes of arrays that are not its own
         raise InputError(f"the agent in {folder} is damaged ({outside.told(error)}); run the benchmark again") from None

@@ -10,6 +10,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,11 @@ import pytest
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
-from deconfounded.benchmarks.engine import catalogue, pool, presets
+from deconfounded.benchmarks.engine import catalogue, identity, pool, presets
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
-from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Allowed, Context, stream
-from deconfounded.deconf import naive_rnn
+from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.deconf import naive_rnn, wire
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.experts import policy, saved
 from deconfounded.experts.demos import Trials, run_trials
@@ -68,7 +69,8 @@ def test_run_play_score(folder: Path) -> None:
     run = folder / "results" / "bent_cartpole-smoke"
     results = json.loads((run / "results.json").read_text())
     assert results["set"] == ["eval_trials=4", "expert_trials=8", "cloning.updates=5"]
-    assert results["expert"] == hashlib.sha256((folder / "linear.py").read_bytes()).hexdigest()
+    made = b"control" + (folder / "linear.py").read_bytes()
+    assert results["expert"] == hashlib.sha256(made).hexdigest()
     assert results["methods"]["my_rnn"]["tier"] == "1"
     assert results["methods"]["my_rnn"]["budget"] == {"expert_trials": 8}
     assert "Clone cannot be saved" in done.stdout
@@ -144,8 +146,21 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ("x = 1", "Task", "has no 'Task'; it has x"),
         ("Task = 3", "Task", "is 3; it must be a subclass of deconfounded.envs.Task"),
         ("1 / 0", "Task", r"division by zero \(ZeroDivisionError, mine.py:1\)"),
-        ("import nonsuch", "Task", "module nonsuch was not found"),
-        ("def f(:", "Task", "SyntaxError, "),
+        ("import nonsuch", "Task", "No module named 'nonsuch'"),
+        ("x = 1\ndef f(:", "Task", r"invalid syntax \(SyntaxError, mine.py:2\)"),
+        ("open('gone.txt')", "Task", r"gone.txt' \(FileNotFoundError, mine.py:1\)"),
+        ("raise SystemExit('bye')", "Task", r"bye \(SystemExit, mine.py:1\)"),
+        ("from deconfounded.envs.cartpole import Cartpole as Task", "Task", "name of Cartpole in .* was None"),
+        (
+            "from deconfounded.envs import Task as T\nclass Task(T):\n    name = 'mine'",
+            "Task",
+            "task mine of .* lacks appl",
+        ),
+        (
+            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'Odd name!'",
+            "Task",
+            "'Odd name!'; it",
+        ),
         (
             "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
             "Task",
@@ -168,11 +183,38 @@ def test_a_bad_reference_is_one_line(reference: str, says: str) -> None:
         envs.get(reference)
 
 
+def test_an_expert_is_its_function_and_its_files(tmp_path: Path) -> None:
+    """Two functions of one file are two experts; a change in what the file imports makes another one."""
+    (tmp_path / "gain.py").write_text("GAIN = 1")
+    text = "import gain\ndef strong(obs, theta): return obs[:, :1]\ndef weak(obs, theta): return 0 * obs[:, :1]\n"
+    (tmp_path / "two.py").write_text(text)
+    task = envs.get(CONTROL)
+    seen = {identity.expert(task, f"{tmp_path}/two.py:{name}") for name in ("strong", "weak")}
+    (tmp_path / "gain.py").write_text("GAIN = 2")
+    identity._imports.cache_clear()
+    seen.add(identity.expert(task, f"{tmp_path}/two.py:strong"))
+    assert len(seen) == 3
+
+
+def test_experts_get_copies_seed_by_seed(tmp_path: Path) -> None:
+    """What they do to what they are given is their own business; rows come out as they would group by group."""
+    code = "seen = []\ndef control(obs, theta):\n    seen.append(len(obs))\n    theta *= 0\n    obs *= 0\n    return obs[:, :1]\n"
+    (tmp_path / "mine.py").write_text(code)
+    expert = policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
+    assert isinstance(expert, policy.OwnExpert)
+    obs, theta = np.ones((6, 6)), np.ones((6, 1))
+    expert.mean(obs, theta, groups=2)
+    assert obs.all()
+    assert theta.all()
+    assert expert.call.__globals__["seen"][-2:] == [3, 3]  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize(
     ("code", "says"),
     [
         ("return np.zeros(3)", r"gave shape \(3,\) for 2 observations; it must be \(2, 1\), finite"),
         ("return np.full((len(obs), 1), np.nan)", "gave NaN or infinity"),
+        ("theta *= 0; return np.full((len(obs) + 1, 1), 0.0)", r"gave shape \(3, 1\)"),
         ("return obs.nonsuch", r"nonsuch' \(AttributeError, mine.py:3\)"),
     ],
 )
@@ -205,6 +247,10 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
 @pytest.mark.parametrize(
     ("text", "says"),
     [
+        ("def fit(given): import sys; sys.exit(0)", r"0 \(SystemExit, mine.py:11\)"),
+        ("def fit(given): raise EOFError('mine')", r"mine \(EOFError, mine.py:11\)"),
+        ("def fit(given): given.progress(float('nan'))", "progress was nan, {}; it must be finite numbers"),
+        ("def fit(given): given._ask('environment')", "it asked for environment, and declares"),
         ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.demos.Agent"),
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
@@ -218,6 +264,60 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (
+            "    def act(self, obs): return np.zeros(3)",
+            r"actions of shape \(3,\) for 4 obs.*; they must be \(4, 1\), finite",
+        ),
+        ("    def act(self, obs): return np.full((len(obs), 1), np.nan)", "actions of NaN or infinity"),
+        ("    def act(self, obs): return [[1], [1, 2]]", r"actions of shape \(0,\)|inhomogeneous|what it sent|it gave"),
+        ("    def act(self, obs): return Thief()", "it gave Thief; it must be numbers, or arrays of them"),
+        ("    def features(self): return np.full((4, 2), np.nan)", "features must be None, or finite"),
+        ("    def begin(self, n): raise ValueError('no')", r"no \(ValueError, mine.py:\d+\)"),
+    ],
+)
+def test_what_an_agent_sends_is_looked_at(tmp_path: Path, text: str, says: str) -> None:
+    """And never run here: an object that would do something when it is unpickled does nothing."""
+    thief = f"class Thief:\n    def __reduce__(self): return (open, ({str(tmp_path / 'stolen')!r}, 'w'))\n"
+    method = f"{thief}\nclass Odd(Still):\n{text}\n\ndef fit(given): return Odd()"
+    context, agent = guest(tmp_path, method)
+    with pytest.raises(envs.InputError, match=f"^method mine.*({says})") as caught:
+        evaluate(context, agent, True)
+    agent.close()
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "stolen").exists()
+
+
+def test_a_stubborn_guest_goes(tmp_path: Path) -> None:
+    """One that does not heed signals, too."""
+    text = "import signal, threading\ndef fit(given):\n    signal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+    text += "    threading.Thread(target=threading.Event().wait).start()\n    return Still()"
+    _, agent = guest(tmp_path, text)
+    agent.close()
+    assert not agent.process.is_alive()
+
+
+class TestWire:
+    def test_there_and_back(self) -> None:
+        arrays = [np.arange(6.0).reshape(2, 3), np.zeros((0, 2), np.float32), np.array([True, False]), np.array(3)]
+        back = wire.unpack(wire.pack(["act", None, 1.5, {"a": arrays}, (1, np.float32(2))]))
+        assert back[:3] == ["act", None, 1.5]
+        assert back[4] == [1, 2.0]
+        for one, other in zip(back[3]["a"], arrays, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+
+    def test_damaged(self) -> None:
+        whole = wire.pack(["act", np.arange(3.0)])
+        for data in (b"", whole[:-1], whole[:20], b"\0" * 40, whole.replace(b"<f8", b"|O8")):
+            with pytest.raises(envs.InputError, match="cannot be read"):
+                wire.unpack(data)
+        with pytest.raises(envs.InputError, match="it gave object"):
+            wire.pack(object())
+
+
 def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(catalogue, "METHODS", dict(catalogue.METHODS))
     (tmp_path / "mine.py").write_text("def fit(given): pass")
@@ -226,6 +326,13 @@ def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "other.py").write_text(HEAD + "@uses('the_test_set')\ndef fit(given): pass")
     with pytest.raises(envs.InputError, match="a method uses 'the_test_set'; it may use demonstrations, exploration"):
         catalogue.add(f"{tmp_path}/other.py:fit")
+    for name in ("demonstrations", "deconfounded_episode"):
+        (tmp_path / f"{name}.py").write_text(HEAD + "@uses()\ndef fit(given): pass")
+        with pytest.raises(envs.InputError, match=f"would be called {name}, which there is already"):
+            catalogue.add(f"{tmp_path}/{name}.py:fit")
+    (tmp_path / "plain.py").write_text("def fit(given): pass\nfit.uses = ('environment',)")
+    with pytest.raises(envs.InputError, match="a method uses 'environment'"):
+        catalogue.add(f"{tmp_path}/plain.py:fit")
     (tmp_path / "naive_rnn.py").write_text(HEAD + "@uses()\ndef fit(given): pass")
     with pytest.raises(envs.InputError, match="would be called naive_rnn, which there is already"):
         catalogue.add(f"{tmp_path}/naive_rnn.py:fit")
@@ -303,7 +410,7 @@ def hunt(start, limit=300_000):
 HIDDEN = {"BatchEnv", "Context", "Physics", "NetworkExpert", "Simulator"}
 
 
-def test_a_hunter_finds_no_theta(tmp_path: Path) -> None:
+def test_a_hunter_finds_no_theta(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A method that walks all that is reachable from what it is handed, and from the agent that acts in evaluation.
 
     It finds no theta of demonstrations, explorations or evaluation, no seed of these and no environment; the same walk
@@ -321,7 +428,7 @@ class Spy(Still):
 
 def write(hunted, name):
     found, kinds = hunted
-    np.savez(f"{tmp_path}/{{name}}.npz", found=np.unique(found), kinds=sorted(kinds))
+    np.savez(f"{tmp_path}/{{name}}.npz", found=np.unique(found), kinds=sorted(kinds), words=sys.argv)
 
 @uses("demonstrations", "exploration", "queries")
 def fit(given):
@@ -329,26 +436,29 @@ def fit(given):
     write(hunt([given, fit, sys._getframe(), *sys.modules.values()]), "fit")
     return Spy(given)
 """
+    seeds, thetas, reset = [], [], envs.BatchEnv.reset
+
+    def watched(self: envs.BatchEnv, seed: Any = None, *rest: Any, **more: Any) -> Any:
+        obs = reset(self, seed, *rest, **more)
+        if seed is not None:
+            seeds.append(np.ravel(seed))
+            thetas.append(self.theta.ravel().copy())
+        return obs
+
+    monkeypatch.setattr(envs.BatchEnv, "reset", watched)
+    monkeypatch.setattr("sys.argv", ["run", "--salt", "4242424242"])
     context, agent = guest(tmp_path, text, CONTROL, "demonstrations", "exploration", "queries")
     evaluate(context, agent, True)
     agent.close()
-    seeds = [stream(purpose, 0) for purpose in (DEMOS, EVALUATION)]
-    draws = context.rngs[0]
-    draws.integers(2**63)
-    explored = [stream(EXPLORATION, int(draws.integers(2**31))) for _ in range(2)]
-    hidden = [context.demonstrated_theta]
-    for seed in (*explored, stream(EVALUATION, 0)):
-        env = envs.BatchEnv(context.task, 4)
-        env.reset(seed)
-        hidden.append(env.theta)
-    thetas = np.concatenate(hidden).ravel()
+    assert len(seeds) == 4  # of demonstrations, exploration, queries and evaluation
+    hidden = np.concatenate([*thetas, *seeds, [4242424242, stream(EVALUATION, 0), stream(DEMOS, 0)]])
     for name in ("fit", "act40", "act80"):
         with np.load(tmp_path / f"{name}.npz") as hunted:
             assert len(hunted["found"]) > (10_000 if name == "fit" else 100)
             assert {"Given", "Generator", "Trials" if name == "fit" else "frame"} <= set(hunted["kinds"])
             assert not HIDDEN & set(hunted["kinds"])
-            assert not np.isin(thetas, hunted["found"]).any()
-            assert not np.isin(np.add.outer([*seeds, *explored], range(4)), hunted["found"]).any()
+            assert not np.isin(hidden, hunted["found"]).any()
+            assert "--salt" not in hunted["words"]
     space: dict = {}
     exec("import numpy as np\n" + HUNTER, space)
     found, kinds = space["hunt"]([context, Allowed(context, ["theta"]), stream(EVALUATION, 0)])
@@ -502,6 +612,9 @@ class TestSentences:
         ("seeds=1.5", "--set seeds was '1.5'; it must be like 3"),
         ("seeds=-1", "--set seeds was '-1'"),
         ("naive.cooled=1", "must be like true"),
+        ("seeds=0", "must be like 3"),
+        ("cloning.learning_rate=NaN", "must be like"),
+        ("cloning.device=tpu", "amount 'cloning.device' is unknown"),
     ],
 )
 def test_bad_amounts_are_one_line(change: str, says: str) -> None:

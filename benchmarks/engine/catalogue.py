@@ -67,11 +67,15 @@ def add(reference: str) -> str:
     fit = outside.find("method", reference)
     if not callable(fit) or not isinstance(getattr(fit, "uses", None), tuple):
         raise envs.InputError(f"method {reference!r} must be a function declared with @uses(...) of what it may use")
+    from deconfounded.deconf.given import check_uses
+
+    check_uses(fit.uses)
     where, _, function = reference.rpartition(":")
     stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
     name = re.sub(r"\W", "_", stem if function == "fit" else f"{stem}_{function}")
     made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference))
-    if METHODS.setdefault(name, made) != made:
+    taken = {"all", "demonstrations", *(f"{known}_episode" for known in METHODS)}
+    if name in taken or METHODS.setdefault(name, made) != made:
         raise envs.InputError(f"method {reference!r} would be called {name}, which there is already; rename its file")
     return name
 

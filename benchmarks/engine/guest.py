@@ -6,10 +6,13 @@ environments in which the method's agent acts.
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import Context
+from deconfounded.benchmarks.engine.methods import GUEST, Context, stream
+from deconfounded.deconf.wire import unpack
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
-from deconfounded.experts.demos import Agent, Trials
+from deconfounded.experts.demos import Agent
 
 
 def die_with_parent() -> None:
@@ -42,6 +46,12 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     """The guest's process: fit, then be the agent until the channel is closed."""
     die_with_parent()
     from deconfounded.deconf.given import Given, serve
+    from deconfounded.deconf.wire import pack
+    from deconfounded.experts.saved import save
+
+    def say(*what: Any) -> None:
+        with contextlib.suppress(OSError):  # nobody listens any more
+            channel.send_bytes(pack(list(what)))
 
     try:
         given = Given(channel, about)
@@ -49,29 +59,23 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
         given.close()
         if not isinstance(agent, Agent):
             raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.demos.Agent")
-        channel.send(("fitted",))
+        say("fitted")
         while True:
             folder, described = serve(channel, agent)
-            from deconfounded.experts.saved import save
-
             try:
                 save(agent, folder, **described)
-                channel.send(("done", ""))
-            except envs.InputError as error:
-                channel.send(("done", str(error)))
-    except EOFError:
-        return
-    except envs.InputError as error:
-        channel.send(("failed", str(error)))
-    except Exception as error:
-        channel.send(("failed", outside.told(error)))
+                say("done", "", time.process_time())
+            except Exception as error:
+                say("done", outside.told(error), time.process_time())
+    except (Exception, SystemExit) as error:  # or the other end is gone, and nobody hears it
+        say("failed", outside.told(error))
 
 
 class Guest(Agent):
-    """The agent of one seed of a method from outside; it acts over there. Use it in a `with` statement."""
+    """The agent of one seed of a method from outside; it acts over there. `close` it in the end."""
 
     def __init__(self, context: Context, name: str, reference: str, uses: Sequence[str]) -> None:
-        self.context, self.name, self.uses = context, name, uses
+        self.context, self.name, self.uses, self.cpu = context, name, uses, 0.0
         here, there = (made := multiprocessing.get_context("spawn")).Pipe()
         task = context.task
         about = {
@@ -79,67 +83,97 @@ class Guest(Agent):
             "action_space": task.action_space,
             "episodes": task.episodes,
             "horizon": task.horizon,
-            "rng": int(context.rngs[0].integers(2**63)),
+            "rng": stream(GUEST, context.seeds[0]),
         }
         self.channel: Connection = here
         self.process = made.Process(target=live, args=(reference, there, about), daemon=True)
+        line, sys.argv = sys.argv, sys.argv[:1]  # which a new process gets, and evaluation's salt is in it
         self.process.start()
+        sys.argv = line
         there.close()
         self._rngs = context.rngs
-        self._fit()
-
-    def _hear(self) -> tuple[str, list[Any]]:
         try:
-            said, *rest = self.channel.recv()
+            self._fit()
+        except BaseException:
+            self.close()
+            raise
+
+    def _hear(self) -> list[Any]:
+        """What it says next: never unpickled, since that would run its code here."""
+        try:
+            said = unpack(self.channel.recv_bytes())
         except (EOFError, ConnectionError):
             raise envs.InputError(f"method {self.name}: its process was killed (out of memory?)") from None
-        if said == "failed":
-            raise envs.InputError(f"method {self.name}: {rest[0]}")
-        return said, rest
+        except envs.InputError as error:
+            raise envs.InputError(f"method {self.name}: {error}") from None
+        if not isinstance(said, list) or not said or not isinstance(said[0], str):
+            raise envs.InputError(f"method {self.name}: it said {said!r}, out of turn")
+        if said[0] == "failed":
+            raise envs.InputError(f"method {self.name}: {said[1]}")
+        return said
 
     def _fit(self) -> None:
         while True:
-            asked, rest = self._hear()
+            asked, *rest = self._hear()
             if asked == "fitted":
                 return
             if asked == "progress":
-                self.context.monitor.update(round(1000 * rest[0]), 1000, rest[1])
+                self._progress(*rest)
             elif asked not in self.uses:
                 told = f"it asked for {asked}, and declares that it uses {', '.join(self.uses) or 'nothing'}"
                 self.channel.send(("refused", told))
             else:
                 self.channel.send(("over", self._data(asked, *rest)))
 
-    def _data(self, kind: str, has_agent: bool, trials: int | None = None) -> Any:
+    def _progress(self, share: Any, losses: Any) -> None:
+        values = [share, *(losses.values() if isinstance(losses, dict) else [None])]
+        if not all(isinstance(value, int | float) and np.isfinite(value) for value in values):
+            raise envs.InputError(f"method {self.name}: progress was {share}, {losses}; it must be finite numbers")
+        self.context.monitor.update(round(1000 * min(max(share, 0), 1)), 1000, losses)
+
+    def _data(self, kind: str, has_agent: bool, trials: Any = None) -> Any:
         context, agent = self.context, self if has_agent else None
+        if trials is not None and not (isinstance(trials, int) and trials > 0):
+            raise envs.InputError(f"method {self.name} asked for {trials!r} trials; it must be a number from 1 up")
         if kind == "demonstrations":
             return context.demonstrations
         if kind == "theta":
             theta = context.task.encode_theta(context.demonstrated_theta)
-            context.monitor.spend("thetas", [len(theta)])
+            context.monitor.budget["thetas"] = [len(theta)]  # the same ones, however often
             return theta
-        if trials is not None and not (isinstance(trials, int | np.integer) and trials > 0):
-            raise envs.InputError(f"method {self.name} asked for {trials!r} trials; it must be a number from 1 up")
-        made: Trials | tuple[Trials, NDArray[np.float32]]
-        made = (context.explore if kind == "exploration" else context.query)(agent, self._rngs, trials)
-        return made
+        if kind == "exploration":
+            return context.explore(agent, self._rngs, trials)
+        if kind == "queries":
+            return context.query(agent, self._rngs, trials)
+        raise envs.InputError(f"method {self.name} asked for {kind!r}, which there is not")
 
     def _do(self, what: str, *given: Any) -> Any:
         self.channel.send((what, *given))
-        return self._hear()[1][0]
+        said = self._hear()
+        if said[0] != "done" or len(said) != 3 or not isinstance(said[2], float):
+            raise envs.InputError(f"method {self.name}: it said {said[0]!r}, out of turn")
+        self.cpu = said[2]
+        return said[1]
 
     def begin(self, n: int) -> None:
         self._do("begin", n)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         """A generator knows the seed it came from: what the guest gets is a number drawn from it."""
-        self._do("reset", [int(rng.integers(2**63)) for rng in rngs])
+        self._do("reset", fresh(rngs))
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        action = np.asarray(self._do("act", obs))
-        if action.ndim != 2 or len(action) != len(obs):
-            raise envs.InputError(f"method {self.name} gave actions of {action.shape} for {len(obs)} observations")
-        return action
+        """Clipped to [-1, 1] if continuous, as environments do. Raises InputError for what is not a row for each."""
+        given, space = self._do("act", obs), self.context.task.action_space
+        width = space.shape[0] if space.shape else 1
+        action = np.asarray(given, float) if isinstance(given, np.ndarray) else np.empty(0)
+        if action.shape != (len(obs), width) or not np.isfinite(action).all():
+            what = f"shape {action.shape}" if action.shape != (len(obs), width) else "NaN or infinity"
+            raise envs.InputError(
+                f"method {self.name} gave actions of {what} for {len(obs)} observations;"
+                f" they must be ({len(obs)}, {width}), finite"
+            )
+        return action.clip(-1, 1) if space.shape else self.context.task.check_action(action, len(obs))
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
@@ -147,15 +181,44 @@ class Guest(Agent):
         self._do("observe", obs, action, next_obs, alive)
 
     def features(self) -> NDArray[np.float32] | None:
-        return self._do("features")
+        known = self._do("features")
+        fits = isinstance(known, np.ndarray) and known.ndim == 2 and bool(np.isfinite(known).all())
+        if known is not None and not fits:
+            raise envs.InputError(f"method {self.name}: features must be None, or finite [N, F]")
+        return known
 
     def keep(self, folder: Path, about: dict[str, Any]) -> str:
         """Let the guest save its agent; returns why it could not."""
-        return self._do("over", (folder, about))
+        return str(self._do("over", (folder, about)))
 
     def close(self) -> None:
         """Let it go."""
         self.channel.close()
-        self.process.join(5)
+        self.process.join(2)
         self.process.terminate()
+        self.process.join(2)
+        self.process.kill()
         self.process.join()
+
+
+def fresh(rngs: Sequence[np.random.Generator]) -> list[int]:
+    """A number from each generator, to make another one of that does not know where it came from."""
+    return [int(rng.integers(2**63)) for rng in rngs]
+
+
+class Stranger(Agent):
+    """An agent of somebody else's class in this process: it gets the random numbers that it would get as a guest."""
+
+    def __init__(self, agent: Agent) -> None:
+        self.agent = agent
+        self.begin, self.act, self.observe = agent.begin, agent.act, agent.observe  # type: ignore[method-assign]
+
+    def begin(self, n: int) -> None:
+        """The agent's own."""
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self.agent.reset([np.random.default_rng(seed) for seed in fresh(rngs)])
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        """The agent's own."""
+        raise NotImplementedError

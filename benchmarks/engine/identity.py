@@ -35,6 +35,7 @@ FRAMEWORK = tuple(
         *("benchmarks/engine/methods", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
     )
 )
+GUESTS = tuple(ROOT / f"{name}.py" for name in ("benchmarks/engine/guest", "deconf/given", "deconf/wire"))
 ASIDE = {ROOT / f"{name}.py" for name in ("envs/render", "envs/files", "envs/outside", "experts/saved")}  # no number's
 AMOUNTS = {  # of a preset, by what a method uses
     "demonstrations": ("expert_trials", "fresh"),
@@ -54,11 +55,22 @@ def identity(job: Job) -> dict[str, Any]:
         "task_version": task.version,
         "method": job.method,
         "settings": {name: settings[name] for name in ("eval_trials", *amounts, *([method.part] * bool(method.part)))},
-        "expert": policy.fingerprint(task, job.expert),
+        "expert": expert(task, job.expert),
         "salt": job.salt,
         "versions": versions(),
         "code": code(task, method.module, method.reference),
     }
+
+
+def expert(task: envs.Task, source: str | None) -> str:
+    """SHA-256 of the expert's weights, or of a callable's name and the files it is made of; or `closed form`."""
+    if source is None or not outside.is_outside(source) or source.endswith(".safetensors"):
+        return policy.fingerprint(task, source)
+    file = outside.file(source)
+    digest = hashlib.sha256(source.rpartition(":")[2].encode())
+    for one in sorted(closure([file]) if file else ()):
+        digest.update(one.read_bytes())
+    return digest.hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -96,7 +108,7 @@ def code(task: envs.Task, module: str, reference: str = "") -> str:
     if reference and (file := outside.file(reference)):
         own.append(file)
     bases = [file for cls in type(task).__mro__ if (file := outside.source(cls)) and _counts(file)]
-    files = {*FRAMEWORK, *closure([*own, *bases])}
+    files = {*FRAMEWORK, *closure([*own, *bases]), *(GUESTS if reference else ())}
     digest = hashlib.sha256()
     for file in sorted(files, key=lambda file: (file.name, str(file))):
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
@@ -124,10 +136,16 @@ def closure(files: Iterable[Path]) -> set[Path]:
 
 @cache
 def _imports(file: Path) -> tuple[Path, ...]:
+    """The files of this package that a file imports; of one from outside, those beside it too."""
     found = []
     for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("deconfounded"):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
             names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-            paths = [ROOT / Path(*str(name).split(".")[1:]).with_suffix(".py") for name in names]
-            found += [path for path in paths if path.is_file() and path not in ASIDE]
+        for name in names:
+            top, *rest = name.split(".")
+            ours = top == "deconfounded"
+            path = (ROOT if ours else file.parent / top).joinpath(*rest).with_suffix(".py")
+            if path.is_file() and path not in ASIDE and (ours or not file.is_relative_to(ROOT)):
+                found.append(path)
     return tuple(found)

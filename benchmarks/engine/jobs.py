@@ -16,6 +16,7 @@ from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.methods import EVALUATION, MAKERS, Allowed, Context, stream
 from deconfounded.benchmarks.engine.pool import Job, JobMonitor
 from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.envs import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved
 from deconfounded.experts.demos import Agent, run_trials
@@ -90,17 +91,18 @@ class BenchmarkJob(Job):
                 agents = {self.method: guests.enter_context(contextlib.closing(guest))}
             trained = monitor.worked()
             found = {name: evaluate(context, agent, self.about.learned, self.salt) for name, agent in agents.items()}
+            monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
+            meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
+            for i, seed in enumerate(self.seeds):
+                rows = context.rows(i)
+                arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
+                for name, (per_trial, probes, clip) in found.items():
+                    arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
+                    arrays[f"{name}/probe"] = probes[i]
+                    if seed == 0 and name in CLIPPED:
+                        arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+                self.save(seed, arrays, monitor, meta)
             notes = [self._keep(name, agent) for name, agent in agents.items()]
-        meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
-        for i, seed in enumerate(self.seeds):
-            rows = context.rows(i)
-            arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
-            for name, (per_trial, probes, clip) in found.items():
-                arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
-                arrays[f"{name}/probe"] = probes[i]
-                if seed == 0 and name in CLIPPED:
-                    arrays.update({f"{name}/{key}": value for key, value in clip.items()})
-            self.save(seed, arrays, monitor, meta)
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
 
     def _keep(self, name: str, agent: Agent) -> str:
@@ -109,10 +111,13 @@ class BenchmarkJob(Job):
         for i, seed in enumerate(self.seeds):
             folder = self.folder.parent / "agents" / f"{name}-{seed}"
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
-            if isinstance(agent, Guest):
-                told = agent.keep(folder, about)
-            elif isinstance(agent, LearnedAgent):
-                saved.save(agent.of_seed(i), folder, **about)
+            try:
+                if isinstance(agent, Guest):
+                    told = agent.keep(folder, about)
+                elif isinstance(agent, LearnedAgent):
+                    saved.save(agent.of_seed(i), folder, **about)
+            except Exception as error:  # the results stand, whatever becomes of the agent
+                told = f"its agent is not kept: {outside.told(error)}"
         return told
 
 

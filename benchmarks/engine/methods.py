@@ -28,7 +28,7 @@ from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials
 
-DEMOS, EXPLORATION, EVALUATION = 1, 2, 3  # each purpose has seeds of its own
+DEMOS, EXPLORATION, EVALUATION, GUEST = 1, 2, 3, 4  # each purpose has seeds of its own
 
 
 def stream(purpose: int, seed: int, salt: str = "") -> int:

@@ -161,7 +161,7 @@ class JobMonitor(Monitor):
         self.file = job.folder / f".{job.method}-{'-'.join(map(str, job.seeds))}.pt"
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []
-        self.cpu_start, self.cpu_before = sum(os.times()[:4]), 0.0
+        self.cpu_start, self.cpu_before, self.elsewhere = time.process_time(), 0.0, 0.0
         self.kept: Training = {}
 
     def spans(self) -> list[tuple[float, float]]:
@@ -169,8 +169,8 @@ class JobMonitor(Monitor):
         return [*self.before, (self.start, time.time())]
 
     def cpu(self) -> float:
-        """CPU seconds of this process, and of those it started that have ended, for all seeds, so far."""
-        return self.cpu_before + sum(os.times()[:4]) - self.cpu_start
+        """CPU seconds of this process, and of a guest's, for all seeds, so far."""
+        return self.cpu_before + time.process_time() - self.cpu_start + self.elsewhere
 
     def worked(self) -> float:
         """Seconds of work so far."""
@@ -324,14 +324,19 @@ def run_jobs(jobs: list[Job], label: str) -> None:
         else:
             os.environ["OMP_NUM_THREADS"] = threads
         try:
-            waiting = set(futures)
+            waiting, failed = set(futures), list[envs.InputError]()
             while waiting:
                 while not ticks.empty():
                     progress.update(ticks.get())
                 for future in [f for f in waiting if f.done()]:
                     waiting.remove(future)
                     job = futures[future]
-                    progress.line(f"{job.method}, {listed(job.seeds)}: {future.result()}")
+                    try:
+                        told = future.result()
+                    except envs.InputError as error:  # a guest's, say: the others go on
+                        failed.append(error)
+                        told = f"failed: {error}"
+                    progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
                 time.sleep(0.1)
         except BrokenProcessPool:
             raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
@@ -341,6 +346,8 @@ def run_jobs(jobs: list[Job], label: str) -> None:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     progress.close()
+    if failed:
+        raise failed[0]
 
 
 def listed(seeds: tuple[int, ...]) -> str:

@@ -156,7 +156,7 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
             raise envs.closest("--set part", part, list(CONFIGS))
         of = getattr(settings, part) if part else settings
         known = {name: now for name, now in asdict(of).items() if name not in CONFIGS}
-        if field not in known:
+        if field not in known or field == "device":
             raise envs.closest("--set amount", key, [f"{part}.{name}" if part else name for name in known])
         kind = get_type_hints(type(of))[field]
         new = {field: _parsed(key, value, get_args(kind) or (kind,), known[field])}
@@ -171,6 +171,8 @@ def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
     except ValueError:
         value = text
     right = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
-    if not right or (isinstance(value, int | float) and value < 0):
+    least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not right or (number and not least <= value < float("inf")):
         raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
     return value

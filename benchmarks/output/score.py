@@ -35,7 +35,8 @@ def bootstrap(values: Array) -> list[float] | None:
 
 def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
     """What a seed used, by kind of data: the mean over seeds."""
-    return {kind: round(float(np.mean([budget[kind] for budget in budgets]))) for kind in budgets[0]}
+    kinds = dict.fromkeys(kind for budget in budgets for kind in budget)
+    return {kind: round(float(np.mean([budget.get(kind, 0) for budget in budgets]))) for kind in kinds}
 
 
 def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict[str, Any]:
