@@ -198,8 +198,8 @@ def test_an_expert_is_its_function_and_its_files(tmp_path: Path) -> None:
 
 def test_experts_get_copies_seed_by_seed(tmp_path: Path) -> None:
     """What they do to what they are given is their own business; rows come out as they would group by group."""
-    code = "seen = []\ndef control(obs, theta):\n    seen.append(len(obs))\n    theta *= 0\n    obs *= 0\n    return obs[:, :1]\n"
-    (tmp_path / "mine.py").write_text(code)
+    code = "seen = []\ndef control(obs, theta):\n    seen.append(len(obs))\n"
+    (tmp_path / "mine.py").write_text(f"{code}    theta *= 0\n    obs *= 0\n    return obs[:, :1]\n")
     expert = policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
     assert isinstance(expert, policy.OwnExpert)
     obs, theta = np.ones((6, 6)), np.ones((6, 1))
