@@ -15,6 +15,7 @@ COMMANDS = {
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
+    "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
     "report": ("benchmarks.report", "make a run's report again, without training"),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
     "publish": ("benchmarks.publish", "keep a finished run in docs/"),

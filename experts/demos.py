@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -58,6 +59,21 @@ class Trials:
 
     def __len__(self) -> int:
         return len(self.mask)
+
+    @property
+    def sha256(self) -> str:
+        """Of shapes and contents: of what is in them, and not of how a file holds it."""
+        digest = hashlib.sha256(f"{self.obs.shape} {self.action.shape} {self.actions}".encode())
+        for array in (self.obs, self.action, self.mask):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    @staticmethod
+    def from_minari(source: Path | str) -> Trials:
+        """The trials of a Minari data set's folder, without their thetas; see `experts.dataset.read`."""
+        from deconfounded.experts import dataset
+
+        return dataset.read(source)[0]
 
     def save(self, file: Path) -> None:
         """Write an .npz file, atomically."""

@@ -1,0 +1,50 @@
+"""Write demonstrations or explorations as a Minari data set: `deconf data --task slippery_cartpole --out data`
+
+The expert's trials are those that seed 0 of a run imitates; --explore writes trials of uniformly random actions. The
+sha256 is of the contents: made again anywhere with the same versions, it is the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, stream
+from deconfounded.envs.files import check_folder
+from deconfounded.experts import dataset, policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--task", required=True, help="its name, or path/file.py:Class")
+    parser.add_argument("--trials", type=int, default=256)
+    parser.add_argument("--explore", action="store_true", help="uniformly random actions in place of the expert's")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
+    parser.add_argument("--out", type=Path, required=True, help="a folder of data sets")
+    args = parser.parse_args()
+    task = envs.get(args.task)
+    envs.check_task(task)
+    expert = policy.load(task, args.expert)
+    if not 1 <= args.trials <= 100_000 or args.seed < 0:
+        raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be from 1 and from 0 up")
+    check_folder(args.out)
+    behaviours: dict[str, Callable[[envs.BatchEnv], Agent]] = {
+        "random": lambda env: RandomAgent(task.action_space),
+        "expert": lambda env: ExpertAgent(env, expert),
+    }
+    env = envs.BatchEnv(task, 64)
+    low, high = (float(run_trials(env, make(env), 1, args.seed)[1].mean()) for make in behaviours.values())
+    kind = "random" if args.explore else "expert"
+    seed = stream(EXPLORATION if args.explore else DEMOS, args.seed)
+    collected = dataset.collect(task, args.trials, behaviours[kind], seed)
+    place = dataset.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
+    print(f"{task.name}: {args.trials} trials, sha256 {collected[0].sha256} -> {place}")
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,71 @@
+"""Data that travels: Trials to a Minari data set and back."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import data
+from deconfounded.benchmarks.engine.methods import Context
+from deconfounded.deconf import naive_rnn
+from deconfounded.experts import dataset
+from deconfounded.experts.demos import RandomAgent, Trials, run_trials
+from tests.tools import tiny_preset
+
+minari = pytest.importorskip("minari")
+
+
+@pytest.mark.parametrize("name", ["bandit", "slippery_cartpole", "icy_road"])
+def test_the_same_in_another_process(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Seed 0's demonstrations, as a run has them: bit for bit, and what naive_rnn makes of them too."""
+    context = Context(envs.get(name), tiny_preset(), [0])
+    shown = context.demonstrations
+    monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", str(tmp_path)])
+    data.main()
+    assert f"{name}: 4 trials, sha256 {shown.sha256} -> {tmp_path}" in capsys.readouterr().out
+    code = f"from deconfounded.experts.demos import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert done.stdout.strip() == shown.sha256, done.stderr
+    trials, theta = dataset.read(tmp_path)
+    np.testing.assert_array_equal(theta, context.demonstrated_theta)
+    one, other = (naive_rnn.fit(given, tiny_preset().naive, context.rngs) for given in (shown, trials))
+    for key, array in one.state()[1].items():
+        np.testing.assert_array_equal(array, other.state()[1][key])
+    with pytest.raises(envs.InputError, match="is there already"):
+        data.main()
+
+
+def test_what_it_says(tmp_path: Path) -> None:
+    """Returns, ends, reference scores and trials are Minari's own to read; theta is in the metadata alone."""
+    task = envs.get("slippery_cartpole")
+    collected = dataset.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
+    _, returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5)
+    place = dataset.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    found = minari.MinariDataset(place / "data")
+    episodes = list(found.iterate_episodes())
+    assert [round(float(one.rewards.sum()), 9) for one in episodes] == returns.ravel().round(9).tolist()
+    assert all(one.terminations[-1] or one.truncations[-1] for one in episodes)
+    assert "EpisodeData" in repr(episodes[0])
+    assert (found.storage.metadata["ref_min_score"], found.storage.metadata["ref_max_score"]) == (1.0, 2.0)
+    assert found.env_spec.id == task.gym_id
+    about = list(found.storage.get_episode_metadata(range(15)))
+    assert [(int(one["trial"]), int(one["episode"])) for one in about] == [(b, e) for b in range(3) for e in range(5)]
+    assert not {"theta", "seed"} & set(vars(Trials.from_minari(place)))
+
+
+def test_bad_input_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(envs.InputError, match="holds 0 Minari data sets"):
+        Trials.from_minari(tmp_path)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "metadata.json").write_text(json.dumps({"data_format": "hdf5"}))
+    with pytest.raises(envs.InputError, match="cannot be read") as caught:
+        Trials.from_minari(tmp_path)
+    assert "\n" not in str(caught.value)
