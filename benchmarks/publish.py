@@ -20,7 +20,6 @@ from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import pages, records
 from deconfounded.benchmarks.output.pages import DOCS
-from deconfounded.envs import outside
 
 
 def gif(video: Path, file: Path) -> None:
@@ -55,7 +54,7 @@ def keep(run: Path) -> None:
             try:
                 gif(run / "video.mp4", clip)
             except Exception as error:
-                raise envs.InputError(f"{run / 'video.mp4'} is no video ({outside.told(error)})") from None
+                raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
         for record in found:
             records.write(DOCS / "records", record)
         shutil.copy(run / "adaptation.png", DOCS / f"{task.name}.png")

@@ -229,7 +229,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def kept() -> list[str]:
         return sorted(str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file())
 
-    for says, record in (("is no video", shown[0]), ("is no record", {**shown[0], "returns": [float("nan")]})):
+    for says, record in (("is no video", shown[0]), ("is not json", {**shown[0], "returns": [float("nan")]})):
         file = run / "records" / records.place(shown[0])
         file.write_text(json.dumps(record))
         with pytest.raises(envs.InputError, match=says):

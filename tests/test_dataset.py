@@ -12,10 +12,10 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import data
-from deconfounded.benchmarks.engine.methods import Context
+from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, Context, stream
 from deconfounded.deconf import naive_rnn
-from deconfounded.experts import dataset
-from deconfounded.experts.demos import RandomAgent, Trials, run_trials
+from deconfounded.experts import dataset, policy
+from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
 minari = pytest.importorskip("minari")
@@ -69,3 +69,14 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(envs.InputError, match="cannot be read") as caught:
         Trials.from_minari(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_the_standard_sets_are_the_same() -> None:
+    """Of the bandit, which a second makes; on MuJoCo the last bits are the machine's kind's."""
+    kept = json.loads((Path(__file__).parents[1] / "docs" / "data.json").read_text())
+    assert set(kept) == {f"{name}-v{envs.get(name).version}" for name in envs.suite()}
+    for kind, purpose in (("expert", DEMOS), ("random", EXPLORATION)):
+        env = envs.BatchEnv(envs.get("bandit"), 256)
+        expert = ExpertAgent(env, policy.load(env.task))
+        agent = expert if kind == "expert" else RandomAgent(env.task.action_space)
+        assert run_trials(env, agent, 1, stream(purpose, 0))[0].sha256 == kept["bandit-v0"][kind]

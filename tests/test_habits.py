@@ -17,8 +17,8 @@ from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 from numpy.typing import NDArray
 
 from deconfounded import envs
+from deconfounded.envs.probe import actions, gl_works, streams
 from deconfounded.envs.streams import Array
-from tests.tools import actions, gl_works, streams
 
 TASKS = envs.names()
 CONTROL = "slippery_cartpole"
@@ -124,7 +124,9 @@ class TestTrials:
             vec.reset(options={"keep_theta": [True, False, False], "theta": lows})
         with pytest.raises(envs.InputError, match="before the first reset"):
             envs.make_vec(name, 3).reset(options={"keep_theta": [False, False, True]})
-        with pytest.raises(envs.InputError, match=r"^the number of episodes was 0; it must be at least 1$"):
+        with pytest.raises(
+            envs.InputError, match=r"^the number of episodes was 0; it must be a whole number from 1 up$"
+        ):
             envs.make_vec(name, 3, episodes=0)
 
 

@@ -227,6 +227,12 @@ def card(task: envs.Task) -> str:
     parts.append(
         f"Tier {TIERS[task.tier]}. Trials of {trial} of at most {task.horizon} steps{more}. {_certificate(task)}"
     )
+    if kept := (_kept(DOCS, "data") or {}).get(f"{task.name}-v{task.version}"):
+        sets = ", ".join(f"`{sha[:16]}` ({kind})" for kind, sha in kept.items())
+        parts.append(
+            f"Standard sets, 256 trials of seed 0, by the sha256 of their contents: {sets}, whole in"
+            f" [data.json](data.json). `deconf data --task {task.name} --out DIR`, and `--explore`."
+        )
     moves = ("what it moves in the model",) if physics else ()
     parts.append(markdown_table(("latent", "unit", "range", "distribution", *moves), latents))
     bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())

@@ -95,10 +95,14 @@ def place(record: Record) -> Path:
     )
 
 
+def _no_number(text: str) -> None:
+    raise ValueError(text)  # NaN and Infinity, which Python's reader takes though JSON does not have them
+
+
 def read(file: Path) -> Record:
     """A record from a file. Raises InputError if it is missing, damaged or none."""
     try:
-        return check(json.loads(file.read_text()), str(file))
+        return check(json.loads(file.read_text(), parse_constant=_no_number), str(file))
     except OSError as error:
         raise InputError(f"record {file} cannot be read: {error.strerror}") from None
     except ValueError:
