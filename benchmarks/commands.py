@@ -97,11 +97,12 @@ def run(
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
     expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
+    track = getattr(args, "track", None) is not None
     described = about(kind, task, args.preset, settings, args.set, expert, salt)
     with locked(folder):
         prepare(folder, described, args.resume)
         jobs = [
-            kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest)
+            kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track)
             for method in methods
             for guest in [METHODS[method] if METHODS[method].reference else None]
         ]

@@ -8,6 +8,7 @@ Seeds of a method run side by side in one program, in as many groups as there ar
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from pathlib import Path
 
 from deconfounded import envs
@@ -23,6 +24,7 @@ def main() -> None:
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
     parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
+    parser.add_argument("--track", choices=["tensorboard"], help="show losses as they come, in the run's folder")
     parser.add_argument("--salt", default="", help="draw other thetas in evaluation, that nobody can have seen")
     args = parser.parse_args()
     if args.list:
@@ -42,6 +44,8 @@ def main() -> None:
     wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
     envs.check_task(task)
     policy.load(task, args.expert)
+    if args.track and not find_spec("tensorboard"):
+        raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
     from deconfounded.benchmarks.output import report  # it takes seconds; bad input is told at once
 

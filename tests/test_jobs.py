@@ -131,3 +131,20 @@ def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest
     for junk in (b"", b"junk", b"PK\x03\x04 half a zip"):
         monitor.file.write_bytes(junk)
         assert monitor.load() is None
+
+
+def test_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it shows is the learning curve that the job keeps."""
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    (tmp_path / "jobs").mkdir()
+    job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path / "jobs", track=True)
+    job.run()
+    kept = job.load(0)
+    assert kept is not None
+    shown = EventAccumulator(str(tmp_path / "tensorboard" / "naive_rnn-0"))
+    shown.Reload()
+    curve = [[event.step, event.value] for event in shown.Scalars("loss/imitation")]
+    np.testing.assert_allclose(curve, kept["meta"]["curve"]["imitation"], rtol=1e-6)

@@ -68,13 +68,29 @@ class Recorder(Agent):
 
 
 class CurveMonitor(JobMonitor):
-    """Keeps the losses of training, at some 400 updates."""
+    """Keeps the losses of training, at some 400 updates, and shows them to TensorBoard if the job asks for it."""
+
+    def __init__(self, job: Job, share: float) -> None:
+        super().__init__(job, share)
+        self.writer: Any = None
+        if job.track:
+            from torch.utils.tensorboard import SummaryWriter
+
+            name = f"{job.method}-{'-'.join(map(str, job.seeds))}"
+            self.writer = SummaryWriter(str(job.folder.parent / "tensorboard" / name))
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         super().update(done, total, losses, agent)
         if done % max(total // 400, 1) == 0:
             for kind, loss in losses.items():
                 self.kept.setdefault(kind, []).append((done, loss))
+                if self.writer is not None:
+                    self.writer.add_scalar(f"loss/{kind}", loss, done)
+
+    def close(self) -> float:
+        if self.writer is not None:
+            self.writer.close()
+        return super().close()
 
 
 class BenchmarkJob(Job):

@@ -50,6 +50,7 @@ class Job(ABC):
     expert: str | None = None  # another than the task's own
     salt: str = ""  # of evaluation's seeds
     guest: Method | None = None  # a method from outside
+    track: bool = False  # whether losses go to TensorBoard as they come
 
     @property
     def about(self) -> Method:
