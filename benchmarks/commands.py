@@ -91,7 +91,7 @@ def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.pool import know_guests, prepare, run_all
     from deconfounded.benchmarks.engine.presets import changed, preset
 
     settings = changed(preset(args.preset, task, args.device), args.set)
@@ -101,6 +101,7 @@ def run(
     described = about(kind, task, args.preset, settings, args.set, expert, salt)
     with locked(folder):
         prepare(folder, described, args.resume)
+        know_guests(folder / "jobs")
         jobs = [
             kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track)
             for method in methods

@@ -54,6 +54,7 @@ def write(
     scores: mean returns of an episode by random actions and by the expert, which Minari normalises with. Raises
     InputError if it is there already.
     """
+    folder = folder.resolve()  # Minari joins a relative one to itself
     with _root(folder), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of authors and links that it would like to be told
         import minari

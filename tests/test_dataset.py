@@ -28,7 +28,8 @@ def test_the_same_in_another_process(
     """Seed 0's demonstrations, as a run has them: bit for bit, and what naive_rnn makes of them too."""
     context = Context(envs.get(name), tiny_preset(), [0])
     shown = context.demonstrations
-    monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", str(tmp_path)])
+    monkeypatch.chdir(tmp_path.parent)
+    monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", tmp_path.name])
     data.main()
     assert f"{name}: 4 trials, sha256 {shown.sha256} -> {tmp_path}" in capsys.readouterr().out
     code = f"from deconfounded.experts.demos import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"

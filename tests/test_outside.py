@@ -77,6 +77,8 @@ def test_run_play_score(folder: Path) -> None:
     again = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small, "--resume")
     assert again.returncode == 0, again.stderr
     assert "seed 0:" not in again.stdout
+    without = deconf(folder, "run", *mine, "--methods", "blind_bc", *small, "--resume")
+    assert "my_rnn" in without.stdout, without.stderr
 
     agent = ("--agent", str(run / "agents" / "blind_bc-0"))
     played = deconf(folder, "play", *agent, "--task", BENT, "--theta", "0.2", "--episodes", "2")

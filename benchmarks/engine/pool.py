@@ -25,6 +25,7 @@ import numpy as np
 import torch
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.guest import die_with_parent
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
@@ -81,6 +82,7 @@ class Job(ABC):
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
         known = {"identity": identity(self), "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
+        known["reference"] = self.about.reference
         whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
@@ -214,6 +216,16 @@ class JobMonitor(Monitor):
 
 Finished = list[tuple[str, int, dict[str, Any]]]
 """Method, seed, and what its job wrote."""
+
+
+def know_guests(folder: Path) -> None:
+    """Make the methods from outside known whose results are in a folder, so that they stay in its tables."""
+    for file in sorted(folder.glob("*-*.npz")):
+        if (found := read(file)) and (reference := found["meta"].get("reference")):
+            try:
+                catalogue.add(str(reference))
+            except envs.InputError as error:
+                print(f"{file.name} is left out: {error}")
 
 
 def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, int]:
