@@ -378,7 +378,7 @@ import collections, sys, types
 
 OURS = ("deconfounded", "outside_", "__mp_main__", "tests")
 
-def hunt(start, limit=300_000):
+def hunt(start, limit=100_000):
     # Every number within reach, nearest first: attributes, containers, closures, globals, frames, our modules.
     seen, found, kinds, queue = {}, [], set(), collections.deque(start)
     while queue and len(seen) < limit:
