@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.methods import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.score import normalise
@@ -222,7 +222,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--task", required=True)
     parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
-    parser.add_argument("--out", type=Path, help="output folder; default: results/certificates")
+    parser.add_argument("--out", type=place, help="output folder; default: results/certificates")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser
+from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
 from deconfounded.envs import outside
@@ -33,7 +33,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
-    made.add_argument("--out", type=Path, help="output folder; default: a folder under results/")
+    made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
     return made
 

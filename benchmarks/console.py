@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 from deconfounded.envs.task import InputError
@@ -20,6 +21,13 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message}; see --help")
+
+
+def place(text: str) -> Path:
+    """An argument that names a file or folder; nothing is no name."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it must be a name")
+    return Path(text)
 
 
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:

@@ -7,10 +7,9 @@ sha256 is of the contents: made again anywhere with the same versions, it is the
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, stream
 from deconfounded.envs.files import check_folder
 from deconfounded.experts import dataset, policy
@@ -25,7 +24,7 @@ def main() -> None:
     parser.add_argument("--explore", action="store_true", help="uniformly random actions in place of the expert's")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
-    parser.add_argument("--out", type=Path, required=True, help="a folder of data sets")
+    parser.add_argument("--out", type=place, required=True, help="a folder of data sets")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
@@ -42,8 +41,8 @@ def main() -> None:
     kind = "random" if args.explore else "expert"
     seed = stream(EXPLORATION if args.explore else DEMOS, args.seed)
     collected = dataset.collect(task, args.trials, behaviours[kind], seed)
-    place = dataset.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
-    print(f"{task.name}: {args.trials} trials, sha256 {collected[0].sha256} -> {place}")
+    written = dataset.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
+    print(f"{task.name}: {args.trials} trials, sha256 {collected[0].sha256} -> {written}")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.envs.files import check_folder, write_json
 
 STEPS = (200, 400, 800, 1600, 3200)
@@ -98,7 +98,7 @@ def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--task", default="slippery_cartpole", help="of the exact policies")
-    parser.add_argument("--out", type=Path, default=Path("results") / "speed", help="output folder")
+    parser.add_argument("--out", type=place, default=Path("results") / "speed", help="output folder")
     args = parser.parse_args()
     task = envs.get(args.task)
     check_folder(args.out)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.methods import EVALUATION, stream
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("--salt", default="", help="any text")
     parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from there")
     parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
-    parser.add_argument("--out", type=Path, help="a .json file to write")
+    parser.add_argument("--out", type=place, help="a .json file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
     agent, expert, where = ready(args.agent, task), policy.load(task, args.expert), elsewhere(task, args.range)

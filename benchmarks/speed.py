@@ -21,7 +21,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.files import check_folder, write_json
 from deconfounded.envs.physics import Physics, cores
@@ -153,7 +153,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--task", nargs="+", metavar="NAME", help="default: all that have physics")
     parser.add_argument("--n", type=int, nargs="+", default=SIZES, help="environments; default: 1 to 4096")
-    parser.add_argument("--out", type=Path, default=Path("results") / "speed", help="output folder")
+    parser.add_argument("--out", type=place, default=Path("results") / "speed", help="output folder")
     args = parser.parse_args()
     physics = [name for name in envs.suite() if isinstance(envs.get(name), envs.MujocoTask)]
     tasks = [envs.get(name) for name in args.task or physics]

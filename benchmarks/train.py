@@ -12,7 +12,7 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--task", required=True)
     parser.add_argument("--steps", type=int, default=STEPS, help=f"control steps of PPO; default: {STEPS:,}")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="weights file; default: <task>.safetensors in this folder")
+    parser.add_argument("--out", type=place, help="weights file; default: <task>.safetensors in this folder")
     args = parser.parse_args()
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
