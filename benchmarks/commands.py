@@ -105,7 +105,7 @@ def run(
         jobs = [
             kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track)
             for method in methods
-            for guest in [METHODS[method] if METHODS[method].reference else None]
+            for guest in [catalogue.guest(method)]
         ]
         finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}")
     return finished, {**described, "resumed": resumed}

@@ -82,7 +82,7 @@ def main() -> None:
         wanted = [*REFERENCES, *methods]
         jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
         finished, _ = run_all(jobs, args.device, label)
-        made = [one for *_, data in finished for one in records.of_job(data, args.preset, args.set, task.episodes)]
+        made = records.of_run(finished, args.preset, args.set, task.episodes)
         results = records.gather(made)["methods"]
         zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
         for method in methods:

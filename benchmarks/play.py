@@ -80,8 +80,9 @@ def main() -> None:
     if args.video is not None:
         import imageio.v2 as imageio
 
-        rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
-        imageio.mimsave(args.video, frames, fps=rate, macro_block_size=8)
+        from deconfounded.benchmarks.output.report import frame_rate
+
+        imageio.mimsave(args.video, frames, fps=frame_rate(task), macro_block_size=8)
         print(f"-> {args.video}")
 
 

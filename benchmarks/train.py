@@ -9,12 +9,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-from safetensors.numpy import save_file
+from safetensors.numpy import save as to_bytes
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, write_atomically, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
 
@@ -49,9 +49,7 @@ def main() -> None:
     progress = Progress(args.steps, "training")
     weights = train(task, args.steps, args.seed, progress.update)
     progress.close()
-    partial = file.with_suffix(".partial")
-    save_file(weights, partial)
-    os.replace(partial, file)
+    write_atomically(file, to_bytes(weights))
     env = envs.BatchEnv(task, 256)
     _, returns = run_trials(env, ExpertAgent(env, policy.load(task, file)), 1, seed=args.seed)
     _, random = run_trials(env, RandomAgent(task.action_space), 1, seed=args.seed)

@@ -43,18 +43,14 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     from deconfounded.benchmarks.engine.presets import changed, preset
 
     settings = changed(preset(record["preset"], task, device), record["set"])
-    guest = METHODS[method] if METHODS[method].reference else None
+    guest = catalogue.guest(method)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "jobs"
         folder.mkdir()
         job = BenchmarkJob(task.reference, settings, method, (record["seed"],), folder, expert, record["salt"], guest)
         finished, _ = run_all([job], device, f"{task.name}, {method}")
-        made = [
-            one
-            for *_, data in finished
-            for one in records.of_job(data, record["preset"], record["set"], task.episodes)
-            if one["method"] == record["method"]
-        ]
+        every = records.of_run(finished, record["preset"], record["set"], task.episodes)
+        made = [one for one in every if one["method"] == record["method"]]
     if not made:
         raise envs.InputError(f"{method} left no {record['method']} to compare with")
     return made[0]

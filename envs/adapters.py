@@ -83,7 +83,8 @@ class GymEnv(gym.Env[Any, Any]):
         alive, row = self.batch.alive, np.asarray(action)
         row = np.reshape(row, (1, 1)) if row.size == 1 else row[None]
         obs, reward, terminated, truncated = self.batch.step(row)
-        self._pictures.act(row, alive)
+        if self.render_mode is not None:
+            self._pictures.act(row, alive)
         if not alive[0] and not self._warned:
             gym.logger.warn(f"step of {self.task.name} was called after the end of an episode; it moves nothing: reset")
             self._warned = True

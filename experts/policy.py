@@ -131,6 +131,11 @@ def path(task: Task) -> Path:
     return folder / f"{task.name}.safetensors"
 
 
+def names_callable(source: str) -> bool:
+    """Whether an expert's source is path/file.py:name or package.module:name, and not a file of weights."""
+    return outside.is_outside(source) and not source.endswith(".safetensors")
+
+
 def load(task: Task, source: str | Path | None = None) -> Expert:
     """The task's expert: the closed form, the weights that come with the task, or others.
 
@@ -141,7 +146,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         if source is not None:
             raise InputError(f"expert was {source}; that of {task.name} is its closed form, `expert_probs`")
         return DiscreteExpert(task)
-    if isinstance(source, str) and outside.is_outside(source) and not source.endswith(".safetensors"):
+    if isinstance(source, str) and names_callable(source):
         expert = OwnExpert(task, outside.find("expert", source), source)
         if not callable(expert.call):
             raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")

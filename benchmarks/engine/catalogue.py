@@ -80,6 +80,11 @@ def add(reference: str) -> str:
     return name
 
 
+def guest(name: str) -> Method | None:
+    """The method's entry if it is from outside, for jobs: another process does not know it."""
+    return METHODS[name] if METHODS[name].reference else None
+
+
 DEFAULT = tuple(name for name, method in METHODS.items() if method.default)  # the paper's comparison
 EXACT = tuple(name for name, method in METHODS.items() if method.exact)
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score

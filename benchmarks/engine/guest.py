@@ -211,14 +211,17 @@ class Stranger(Agent):
 
     def __init__(self, agent: Agent) -> None:
         self.agent = agent
-        self.begin, self.act, self.observe = agent.begin, agent.act, agent.observe  # type: ignore[method-assign]
 
     def begin(self, n: int) -> None:
-        """The agent's own."""
+        self.agent.begin(n)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self.agent.reset([np.random.default_rng(seed) for seed in fresh(rngs)])
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        """The agent's own."""
-        raise NotImplementedError
+        return self.agent.act(obs)
+
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.agent.observe(obs, action, next_obs, alive)

@@ -64,7 +64,7 @@ def identity(job: Job) -> dict[str, Any]:
 
 def expert(task: envs.Task, source: str | None) -> str:
     """SHA-256 of the expert's weights, or of a callable's name and the files it is made of; or `closed form`."""
-    if source is None or not outside.is_outside(source) or source.endswith(".safetensors"):
+    if source is None or not policy.names_callable(source):
         return policy.fingerprint(task, source)
     file = outside.file(source)
     digest = hashlib.sha256(source.rpartition(":")[2].encode())

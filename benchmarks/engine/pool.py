@@ -233,12 +233,14 @@ def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, in
 
     every: a job for each method, with all seeds, in one folder.
     """
-    folder = every[0].folder
-    for job in every:
+    folder, left = every[0].folder, [list[int]() for _ in every]
+    for job, missing in zip(every, left, strict=True):
         for seed in job.seeds:
-            if (found := read(job.file(seed))) and (why := job.unfit(seed, found)):
+            found = read(job.file(seed))
+            if found is not None and (why := job.unfit(seed, found)):
                 print(f"{job.file(seed).name} is made again: {why}")
-    left = [[seed for seed in job.seeds if job.load(seed) is None] for job in every]
+            if found is None or why:
+                missing.append(seed)
     parts = [
         replace(job, seeds=part)
         for job, missing in zip(every, left, strict=True)
@@ -264,10 +266,7 @@ def written(like: Job, folder: Path) -> list[Job]:
     pairs = [(m[1], int(m[2])) for m in named if m and m[1] in METHODS and m[2] == str(int(m[2]))]
     order = list(METHODS)
     pairs.sort(key=lambda pair: (order.index(pair[0]), pair[1]))
-    return [
-        replace(like, method=method, seeds=(seed,), guest=METHODS[method] if METHODS[method].reference else None)
-        for method, seed in pairs
-    ]
+    return [replace(like, method=name, seeds=(seed,), guest=catalogue.guest(name)) for name, seed in pairs]
 
 
 def left_in(folder: Path) -> Finished:

@@ -64,6 +64,13 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     return found
 
 
+def of_run(
+    finished: Sequence[tuple[str, int, dict[str, Any]]], preset: str, changes: Sequence[str], episodes: int
+) -> list[Record]:
+    """The records of all that jobs wrote: method, seed, and the data of `of_job`."""
+    return [record for *_, data in finished for record in of_job(data, preset, changes, episodes)]
+
+
 def bits(returns: np.ndarray) -> str:
     """SHA-256 of the returns of every trial and episode [N, E]."""
     return hashlib.sha256(np.ascontiguousarray(returns, np.float64).tobytes()).hexdigest()

@@ -46,7 +46,7 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
 
     about: what the folder is for, as its settings.json says. Numbers come first: they stand, whatever pictures do.
     """
-    made = [one for *_, data in finished for one in records.of_job(data, about["preset"], about["set"], task.episodes)]
+    made = records.of_run(finished, about["preset"], about["set"], task.episodes)
     for record in made:
         records.write(folder / "records", record)
     results = {**records.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
@@ -78,7 +78,7 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
     try:
         video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except Exception as error:  # no GL, or no encoder: the run is good all the same
-        print(f"no video: {error if isinstance(error, envs.InputError) else outside.told(error)}")
+        print(f"no video: {outside.told(error)}")
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
@@ -125,6 +125,11 @@ def _labelled(frame: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     return np.asarray(image)
 
 
+def frame_rate(task: envs.Task) -> int:
+    """Of a video, a second: real time, but no more than 25; 5 where steps have no time of their own."""
+    return min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
+
+
 def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], file: Path) -> None:
     """Recorded states of several agents under one theta, side by side. Raises InputError where no GL works.
 
@@ -136,9 +141,8 @@ def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], fil
         frames = zip(clip["state"], clip["action"], strict=True)
         columns.append([_labelled(paint(state, action), name) for state, action in frames])
     columns = [column for column in columns if column]
-    rate = min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
     writer: Any
-    with imageio.get_writer(file, fps=rate, quality=6, macro_block_size=8) as writer:
+    with imageio.get_writer(file, fps=frame_rate(task), quality=6, macro_block_size=8) as writer:
         for t in range(max(len(frames) for frames in columns)):  # who failed early stands still
             writer.append_data(np.concatenate([frames[min(t, len(frames) - 1)] for frames in columns], 1))
 
