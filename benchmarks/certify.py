@@ -6,6 +6,11 @@ loudly actions and dynamics speak of theta, what the exact policies make of it, 
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import platform
 import time
 from collections.abc import Callable, Sequence

@@ -7,6 +7,11 @@ are drawn beside.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import json
 from dataclasses import fields, replace
 from pathlib import Path
@@ -77,11 +82,12 @@ def main() -> None:
     for share in SHARES:
         settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})
         own = folder / f"{share:g}"
-        prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]
         jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
-        finished, _ = run_all(jobs, args.device, label)
+        with commands.locked(own):
+            prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
+            finished, _ = run_all(jobs, args.device, label)
         made = records.of_run(finished, args.preset, args.set, task.episodes)
         results = records.gather(made)["methods"]
         zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)

@@ -7,6 +7,11 @@ and growth.png.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import time
 from collections.abc import Callable
 from functools import partial

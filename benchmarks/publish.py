@@ -7,6 +7,11 @@ looked at before anything is changed.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import shutil
 import tempfile
 from pathlib import Path

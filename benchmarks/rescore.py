@@ -6,6 +6,11 @@ you like: what the expert, random actions and the agent then make of it are meas
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

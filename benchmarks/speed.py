@@ -8,6 +8,11 @@ loop, on a cartpole each, as shares of raw mj_step on their own model. Writes sp
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import os
 import platform
 import time

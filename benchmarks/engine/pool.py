@@ -13,9 +13,10 @@ import time
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing.queues import Queue
 from pathlib import Path
@@ -317,6 +318,21 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             raise envs.InputError(f"{folder} holds a run with another {differ[0]}; give another --out, or remove it")
 
 
+@contextmanager
+def ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
+    """The pool; when the work is over, or ends early by an error or a signal, none of its processes is left."""
+    try:
+        yield pool
+    except BaseException as error:
+        for process in multiprocessing.active_children():
+            process.kill()
+        if isinstance(error, BrokenProcessPool):
+            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
 def run_jobs(jobs: list[Job], label: str) -> None:
     """Run jobs side by side, one core each, longest first."""
     if not jobs:
@@ -325,7 +341,7 @@ def run_jobs(jobs: list[Job], label: str) -> None:
     workers = min(cores(), len(jobs))
     progress = Progress(sum(job.ticks for job in jobs), label)
     ticks = context.Queue()
-    with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as pool:
+    with ended(ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,))) as pool:
         # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
         heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
         os.environ["OMP_NUM_THREADS"] = "1"
@@ -335,28 +351,20 @@ def run_jobs(jobs: list[Job], label: str) -> None:
             del os.environ["OMP_NUM_THREADS"]
         else:
             os.environ["OMP_NUM_THREADS"] = threads
-        try:
-            waiting, failed = set(futures), list[envs.InputError]()
-            while waiting:
-                while not ticks.empty():
-                    progress.update(ticks.get())
-                for future in [f for f in waiting if f.done()]:
-                    waiting.remove(future)
-                    job = futures[future]
-                    try:
-                        told = future.result()
-                    except envs.InputError as error:  # a guest's, say: the others go on
-                        failed.append(error)
-                        told = f"failed: {error}"
-                    progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
-                time.sleep(0.1)
-        except BrokenProcessPool:
-            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
-        except BaseException:
-            for process in multiprocessing.active_children():
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        waiting, failed = set(futures), list[envs.InputError]()
+        while waiting:
+            while not ticks.empty():
+                progress.update(ticks.get())
+            for future in [f for f in waiting if f.done()]:
+                waiting.remove(future)
+                job = futures[future]
+                try:
+                    told = future.result()
+                except envs.InputError as error:  # a guest's, say: the others go on
+                    failed.append(error)
+                    told = f"failed: {error}"
+                progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
+            time.sleep(0.1)
     progress.close()
     if failed:
         raise failed[0]
