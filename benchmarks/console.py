@@ -79,7 +79,7 @@ class Stoppable:
 
 
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
-    """Run a command. Bad input, or a full disk, ends it with one line and exit code 2, signal n with one and 128 + n."""
+    """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
     from deconfounded.envs.task import InputError
 
     signals = Stoppable()

@@ -10,13 +10,13 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.output import report
+from deconfounded.envs.files import read_sealed
 
 
 def main() -> None:
@@ -25,9 +25,9 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="output folder of a run")
     folder = parser.parse_args().run
     try:
-        about = json.loads((folder / "settings.json").read_text())
-        task, kind = envs.get(about["reference"]), about["kind"]
-    except (OSError, ValueError, KeyError, TypeError):
+        about = read_sealed(folder / "settings.json")
+        task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
+    except (OSError, KeyError):
         raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
     finished = pool.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:

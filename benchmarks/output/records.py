@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.output import score
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, unsealed, write_sealed
 from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]
@@ -109,18 +109,25 @@ def _no_number(text: str) -> None:
 def read(file: Path) -> Record:
     """A record from a file. Raises InputError if it is missing, damaged or none."""
     try:
-        return check(json.loads(file.read_text(), parse_constant=_no_number), str(file))
+        record = check(json.loads(file.read_bytes(), parse_constant=_no_number), str(file))
     except OSError as error:
         raise InputError(f"record {file} cannot be read: {error.strerror}") from None
-    except ValueError:
+    except InputError:
+        raise
+    except (ValueError, RecursionError):
         raise InputError(f"record {file} is not json") from None
+    try:  # a note is written by hand
+        note = {"note": record.pop("note")} if "note" in record else {}
+        return {**(unsealed(record) if "sha256" in record else record), **note}
+    except ValueError:
+        raise InputError(f"record {file} is damaged, or was changed by hand: its sha256 is of something else") from None
 
 
 def write(folder: Path, record: Record) -> None:
     """Keep a record in its place."""
     file = folder / place(record)
     check_folder(file.parent)
-    write_json(file, check(record, str(file)))
+    write_sealed(file, check(record, str(file)))
 
 
 def of_task(folder: Path, task: str, version: int, preset: str = "default") -> list[Record]:
