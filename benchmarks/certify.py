@@ -33,7 +33,7 @@ from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
@@ -218,7 +218,7 @@ def picture(result: dict[str, Any], file: Path) -> None:
     told = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
     right.set(yscale="symlog", ylabel="nats a step", title=told)
     figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 

@@ -94,6 +94,8 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
             told, code = f"error: {error}", 2
         elif isinstance(error, OSError):
             told, code = f"error: {error.filename or 'file'}: {error.strerror or error}", 2
+        elif isinstance(error, MemoryError):
+            told, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
         else:
             raise
     with contextlib.suppress(OSError):  # the terminal is gone

@@ -23,7 +23,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
-from deconfounded.envs.files import write_json
+from deconfounded.envs.files import save_figure, write_json
 from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
@@ -59,7 +59,7 @@ def picture(task: str, found: dict[str, Any], before: dict[str, Any], file: Path
     panels.flat[0].set_ylabel("score, last episode")
     panels.flat[0].legend(frameon=False, fontsize=8)
     figure.suptitle(task)
-    figure.savefig(file, dpi=100)
+    save_figure(figure, file, 100)
     plt.close(figure)
 
 

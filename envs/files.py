@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import tempfile
@@ -25,6 +26,13 @@ def check_folder(folder: Path) -> None:
         raise InputError(f"output folder {folder} cannot be written: {error.strerror}; give another one") from None
 
 
+def check_file(file: Path) -> None:
+    """Make an output file's folder. Raises InputError if the file is something else, or cannot be written."""
+    if (file.exists() or file.is_symlink()) and not file.is_file():
+        raise InputError(f"output file {file} is {'a folder' if file.is_dir() else 'no plain file'}; give another one")
+    check_folder(file.parent)
+
+
 def write_atomically(file: Path, data: str | bytes) -> None:
     """The file holds all of data, or what it held before."""
     partial = file.with_name(f".{file.name}.{os.getpid()}{PARTIAL}")
@@ -43,6 +51,13 @@ def sweep(folder: Path) -> None:
     """Remove what was being written in a folder when a process was killed; nobody else may be at work in it."""
     for partial in folder.glob(f".*{PARTIAL}"):
         partial.unlink(missing_ok=True)
+
+
+def save_figure(figure: Any, file: Path, dpi: int) -> None:
+    """A matplotlib figure as .png, atomically."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=dpi)
+    write_atomically(file, buffer.getvalue())
 
 
 def write_json(file: Path, data: Any) -> None:

@@ -42,6 +42,8 @@ class Trials:
                 raise InputError(f"{name} of Trials must be an array of numbers ({error})") from None
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        if not isinstance(self.actions, int | np.integer) or self.actions < 0:
+            raise InputError(f"actions of Trials was {self.actions!r}; it must be how many there are, or 0")
         b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
         if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
             raise InputError(

@@ -57,6 +57,8 @@ def load(folder: Path | str) -> Agent:
 
     The class that agent.json names is imported, so that loading an agent is running its code.
     """
+    if not isinstance(folder, str | Path):
+        raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
     folder = Path(folder)
     about = describe(folder)
     try:

@@ -235,6 +235,7 @@ class TestRecords:
             ({"task": "../../etc"}, "task "),
             ({"seed": -1}, "seed "),
             ({"returns": ["<script>"]}, r"returns\.0 "),
+            ({"machine": "<script>"}, "machine "),
             ({"spans": [[0, 1]]}, r"spans\.0\.0 "),
             ({"spans": [[1.8e9, 1.7e9]]}, "spans must end after they begin"),
             ({"tier": "0"}, "tier "),

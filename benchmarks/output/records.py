@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.output import score
 from deconfounded.envs.files import check_folder, unsealed, write_sealed
 from deconfounded.envs.task import InputError
@@ -145,6 +146,8 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         for key in COMMON:
             if record[key] != first[key]:
                 raise InputError(f"records with {key} {first[key]} and {record[key]} do not belong in one table")
+    if missing := [name for name in REFERENCES if name not in {record["method"] for record in records}]:
+        raise InputError(f"records of {first['task']} are without those of {missing[0]}, which scores need")
     by_method: dict[str, list[Record]] = {}
     for record in records:
         by_method.setdefault(record["method"], []).append(record)
