@@ -23,6 +23,7 @@ from deconfounded.benchmarks import certify, commands, cost, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.output import pages, records, score
+from deconfounded.envs import render
 from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.envs.task import Array
@@ -295,6 +296,15 @@ def test_no_gl_is_only_a_note(backend: str) -> None:
     code = f"from deconfounded import envs; e = {made}; e.reset(seed=0); e.render()"
     done = command("-c", code, MUJOCO_GL=backend)
     assert "InputError: no GL for pictures" in done.stderr
+
+
+@pytest.mark.parametrize(("given", "meant"), [("EGL", "egl"), ("egl ", "egl"), ("OSMesa", "osmesa"), (" ", "egl")])
+def test_gl_by_another_spelling(given: str, meant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What mujoco takes for a backend is one, and is loaded by its own name."""
+    monkeypatch.setenv("MUJOCO_GL", given)
+    probed = subprocess.CompletedProcess("", 0)
+    monkeypatch.setattr(render.subprocess, "run", lambda *_, env, **__: probed if env["MUJOCO_GL"] == meant else None)
+    assert render.backend.__wrapped__() == meant
 
 
 class TestScore:
