@@ -44,8 +44,8 @@ def main() -> None:
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
     if args.out is None and file.exists():
         raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
-    check_file(file)
     envs.check_task(task)
+    check_file(file)
     from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
 
     start = time.time()

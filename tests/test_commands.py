@@ -281,6 +281,7 @@ class TestFiles:
 
 def test_cost_locks_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["cost", "--task", "bandit", "--out", str(tmp_path)])
+    monkeypatch.setattr(pool, "run_all", None)
     with commands.locked(tmp_path / "0.25"), pytest.raises(envs.InputError, match="another command is at work"):
         cost.main()
 
