@@ -1,4 +1,4 @@
-"""Flip single bits in the files that commands read back: `python -m tests.faults.flips` (about two minutes)
+"""Flip single bits in the files that commands read back: `python -m tests.faults.flips` (10 CPU seconds)
 
 Of each kind of file, 300 copies with one bit flipped, drawn by --seed. *noticed*: the file is not believed (it is made
 again, or told of in one line); *harmless*: what is read is equal to what was written, every value of it. Anything else

@@ -1,4 +1,4 @@
-"""Odd inputs to every command and to the API: `python -m tests.faults.inputs` (about a minute)
+"""Odd inputs to every command and to the API: `python -m tests.faults.inputs` (8 CPU seconds)
 
 Each command with each of its options at odd values, one at a time, in this process; what would train, measure or write
 is replaced by a mark that it was reached. *told*: one line and exit code 2 (of a call: an InputError of one line).
