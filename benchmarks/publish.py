@@ -41,10 +41,8 @@ def keep(run: Path) -> None:
         raise envs.InputError(
             f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
         )
-    if results["task"] not in envs.suite():
-        raise envs.InputError(
-            f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.suite())}"
-        )
+    if results["task"] not in envs.SUITE:
+        raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
     task = envs.get(results["task"])
     if results["task_version"] != task.version:
         raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")

@@ -16,8 +16,8 @@ from deconfounded import envs
 from deconfounded.benchmarks import certify, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output import pages, records, score
-from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.task import Array
+from deconfounded.envs.tasks.cartpole import Cartpole
 from deconfounded.experts.policy import Expert
 
 ROOT = Path(__file__).parents[1]

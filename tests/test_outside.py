@@ -152,19 +152,19 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ("x = 1\ndef f(:", "Task", r"invalid syntax \(SyntaxError, mine.py:2\)"),
         ("open('gone.txt')", "Task", r"gone.txt' \(FileNotFoundError, mine.py:1\)"),
         ("raise SystemExit('bye')", "Task", r"bye \(SystemExit, mine.py:1\)"),
-        ("from deconfounded.envs.cartpole import Cartpole as Task", "Task", "name of Cartpole in .* was None"),
+        ("from deconfounded.envs.tasks.cartpole import Cartpole as Task", "Task", "name of Cartpole in .* was None"),
         (
             "from deconfounded.envs import Task as T\nclass Task(T):\n    name = 'mine'",
             "Task",
             "task mine of .* lacks appl",
         ),
         (
-            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'Odd name!'",
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Task(Bandit):\n    name = 'Odd name!'",
             "Task",
             "'Odd name!'; it",
         ),
         (
-            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
             "Task",
             "'tilted_cartpole' of .* is taken by .*; give it another name",
         ),

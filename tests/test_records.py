@@ -42,8 +42,8 @@ class TestIdentity:
             ("deconf/dagger.py", {"dagger"}),
             ("deconf/exact.py", {"conditional", "interventional"}),
             ("deconf/recurrent.py", {"naive_rnn", "dagger"}),
-            ("envs/icy_road.py", set()),
-            ("envs/slippery_cartpole.py", set(METHODS)),
+            ("envs/tasks/icy_road.py", set()),
+            ("envs/tasks/slippery_cartpole.py", set(METHODS)),
             ("envs/render.py", set()),
             ("benchmarks/output/pages.py", set()),
             ("benchmarks/engine/jobs.py", set(METHODS)),
@@ -67,7 +67,7 @@ class TestIdentity:
         """Its file, that of a class it stands on, and its MJCF."""
         monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
         (tmp_path / "base_body.py").write_text(
-            "from deconfounded.envs.bandit import Bandit\nclass Base(Bandit): pass\n"
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Base(Bandit): pass\n"
         )
         (tmp_path / "mine.py").write_text("from base_body import Base\nclass Mine(Base):\n    name = 'mine'\n")
         task = envs.get(f"{tmp_path}/mine.py:Mine")
