@@ -428,7 +428,7 @@ class TestMethods:
         encode, config = env.task.encode_theta, cloning.CloningConfig(updates=300)
         score = envs.BatchEnv(env.task, 500)
         rng = np.random.default_rng
-        oracle = cloning.fit(trials, config, rng(0), encode(env.theta), lambda: encode(score.theta))
+        oracle = cloning.fit(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
         blind = cloning.fit(trials, config, rng(0))
         assert run_trials(score, oracle, 1, 3)[1].mean() == pytest.approx(60, abs=2)
         assert run_trials(score, blind, 1, 3)[1].mean() == pytest.approx(20, abs=2)

@@ -114,7 +114,7 @@ class TestData:
         made, _ = run_trials(env, ExpertAgent(env, context.expert), task.episodes, [stream(DEMOS, s) for s in seeds])
         np.testing.assert_array_equal(context.demonstrations.obs, made.obs)
         np.testing.assert_array_equal(context.demonstrations.action, made.action)
-        np.testing.assert_array_equal(context.demonstrated_theta, env.theta)
+        np.testing.assert_array_equal(context.demonstrated_theta, np.stack([env.theta] * task.episodes, 1))
         assert not np.array_equal(made.action[:4], made.action[4:])
 
     def test_kept_demonstrations_are_the_same(self, tmp_path: Any) -> None:
@@ -182,7 +182,7 @@ class TestData:
         for _ in range(2):
             context.explore(None, [np.random.default_rng(seed) for seed in (0, 1)])
         evaluate(context, RandomAgent(task.action_space), False)
-        thetas = np.concatenate([*made[:1], *made[2:], context.demonstrated_theta])[:, 0]
+        thetas = np.concatenate([*made[:1], *made[2:], context.demonstrated_theta[:, 0]])[:, 0]
         np.testing.assert_array_equal(made[0], made[1])  # the same generators
         assert len(np.unique(thetas)) == len(thetas) == 3 * 8
         same = {stream(purpose, seed) for purpose in (DEMOS, EXPLORATION, EVALUATION) for seed in range(100)}

@@ -19,7 +19,7 @@ from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved
-from deconfounded.experts.demos import Agent, run_trials
+from deconfounded.experts.demos import Agent, run_trials, thetas
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
@@ -111,7 +111,7 @@ class BenchmarkJob(Job):
             meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
             for i, seed in enumerate(self.seeds):
                 rows = context.rows(i)
-                arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
+                arrays: dict[str, Any] = {}
                 for name, (per_trial, probes, clip) in found.items():
                     arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
                     arrays[f"{name}/probe"] = probes[i]
@@ -150,16 +150,18 @@ def spaces(task: envs.Task) -> dict[str, int]:
 def evaluate(
     context: Context, agent: Agent, learned: bool, salt: str = ""
 ) -> tuple[dict[str, Array], Array, dict[str, Array]]:
-    """Deploy in all seeds' trials: returns and Eq. (1) [N, E], probes [S, E or 0], and a clip of the first seed."""
+    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E], probes [S, E or 0], a seed's clip."""
     task, seeds = context.task, context.seeds
     # Learned agents go on for twice the episodes they were trained on.
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
     recorder = Recorder(agent, context.env)
-    trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed, salt) for seed in seeds])
+    streams = [stream(EVALUATION, seed, salt) for seed in seeds]
+    trials, returns = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    objective = measure.objective(context.expert, trials, context.env.theta)
-    features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)
+    theta = thetas(task, context.env.n, episodes, streams)
+    objective = measure.objective(context.expert, trials, theta)
+    encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = np.array([[measure.probe(known[rows], theta[rows]) for known in features] for rows in groups])
+    read = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
     clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
-    return {"returns": returns, "objective": objective}, probes, clip
+    return {"theta": theta, "returns": returns, "objective": objective}, np.array(read), clip

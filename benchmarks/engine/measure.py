@@ -11,10 +11,10 @@ from deconfounded.experts.policy import Expert
 
 
 def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
-    """Eq. (1) [B, E]: how likely the expert that sees theta [B, L] finds the imitator's own actions, by episode."""
+    """Eq. (1) [B, E]: how likely the expert that sees theta [B, E, L] finds the imitator's own actions, by episode."""
     b, e, t = trials.mask.shape
     obs, action = (x.reshape(b * e * t, -1) for x in (trials.obs[:, :, :-1], trials.action))
-    log_expert = expert.log_prob(obs, action, np.repeat(theta, e * t, 0)).reshape(b, e, t)
+    log_expert = expert.log_prob(obs, action, np.repeat(theta.reshape(b * e, -1), t, 0)).reshape(b, e, t)
     return imitation_objective(log_expert, trials.mask)
 
 

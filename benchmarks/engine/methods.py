@@ -26,7 +26,7 @@ from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials, thetas
 
 DEMOS, EXPLORATION, EVALUATION, GUEST = 1, 2, 3, 4  # each purpose has seeds of its own
 
@@ -109,11 +109,9 @@ class Context:
 
     @property
     def demonstrated_theta(self) -> Array:
-        """theta [B, L] of the demonstrations, drawn once more from their seeds: for the oracle alone."""
-        n = self.preset.expert_trials
-        env = envs.BatchEnv(self.task, n * len(self.seeds))
-        env.reset([stream(DEMOS, seed) + i for seed in self.seeds for i in range(n)])
-        return env.theta
+        """theta [B, E, L] of the demonstrations' episodes, drawn once more from their seeds: for the oracle alone."""
+        n = self.preset.expert_trials * len(self.seeds)
+        return thetas(self.task, n, self.task.episodes, [stream(DEMOS, seed) for seed in self.seeds])
 
     def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
         """Fresh expert trials."""
@@ -129,14 +127,12 @@ class Context:
         """For initial weights and batches; the same for every method of a seed."""
         return [np.random.default_rng([seed, 0]) for seed in self.seeds]
 
-    def _roll_out(
-        self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]
-    ) -> tuple[Trials, envs.BatchEnv]:
+    def _roll_out(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, list[int]]:
         env = envs.BatchEnv(self.task, n * len(rngs))
         self.monitor.spend("exploration_trials", [n] * len(rngs))
         seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
         behaviour = agent or RandomAgent(self.task.action_space)
-        return run_trials(env, behaviour, self.task.episodes, seeds)[0], env
+        return run_trials(env, behaviour, self.task.episodes, seeds)[0], seeds
 
     def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None) -> Trials:
         """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
@@ -146,12 +142,13 @@ class Context:
         self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None
     ) -> tuple[Trials, NDArray[np.float32]]:
         """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
-        trials, env = self._roll_out(n or self.preset.query_trials, agent, rngs)
+        trials, seeds = self._roll_out(n or self.preset.query_trials, agent, rngs)
         self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
-        theta, random = env.theta, Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
-        labels = [self.expert.act(obs[:, t], theta, random) for t in range(obs.shape[1])]
+        theta = thetas(self.task, len(trials), self.task.episodes, seeds)
+        random = Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
+        labels = [self.expert.act(obs[:, t], theta[:, t // shape[2]], random) for t in range(obs.shape[1])]
         return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
 
 

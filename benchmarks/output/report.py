@@ -72,7 +72,7 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
             curves[method].append(curve)
         for name in CLIPPED:
             if f"{name}/state" in data:
-                theta = data["theta"][int(data[f"{name}/trial"])]
+                theta = data[f"{name}/theta"][int(data[f"{name}/trial"]), task.episodes - 1]
                 clips[name] = {"state": data[f"{name}/state"], "action": data[f"{name}/action"], "theta": theta}
     learning(curves, task.name, folder / "learning.png")
     try:
