@@ -1,12 +1,19 @@
-"""Latents that walk from episode to episode: their distribution, their transition matrix, and the exact filter."""
+"""Latents that walk from episode to episode: their distribution, the exact filter, and how learned beliefs forget."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
 from deconfounded import envs
+from deconfounded.deconf import models
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.drift import choose_kept
 from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.models import LatentModel
+from deconfounded.deconf.nets import Scaler
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 from deconfounded.experts import policy
@@ -70,3 +77,58 @@ def test_the_exact_filter_spreads_between_episodes() -> None:
         agent.reset([np.random.default_rng(0)])
         expected = np.eye(11) if static else Grid(env, expert, 11).env.task.transition(11)
         np.testing.assert_allclose(np.exp(agent.log_belief), expected[[0, 5, 10]], atol=1e-12)
+
+
+class Average(LatentModel):
+    """Knows theta ~ N(0, 1) from readings theta + N(0, 1): memory (their sum, their number), exact Gaussian beliefs."""
+
+    def __init__(self, draws: Draws) -> None:
+        super().__init__(draws)
+
+    def start(self, n: int) -> Tensor:
+        return torch.zeros(len(self.kept), n, 2)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return memory + torch.cat([step.next_obs, torch.ones_like(step.next_obs)], -1) * step.mask[..., None]
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        variance = 1 / (1 + memory[..., 1])
+        return torch.distributions.Normal(memory[..., 0] * variance, (1 + variance).sqrt()).log_prob(
+            step.next_obs[..., 0]
+        )
+
+    last = belief = sample = point = loss = None  # type: ignore[assignment]
+
+
+def test_how_much_to_keep_is_seen_without_theta() -> None:
+    """Of thetas that stay, nearly all is kept; of thetas drawn anew each episode, nothing; each seed decides for itself."""
+    generator, b, e, t = torch.Generator().manual_seed(0), 400, 6, 5
+    stays = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
+    anew = torch.randn(b, e, 1, generator=generator)
+    theta = torch.stack([stays, anew]).reshape(2, b * e, 1, 1).expand(2, b * e, t, 1)
+    readings = theta + torch.randn(theta.shape, generator=generator)
+    episodes = Batch(readings, readings, readings, torch.ones(2, b * e, t))
+    model = Average(Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+    choose_kept(model, episodes, e, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+    assert model.kept[0] >= 0.8  # .9 is a nat or so from 1
+    assert model.kept[1] == 0
+
+
+@pytest.mark.parametrize("kind", ["evidence", "discrete"])
+def test_forgetting(kind: str) -> None:
+    """What is kept whole stays as it was, to the bit; of what is not kept, nothing; and in between, in between."""
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    unit = Scaler(draws.normal(50, 2), torch.ones(1, 50))
+    model = models.new(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
+    step = Batch(draws.normal(4, 2), draws.normal(4, 1), draws.normal(4, 2), torch.ones(1, 4))
+    memory = model.update(model.start(4), step)
+    assert torch.equal(model.forget(memory), memory) or kind == "discrete"
+    torch.testing.assert_close(model.forget(memory), memory)
+    model.kept.fill_(0)
+    torch.testing.assert_close(model.forget(memory), model.start(4))
+    model.kept.fill_(0.5)
+    half = model.belief(model.forget(memory))
+    if kind == "discrete":
+        torch.testing.assert_close(half.sum(-1), torch.ones(1, 4))
+        torch.testing.assert_close(half, (whole := model.belief(memory).sqrt()) / whole.sum(-1, keepdim=True))
+    assert not torch.allclose(half, model.belief(memory))

@@ -141,7 +141,10 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
         amounts = _smoke(amounts)
     if name == "paper":
         amounts = _PAPER if amounts is _BANDIT else replace(amounts, seeds=10)
-    return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in CONFIGS})
+    told: dict[str, dict[str, Any]] = {part: {"device": device} for part in CONFIGS}
+    for part in ("deconfounded", "discrete", "offline"):
+        told[part] |= {"drifts": task.drifts}
+    return replace(amounts, **{part: replace(getattr(amounts, part), **values) for part, values in told.items()})
 
 
 def changed(settings: Preset, changes: Sequence[str]) -> Preset:
@@ -156,7 +159,7 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
             raise envs.closest("--set part", part, list(CONFIGS))
         of = getattr(settings, part) if part else settings
         known = {name: now for name, now in asdict(of).items() if name not in CONFIGS}
-        if field not in known or field == "device":
+        if field not in known or field in ("device", "drifts"):
             raise envs.closest("--set amount", key, [f"{part}.{name}" if part else name for name in known])
         kind = get_type_hints(type(of))[field]
         new = {field: _parsed(key, value, get_args(kind) or (kind,), known[field])}
