@@ -237,7 +237,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         records.write(run / "records", record)
     (run / "adaptation.png").write_bytes(b"a picture")
     (run.parent / "certificates" / "bandit.json").write_text("{}")
-    (docs / "bandit.gif").write_bytes(b"an old clip")
+    (docs / "bandit.webp").write_bytes(b"an old clip")
     (run / "video.mp4").write_bytes(b"junk")
     monkeypatch.setattr(publish, "DOCS", docs)
 
@@ -249,7 +249,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         file.write_text(json.dumps(record))
         with pytest.raises(envs.InputError, match=says):
             publish.keep(run)
-        assert kept() == ["bandit.gif"]
+        assert kept() == ["bandit.webp"]
     file.write_text(json.dumps(shown[0]))
     (run / "video.mp4").unlink()
     publish.keep(run)

@@ -101,7 +101,7 @@ class Average(LatentModel):
 
 
 def test_how_much_to_keep_is_seen_without_theta() -> None:
-    """Of thetas that stay, nearly all is kept; of thetas drawn anew each episode, nothing; each seed decides for itself."""
+    """Of thetas that stay, nearly all is kept; of thetas drawn anew, nothing; each seed decides for itself."""
     generator, b, e, t = torch.Generator().manual_seed(0), 400, 6, 5
     stays = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
     anew = torch.randn(b, e, 1, generator=generator)

@@ -27,19 +27,19 @@ CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in 
 class Recorder(Agent):
     """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
-    The clip is of episode number task.episodes of that trial of the first seed whose first latent is nearest the
-    quantile: the same trial for every method, as seeds are shared.
+    The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
+    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
+    an action, and each step after it; with what the agent knows then.
     """
 
-    def __init__(self, agent: Agent, env: envs.BatchEnv, quantile: float = 0.85) -> None:
-        self.agent, self.env, self.quantile = agent, env, quantile
+    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
+        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
 
     def begin(self, n: int) -> None:
         self.agent.begin(n)
         self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
         self.episode = 0
-        self.states: list[Array] = []
-        self.actions: list[Array] = []
+        self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
         """An episode is over."""
@@ -54,6 +54,16 @@ class Recorder(Agent):
             self.note()
         self.agent.reset(rngs)
         self.episode += 1
+        self._film(np.zeros(self.env.task.action_space.shape or (1,)))
+
+    def _film(self, action: Array) -> None:
+        if not self.filmed or self.episode > self.env.task.episodes:
+            return
+        row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
+        if (known := self.agent.features()) is not None:
+            row["known"] = known[self.trial].copy()
+        for kind, value in row.items():
+            self.clip.setdefault(kind, []).append(value)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         return self.agent.act(obs)
@@ -62,9 +72,8 @@ class Recorder(Agent):
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         self.agent.observe(obs, action, next_obs, alive)
-        if self.episode == self.env.task.episodes and alive[self.trial]:
-            self.states.append(self.env.state[self.trial].copy())
-            self.actions.append(action[self.trial])
+        if alive[self.trial]:
+            self._film(action[self.trial])
 
 
 class CurveMonitor(JobMonitor):
@@ -106,7 +115,10 @@ class BenchmarkJob(Job):
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {self.method: guests.enter_context(contextlib.closing(guest))}
             trained = monitor.worked()
-            found = {name: evaluate(context, agent, self.about.learned, self.salt) for name, agent in agents.items()}
+            found = {
+                name: evaluate(context, agent, self.about.learned, self.salt, name in CLIPPED and 0 in self.seeds)
+                for name, agent in agents.items()
+            }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
             meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
             for i, seed in enumerate(self.seeds):
@@ -115,7 +127,7 @@ class BenchmarkJob(Job):
                 for name, (per_trial, probes, clip) in found.items():
                     arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
                     arrays[f"{name}/probe"] = probes[i]
-                    if seed == 0 and name in CLIPPED:
+                    if seed == 0:
                         arrays.update({f"{name}/{key}": value for key, value in clip.items()})
                 self.save(seed, arrays, monitor, meta)
             notes = [self._keep(name, agent) for name, agent in agents.items()]
@@ -148,13 +160,13 @@ def spaces(task: envs.Task) -> dict[str, int]:
 
 
 def evaluate(
-    context: Context, agent: Agent, learned: bool, salt: str = ""
+    context: Context, agent: Agent, learned: bool, salt: str = "", filmed: bool = False
 ) -> tuple[dict[str, Array], Array, dict[str, Array]]:
-    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E], probes [S, E or 0], a seed's clip."""
+    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
     task, seeds = context.task, context.seeds
     # Learned agents go on for twice the episodes they were trained on.
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
-    recorder = Recorder(agent, context.env)
+    recorder = Recorder(agent, context.env, filmed)
     streams = [stream(EVALUATION, seed, salt) for seed in seeds]
     trials, returns = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
@@ -162,6 +174,11 @@ def evaluate(
     objective = measure.objective(context.expert, trials, theta)
     encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    read = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
-    clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
-    return {"theta": theta, "returns": returns, "objective": objective}, np.array(read), clip
+    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    clip = {key: np.array(value) for key, value in recorder.clip.items()}
+    if filmed:
+        clip["trial"] = np.array(recorder.trial)
+    if "known" in clip:  # theta, as it can be read off at the end of the last episode
+        clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
+    r2 = np.array([[score for score, _ in each] for each in probes])
+    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip

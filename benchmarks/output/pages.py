@@ -93,8 +93,8 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         if folder.name != f"{task.name}-v{task.version}"
     ):
         parts.append(f"Superseded, and not to be compared: the records of {', '.join(old)}.")
-    if (DOCS / f"{task.name}.gif").exists():
-        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.gif)")
+    if (DOCS / f"{task.name}.webp").exists():
+        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
     return "\n\n".join(parts)
 
 
