@@ -1,8 +1,8 @@
 """Keep a finished run in docs/: `python benchmarks/publish.py results/slippery_cartpole-default`
 
 Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
-certificate; makes a small animated picture of the video; and brings the pages up to date that show them (`pages.py`). All of it is
-looked at before anything is changed.
+certificate; makes a small animated picture of the video; and brings the pages up to date that show them (`pages.py`).
+All of it is looked at before anything is changed.
 """
 
 from __future__ import annotations
