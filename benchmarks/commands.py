@@ -17,8 +17,8 @@ from deconfounded.envs import outside
 from deconfounded.envs.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
-    from deconfounded.benchmarks.engine.methods import Preset
     from deconfounded.benchmarks.engine.pool import Finished, Job
+    from deconfounded.benchmarks.engine.presets import Preset
 
 KEPT = "what was finished is kept, and --resume goes on"
 

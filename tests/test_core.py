@@ -15,7 +15,8 @@ from torch import Tensor
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import measure
-from deconfounded.benchmarks.engine.methods import MAKERS, Context
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import cloning, deconfounded, naive_rnn, offline
 from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.data import Batch, Draws, Signature

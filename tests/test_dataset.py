@@ -12,7 +12,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import data
-from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, Context, stream
+from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
 from deconfounded.deconf import naive_rnn
 from deconfounded.experts import dataset, policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials

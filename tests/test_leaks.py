@@ -12,8 +12,9 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import evaluate
-from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import dagger, deconfounded, models, naive_rnn, offline
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.cloning import CloningConfig

@@ -19,9 +19,10 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
 from deconfounded.benchmarks.engine import catalogue, identity, pool, presets
+from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
-from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import naive_rnn, wire
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.experts import policy, saved

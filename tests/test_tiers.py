@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import MAKERS, Context
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning

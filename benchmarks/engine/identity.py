@@ -32,7 +32,7 @@ FRAMEWORK = tuple(
     ROOT / f"{name}.py"
     for name in (
         *("envs/task", "envs/batch", "envs/streams", "experts/demos", "experts/policy"),
-        *("benchmarks/engine/methods", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
+        *("benchmarks/engine/context", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
     )
 )
 GUESTS = tuple(ROOT / f"{name}.py" for name in ("benchmarks/engine/guest", "deconf/given", "deconf/wire"))

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
-from deconfounded.benchmarks.engine.methods import EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.pool import Job, JobMonitor
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs import outside

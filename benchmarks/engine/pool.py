@@ -27,9 +27,10 @@ import torch
 from deconfounded import envs
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.guest import die_with_parent
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
-from deconfounded.benchmarks.engine.methods import Context, Preset
+from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.deconf.agents import Monitor, Training
 from deconfounded.envs.files import check_folder, write_atomically, write_json

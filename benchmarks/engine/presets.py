@@ -4,18 +4,37 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args, get_type_hints
 
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Amounts of data and training. Trials are of task.episodes episodes each."""
+
+    seeds: int
+    expert_trials: int
+    explore_trials: int  # a round
+    eval_trials: int
+    query_trials: int  # a round
+    fresh: int  # expert trials drawn anew for each update of naive_rnn, and round of what does not accumulate; or 0
+    grid: int
+    deconfounded: DeconfoundedConfig
+    discrete: DeconfoundedConfig
+    offline: OfflineConfig
+    naive: RecurrentConfig
+    dagger: DaggerConfig
+    cloning: CloningConfig
+
 
 CONFIGS = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")  # of a preset's fields
 
