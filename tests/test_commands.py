@@ -31,6 +31,16 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command that must end with code 2 says, in this process."""
+    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
+    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
+    with pytest.raises(SystemExit) as ended:
+        run_command(importlib.import_module(name).main)
+    assert ended.value.code == 2
+    return capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("args", "says"),
     [
@@ -70,12 +80,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
 def test_bad_input_is_one_line(
     args: tuple[str, ...], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
-    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
-    with pytest.raises(SystemExit) as ended:
-        run_command(importlib.import_module(name).main)
-    assert ended.value.code == 2
-    told = capsys.readouterr().err
+    told = refusal(args, monkeypatch, capsys)
     assert says in told
     assert len(told.strip().splitlines()) == 1
 
@@ -95,7 +100,7 @@ def test_bad_input_from_the_shell() -> None:
     assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
 
 
-def test_smoke_run_resumes(tmp_path: Path) -> None:
+def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
     out, args = tmp_path / "out", ("benchmarks/run.py", "--task", "bandit", "--preset", "smoke", "--out")
     first = command(*args, str(out), "--methods", "blind_bc", "conditional", "interventional", MUJOCO_GL="off")
@@ -113,12 +118,9 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert header == "method,seed,trial,best_arm,episode,return,score,objective"
     assert len(lines) == results["eval_trials"] * 5
 
-    again = command(*args, str(out))
-    assert again.returncode == 2
-    assert "--resume" in again.stderr
-    other = command(*args[:-2], "default", "--out", str(out), "--resume")
-    assert other.returncode == 2
-    assert "another preset" in other.stderr
+    assert "--resume" in refusal((*args, str(out)), monkeypatch, capsys)
+    other = (*args[:-2], "default", "--out", str(out), "--resume")
+    assert "another preset" in refusal(other, monkeypatch, capsys)
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
     (out / "jobs" / "random-0.npz").write_bytes(b"half a file")
@@ -131,7 +133,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert repeated["resumed"] == 3
 
     (out / "settings.json").unlink()
-    assert "not their settings.json" in command(*args, str(out), "--resume").stderr
+    assert "not their settings.json" in refusal((*args, str(out), "--resume"), monkeypatch, capsys)
 
 
 def test_time_worked_counts_overlaps_once() -> None:
