@@ -8,6 +8,7 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import socket
 import tempfile
 import threading
@@ -82,37 +83,46 @@ class Cluster(Engine):
             running[number] = attempt
             tasks[task.remote(*about, *(sent[file] for file in files))] = number
 
-        for job in jobs:
-            start(Attempt(job, 1))
-        while tasks:
-            ended, _ = ray.wait(list(tasks), num_returns=len(tasks), timeout=0.5)
-            for number, ticks, files in ray.get(self.mailbox.take.remote()):
-                if (attempt := running.get(number)) is not None:  # and is not a lost worker's late one
-                    tick(max(ticks - attempt.ticks, 0))
-                    attempt.ticks = max(ticks, attempt.ticks)
-                    keep(attempt.job, files)
-            for task in ended:
-                attempt = running.pop(tasks.pop(task))
-                job = attempt.job
-                try:
-                    told, files = ray.get(task)
-                except RayTaskError as error:
-                    if isinstance(error.cause, envs.InputError) and not isinstance(error.cause, Unlike):
-                        say(job, error.cause)
-                        continue
+        def ended(task: Any) -> None:
+            attempt = running.pop(tasks.pop(task))
+            job = attempt.job
+            try:
+                told, files = ray.get(task)
+            except RayTaskError as error:
+                if not isinstance(error.cause, envs.InputError) or isinstance(error.cause, Unlike):
                     raise envs.InputError(failure(error)) from None
-                except RayError as error:
-                    if attempt.tries == TRIES:
-                        lost = f"its worker was lost {TRIES} times ({type(error).__name__}; out of memory?)"
-                        say(job, envs.InputError(f"{job.method}: {lost}; --resume goes on"))
-                        continue
+                say(job, error.cause)
+            except RayError as error:
+                if attempt.tries == TRIES:
+                    lost = f"its worker was lost {TRIES} times ({type(error).__name__}; out of memory?)"
+                    say(job, envs.InputError(f"{job.method}: {lost}; --resume goes on"))
+                else:
                     say(job, "its worker was lost; it is tried again")
                     start(Attempt(job, attempt.tries + 1, attempt.ticks))
-                else:
-                    keep(job, files)
-                    job.checkpoint.unlink(missing_ok=True)
-                    tick(job.ticks - attempt.ticks)
-                    say(job, told)
+            else:
+                keep(job, files)
+                job.checkpoint.unlink(missing_ok=True)
+                tick(job.ticks - attempt.ticks)
+                say(job, told)
+
+        for job in jobs:
+            start(Attempt(job, 1))
+        try:
+            while tasks:
+                done, _ = ray.wait(list(tasks), num_returns=len(tasks), timeout=0.5)
+                for number, ticks, files in ray.get(self.mailbox.take.remote()):
+                    if (attempt := running.get(number)) is not None:  # and is not a lost worker's late one
+                        tick(max(ticks - attempt.ticks, 0))
+                        attempt.ticks = max(ticks, attempt.ticks)
+                        keep(attempt.job, files)
+                for task in done:
+                    ended(task)
+        except BaseException:
+            for task in tasks:  # asked, jobs clean up; in the end none has a choice
+                ray.cancel(task)
+            if tasks:
+                ray.wait(list(tasks), num_returns=len(tasks), timeout=2)
+            raise
 
 
 class Mailbox:
@@ -147,11 +157,14 @@ def connect(address: str) -> None:
             socket.create_connection((host.strip("[]"), int(port)), 5).close()
         except (OSError, OverflowError) as error:
             raise envs.InputError(f"--cluster {address}: nobody answers there ({error}); is Ray started?") from None
+    heard = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address, log_to_driver=False, logging_level="ERROR")
     except Exception as error:  # Ray tells in many ways
         remedy = "; `ray start --head` starts one" * (address == "auto")
         raise envs.InputError(f"--cluster {address}: {outside.told(error)}{remedy}") from None
+    finally:
+        signal.signal(signal.SIGTERM, heard)  # Ray has one of its own
 
 
 def given(job: Job) -> dict[str, Path]:
