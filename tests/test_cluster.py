@@ -25,7 +25,7 @@ from tests.tools import tiny_preset
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install deconfounded-imitation[cluster]")
 
-from deconfounded.benchmarks.engine import cluster  # noqa: E402
+from deconfounded.benchmarks.engine import cluster, worker  # noqa: E402
 
 GUEST = """
 from pathlib import Path
@@ -212,15 +212,15 @@ def test_what_a_job_needs_travels(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_another_version_over_there_is_told() -> None:
     job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), Path("jobs"))
     here = identity.identity(job)
-    cluster.check(here, dict(here))
+    worker.check(here, dict(here))
     versions = here["versions"]
     for change, says in (
         ({"code": "0"}, "has other code; install the same of all on every machine"),
         ({"versions": {**versions, "numpy": "1.0"}}, f"has numpy 1.0, not {versions['numpy']}; install"),
         ({"versions": {"python": versions["python"]}}, "has dm_control missing, not"),
     ):
-        with pytest.raises(cluster.Unlike, match=f"^machine .* {says}"):
-            cluster.check(here, {**here, **change})
+        with pytest.raises(worker.Unlike, match=f"^machine .* {says}"):
+            worker.check(here, {**here, **change})
 
 
 @pytest.mark.parametrize(
@@ -254,8 +254,8 @@ def test_what_killed_workers_left_is_removed(tmp_path: Path, monkeypatch: pytest
     names = [f"deconfounded-{process}-{'ab' * 8}" for process in (2**22 + 1, os.getpid())]
     for name in [*names, "deconfounded-data", f"deconfounded-{2**22 + 1}-mine"]:
         (tmp_path / name).mkdir()
-    monkeypatch.setattr(cluster, "PLACE", tmp_path / "place")
-    with cluster.scratch() as folder:
+    monkeypatch.setattr(worker, "PLACE", tmp_path / "place")
+    with worker.scratch() as folder:
         assert (folder / "jobs").is_dir()
         assert not (tmp_path / names[0]).exists()
     assert {one.name for one in tmp_path.iterdir()} == {names[1], "deconfounded-data", f"deconfounded-{2**22 + 1}-mine"}

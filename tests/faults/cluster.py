@@ -1,8 +1,9 @@
-"""kill -9 in runs on Ray, again and again: `python tests/kill_cluster.py --kills 10 --seed 0`
+"""kill -9 in runs on Ray, again and again: `python -m tests.faults.cluster --kills 10 --seed 0`
 
-Starts Ray on this machine, with two nodes. Runs of run.py on it are hit at random times: a worker, a node, or the command
-itself, which is then begun again with --resume. Each must end with the numbers of a run in local processes, bit for bit;
-what was finished at a kill must be the same file in the end; and nothing may be left running. Exit code 1 if not.
+Starts Ray on this machine, with two nodes. Runs of run.py on it are hit at random times: a worker, a node, the mailbox,
+or the command itself, which is then begun again with --resume. Each must end with the numbers of a run in local
+processes, bit for bit; what was finished at a kill must be the same file in the end; and nothing may be left running.
+Exit code 1 if not.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from typing import Any
 
 from ray.cluster_utils import Cluster
 
-ROOT = Path(__file__).parents[1]
-RUN = ("--task", "bandit", "--preset", "smoke", "--methods", "naive_rnn", "blind_bc", "conditional", "--seeds", "2")
+ROOT = Path(__file__).parents[2]
+RUN = ("--task", "bandit", "--preset", "smoke", "--methods", "naive_rnn", "blind_bc", "--seeds", "2")
 AMOUNTS = ("naive.updates=150", "expert_trials=200", "eval_trials=200", "cloning.updates=200")
 
 
@@ -76,10 +77,9 @@ def main() -> None:
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     with tempfile.TemporaryDirectory() as scratch:
         local = Path(scratch) / "local"
-        start = time.monotonic()
         if command(local).wait():
             raise SystemExit(f"the run in local processes failed:\n{local.with_suffix('.log').read_text()}")
-        expected, length = (local / "rows.csv").read_bytes(), time.monotonic() - start
+        expected = (local / "rows.csv").read_bytes()
         cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
         second = [cluster.add_node(num_cpus=1)]
         try:
@@ -91,7 +91,7 @@ def main() -> None:
                     killed = False
                     while kills < args.kills and not killed:
                         try:
-                            run.wait(rng.uniform(0.1, 1) * length)
+                            run.wait(rng.uniform(5, 20))
                             break
                         except subprocess.TimeoutExpired:
                             before, kind = finished(out), rng.choice(["worker", "worker", "node", "command", "mailbox"])
