@@ -48,6 +48,8 @@ def broken(given):
 """
 
 
+MARK = "DECONFOUNDED_TESTED_BY"  # in the environment of all that a test starts
+
 TASK = """
 import beside
 from deconfounded.envs.slippery_cartpole import SlipperyCartpole
@@ -85,7 +87,12 @@ def two() -> Iterator[Any]:
     """A cluster of two nodes with a core each."""
     from ray.cluster_utils import Cluster
 
-    quiet = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "OMP_NUM_THREADS": "1"}
+    quiet = {
+        MARK: str(os.getpid()),
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+        "OMP_NUM_THREADS": "1",
+    }
     with pytest.MonkeyPatch.context() as patch:
         for key, value in quiet.items():
             patch.setenv(key, value)
@@ -99,14 +106,15 @@ def two() -> Iterator[Any]:
 
 
 def workers() -> list[str]:
-    """Ray's processes that run jobs."""
+    """Processes of this test's Ray that run jobs."""
     found = []
-    for file in Path("/proc").glob("[0-9]*/cmdline"):
+    for folder in Path("/proc").glob("[0-9]*"):
         try:
-            words = file.read_bytes().replace(b"\0", b" ").decode()
+            words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
         except OSError:
             continue
-        found += [words] * words.startswith(("ray::work", "ray::Mailbox"))
+        ours = f"{MARK}={os.getpid()}".encode() in environ.split(b"\0")
+        found += [words.decode()] * (ours and words.startswith((b"ray::work", b"ray::Mailbox")))
     return found
 
 
@@ -129,9 +137,11 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path) -> None:
 
     told: list[tuple[str, str | Exception]] = []
     ticks: list[int] = []
+    seen: list[str] = []
 
     def tick(n: int) -> None:
         ticks.append(n)
+        seen.extend(workers())
         if two.second is not None and list(there.glob(".*.pt")):
             two.remove_node(two.second, allow_graceful=False)
             two.second = None
@@ -177,6 +187,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path) -> None:
     deadline = time.monotonic() + 30
     while workers() and time.monotonic() < deadline:
         time.sleep(0.1)
+    assert seen
     assert workers() == []
 
 

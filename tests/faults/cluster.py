@@ -24,6 +24,7 @@ from ray.cluster_utils import Cluster
 
 ROOT = Path(__file__).parents[2]
 RUN = ("--task", "bandit", "--preset", "smoke", "--methods", "naive_rnn", "blind_bc", "--seeds", "2")
+MARK = "DECONFOUNDED_KILLS"  # in the environment of all that this script starts
 AMOUNTS = ("naive.updates=150", "expert_trials=200", "eval_trials=200", "cloning.updates=200")
 
 
@@ -41,14 +42,15 @@ def finished(out: Path) -> dict[str, str]:
 
 
 def processes(*starts: str) -> list[int]:
-    """Those whose command line starts so."""
+    """Those of this script's Ray whose command line starts so."""
     found = []
-    for file in Path("/proc").glob("[0-9]*/cmdline"):
+    for folder in Path("/proc").glob("[0-9]*"):
         try:
-            words = file.read_bytes().decode(errors="replace")
+            words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
         except OSError:
             continue
-        found += [int(file.parent.name)] * words.startswith(starts)
+        ours = f"{MARK}={os.environ[MARK]}".encode() in environ.split(b"\0")
+        found += [int(folder.name)] * (ours and words.decode(errors="replace").startswith(starts))
     return sorted(found)
 
 
@@ -73,7 +75,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     rng, bad, kills, runs = random.Random(args.seed), 0, 0, 0
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+    os.environ |= {MARK: str(os.getpid()), "RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     with tempfile.TemporaryDirectory() as scratch:
         local = Path(scratch) / "local"
