@@ -81,7 +81,9 @@ _BANDIT = Preset(
     fresh=0,
     grid=0,
     deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=3200),
-    discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=1600),
+    discrete=replace(
+        _ON_BANDIT, model="discrete", latent=10, inference_updates=400, imitation_updates=200, final_updates=800
+    ),
     offline=OfflineConfig(
         latent=5,
         offline_batch=64,
@@ -96,7 +98,7 @@ _BANDIT = Preset(
         learning_rate=3e-3,
     ),
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    dagger=DaggerConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    dagger=DaggerConfig(updates=500, batch=128, chunk=50, learning_rate=1e-2),
     cloning=CloningConfig(updates=500),
 )
 
