@@ -6,6 +6,11 @@ loudly actions and dynamics speak of theta, what the exact policies make of it, 
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -28,7 +33,7 @@ from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials, thetas
@@ -223,7 +228,7 @@ def picture(result: dict[str, Any], file: Path) -> None:
     told = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
     right.set(yscale="symlog", ylabel="nats a step", title=told)
     figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 

@@ -118,6 +118,7 @@ def run(
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
+    catalogue.check(args.preset, None, seeds, ())
     expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
     track = getattr(args, "track", None) is not None
     described = about(kind, task, args.preset, settings, args.set, expert, salt)

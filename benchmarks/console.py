@@ -1,14 +1,20 @@
-"""What commands share: their arguments, and one line for bad input."""
+"""What commands share: their arguments, and one line for bad input and for signals. It imports what is quick alone."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
+import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
+from types import FrameType
+from typing import Any, NoReturn
 
-from deconfounded.envs.task import InputError
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+CLEANING_S = 5.0  # for which a signal after the first changes nothing
 
 
 class Parser(argparse.ArgumentParser):
@@ -20,6 +26,8 @@ class Parser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
+        from deconfounded.envs.task import InputError
+
         raise InputError(f"{message}; see --help")
 
 
@@ -30,16 +38,66 @@ def place(text: str) -> Path:
     return Path(text)
 
 
+class Stopped(KeyboardInterrupt):
+    """A signal that asks to stop: Ctrl-C, SIGTERM, or the terminal is gone."""
+
+
+def _heed(handler: Callable[[int, FrameType | None], None]) -> dict[int, Any]:
+    """Take signals, but those that are ignored (nohup); returns what took them before."""
+    return {one: signal.signal(one, handler) for one in SIGNALS if signal.getsignal(one) is not signal.SIG_IGN}
+
+
+def stop_at_once() -> None:
+    """Until `run_command` a signal ends this process with one line: there is nothing yet to clean up."""
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        with contextlib.suppress(OSError):  # the terminal is gone
+            os.write(2, b"interrupted\n")
+        os._exit(128 + number)
+
+    _heed(stop)
+
+
+class Stoppable:
+    """Meanwhile signals raise Stopped; those that come while it is being cleaned up do nothing."""
+
+    stopped: int | None = None  # by which signal
+
+    def __enter__(self) -> Stoppable:
+        self._last = -CLEANING_S
+        self._before = _heed(self._stop)
+        return self
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if time.monotonic() - self._last >= CLEANING_S:
+            self.stopped, self._last = number, time.monotonic()
+            raise Stopped(number)
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
-    """Run a command. Bad input, or a disk that is full, ends it with one line and exit code 2, Ctrl-C with 130."""
+    """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
+    from deconfounded.envs.task import InputError
+
+    signals = Stoppable()
     try:
-        main()
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except OSError as error:
-        print(f"error: {error.filename or 'file'}: {error.strerror or error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print(f"interrupted; {interrupted}", file=sys.stderr)
-        sys.exit(130)
+        with signals:
+            main()
+        return
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) or signals.stopped:  # an import turns it into an error of its own
+            told, code = f"interrupted; {interrupted}", 128 + (signals.stopped or signal.SIGINT)
+        elif isinstance(error, InputError):
+            told, code = f"error: {error}", 2
+        elif isinstance(error, OSError):
+            told, code = f"error: {error.filename or 'file'}: {error.strerror or error}", 2
+        elif isinstance(error, MemoryError):
+            told, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
+        else:
+            raise
+    with contextlib.suppress(OSError):  # the terminal is gone
+        print(told, file=sys.stderr)
+    sys.exit(code)

@@ -7,6 +7,11 @@ are drawn beside.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import json
 from dataclasses import fields, replace
 from pathlib import Path
@@ -18,7 +23,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
-from deconfounded.envs.files import write_json
+from deconfounded.envs.files import save_figure, write_json
 from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
@@ -54,7 +59,7 @@ def picture(task: str, found: dict[str, Any], before: dict[str, Any], file: Path
     panels.flat[0].set_ylabel("score, last episode")
     panels.flat[0].legend(frameon=False, fontsize=8)
     figure.suptitle(task)
-    figure.savefig(file, dpi=100)
+    save_figure(figure, file, 100)
     plt.close(figure)
 
 
@@ -77,11 +82,11 @@ def main() -> None:
     for share in SHARES:
         settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})
         own = folder / f"{share:g}"
-        prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]
         jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
-        with commands.engine(args.cluster) as engine:
+        with commands.locked(own), commands.engine(args.cluster) as engine:
+            prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
             finished, _ = run_all(jobs, args.device, label, engine)
         made = records.of_run(finished, args.preset, args.set, task.episodes)
         results = records.gather(made)["methods"]

@@ -6,6 +6,11 @@ sha256 is of the contents: made again anywhere with the same versions, it is the
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from collections.abc import Callable
 
 from deconfounded import envs

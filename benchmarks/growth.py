@@ -7,6 +7,11 @@ and growth.png.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import time
 from collections.abc import Callable
 from functools import partial
@@ -16,7 +21,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, save_figure, write_json
 
 STEPS = (200, 400, 800, 1600, 3200)
 VALUES = (5, 11, 21, 41, 81)
@@ -90,7 +95,7 @@ def picture(found: dict[str, dict[str, dict[int, float]]], file: Path) -> None:
         axes.set_xticks(list(by), list(by))
         axes.set_xticks([], minor=True)
         axes.legend(frameon=False)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 

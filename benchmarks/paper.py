@@ -6,6 +6,11 @@ and online (b), imitation loss (c) and best-arm pulls (d) during training; learn
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

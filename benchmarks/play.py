@@ -5,6 +5,11 @@ Prints the return of each episode of a trial, under one theta; --video writes wh
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +22,7 @@ from deconfounded.benchmarks.engine import jobs
 from deconfounded.benchmarks.engine.guest import Stranger
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.cloning import MemorylessAgent
-from deconfounded.envs.files import check_folder
+from deconfounded.envs.files import check_file
 from deconfounded.experts import saved
 from deconfounded.experts.demos import Agent
 
@@ -66,12 +71,14 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     agent, episodes = ready(args.agent, task), task.episodes if args.episodes is None else args.episodes
-    if episodes < 1 or args.seed < 0:
-        raise envs.InputError(f"--episodes was {episodes} and --seed {args.seed}; they must be at least 1 and 0")
+    if not 1 <= episodes <= 1000 or args.seed < 0:
+        raise envs.InputError(
+            f"--episodes was {episodes} and --seed {args.seed}; they must be from 1 to 1,000, and from 0 up"
+        )
     if args.video is not None:
         if args.video.suffix != ".mp4":
             raise envs.InputError(f"--video was {args.video}; it must end in .mp4")
-        check_folder(args.video.parent)
+        check_file(args.video)
     env = envs.GymEnv(task, render_mode="rgb_array" if args.video else None)
     returns, frames = play(agent, env, episodes, args.seed, args.theta)
     pairs = zip(task.latents, env.batch.theta[0], strict=True)

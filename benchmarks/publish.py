@@ -7,6 +7,11 @@ All of it is looked at before anything is changed.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import shutil
 import tempfile
 from pathlib import Path
@@ -29,7 +34,9 @@ def clip(video: Path, file: Path) -> None:
 
 def keep(run: Path) -> None:
     """Copy what is worth keeping of a finished run. Raises InputError, and changes nothing, if something is amiss."""
-    files = [file for file in sorted((run / "records").glob("*/*/*.json")) if not file.is_symlink()]
+    files, beside = sorted((run / "records").glob("*/*/*.json")), [run / "adaptation.png", run / "video.mp4"]
+    if links := [file for file in (*files, *beside) if file.is_symlink()]:
+        raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
     if not files or not (run / "adaptation.png").is_file():
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
     found = [records.read(file) for file in files]
@@ -43,6 +50,10 @@ def keep(run: Path) -> None:
     task = envs.get(results["task"])
     if results["task_version"] != task.version:
         raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")
+    certificates = [file for file in (run.parent / "certificates").glob(f"{task.name}.*") if not file.is_symlink()]
+    for file in certificates:
+        if file.suffix == ".json":
+            pages.check_certificate(file, task)
     with tempfile.TemporaryDirectory() as scratch:
         small = Path(scratch) / "clip.webp"
         if (run / "video.mp4").exists():
@@ -56,7 +67,7 @@ def keep(run: Path) -> None:
         (DOCS / f"{task.name}.webp").unlink(missing_ok=True)
         if small.exists():
             shutil.copy(small, DOCS / f"{task.name}.webp")
-    for file in (run.parent / "certificates").glob(f"{task.name}.*"):
+    for file in certificates:
         shutil.copy(file, DOCS / "certificates")
 
 

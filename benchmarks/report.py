@@ -5,13 +5,18 @@ Nothing is trained, and nothing is made that is not there.
 
 from __future__ import annotations
 
-import json
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.output import report
+from deconfounded.envs.files import read_sealed
 
 
 def main() -> None:
@@ -20,9 +25,9 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="output folder of a run")
     folder = parser.parse_args().run
     try:
-        about = json.loads((folder / "settings.json").read_text())
-        task, kind = envs.get(about["reference"]), about["kind"]
-    except (OSError, ValueError, KeyError, TypeError):
+        about = read_sealed(folder / "settings.json")
+        task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
+    except (OSError, KeyError):
         raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
     finished = pool.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:

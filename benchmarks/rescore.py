@@ -6,6 +6,11 @@ you like: what the expert, random actions and the agent then make of it are meas
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +20,7 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_file, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
 from deconfounded.experts.policy import Expert
@@ -78,12 +83,12 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     agent, expert, where = ready(args.agent, task), policy.load(task, args.expert), elsewhere(task, args.range)
-    if args.trials < 2 or args.seed < 0:
-        raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be at least 2 and 0")
+    if not 2 <= args.trials <= 100_000 or args.seed < 0:
+        raise envs.InputError(
+            f"--trials was {args.trials} and --seed {args.seed}; they must be from 2 to 100,000, and from 0 up"
+        )
     if args.out is not None:
-        if args.out.is_dir():
-            raise envs.InputError(f"--out was {args.out}, a folder; it must be a file")
-        check_folder(args.out.parent)
+        check_file(args.out)
     found = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
     low, high = found["ci95_last"]
     print(

@@ -8,6 +8,11 @@ Seeds of a method run side by side in one program, in as many groups as there ar
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 from importlib.util import find_spec
 from pathlib import Path
 

@@ -6,6 +6,11 @@ gains nothing, 1 that the other seeds come for free.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import time
 from dataclasses import replace
 from statistics import median

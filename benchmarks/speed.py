@@ -8,6 +8,11 @@ loop, on a cartpole each, as shares of raw mj_step on their own model. Writes sp
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import os
 import platform
 import time
@@ -23,7 +28,7 @@ from gymnasium.vector import SyncVectorEnv
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.physics import Physics, cores
 
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)
@@ -144,7 +149,7 @@ def picture(found: dict[str, dict[str, dict[str, float]]], file: Path) -> None:
     left.set(xscale="log", ylim=(0, 1.1), xlabel="environments", title="closed loop / open loop")
     right.set(xscale="log", yscale="log", xlabel="environments", title="microseconds a control step of one")
     right.legend(frameon=False, bbox_to_anchor=(1, 0.5), loc="center left")
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 
@@ -160,8 +165,8 @@ def main() -> None:
     for task in tasks:
         if not isinstance(task, envs.MujocoTask):
             raise envs.InputError(f"{task.name} has no physics to time; give a MuJoCo task")
-    if min(args.n) < 1:
-        raise envs.InputError(f"--n was {min(args.n)}; it must be at least 1")
+    if wrong := [n for n in args.n if not 1 <= n <= 1_000_000]:
+        raise envs.InputError(f"--n was {wrong[0]}; it must be from 1 to 1,000,000")
     check_folder(args.out)
     progress = Progress(len(tasks) * len(args.n), "timing")
     found: dict[str, dict[str, dict[str, float]]] = {}

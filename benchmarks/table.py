@@ -8,6 +8,11 @@ on where it was. The first five seeds of everything come first.
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import json
 from dataclasses import replace
 from pathlib import Path

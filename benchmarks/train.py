@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import os
 import platform
 import time
@@ -14,7 +19,7 @@ from safetensors.numpy import save as to_bytes
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.files import check_folder, write_atomically, write_json
+from deconfounded.envs.files import check_file, write_atomically, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
 
@@ -37,12 +42,10 @@ def main() -> None:
     file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
-    if file.is_dir():
-        raise envs.InputError(f"--out was {file}, a folder; it must be a file")
     if args.out is None and file.exists():
         raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
     envs.check_task(task)
-    check_folder(file.parent)
+    check_file(file)
     from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
 
     start = time.time()

@@ -6,6 +6,11 @@ Says `same bits`, `inside the interval` (the mean return of every episode within
 
 from __future__ import annotations
 
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
 import tempfile
 from pathlib import Path
 

@@ -100,7 +100,7 @@ class LearnedAgent(Agent):
         self._n, self._draws = 0, Draws([], self.device)
 
     def begin(self, n: int) -> None:
-        if n < 1 or n % self.seeds:
+        if not isinstance(n, int | np.integer) or n < 1 or n % self.seeds:
             raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
         self._n = n // self.seeds
         self._draws = Draws([], self.device)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import runpy
 import sys
 
+from deconfounded.benchmarks.console import stop_at_once
+
 COMMANDS = {
     "run": ("benchmarks.run", "train, deploy and score methods on a task"),
     "train": ("benchmarks.train", "train a task's expert (PPO)"),
@@ -40,12 +42,10 @@ def main() -> None:
     if name not in COMMANDS:
         print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
+    stop_at_once()
     sys.argv = [f"deconf {name}", *sys.argv[2:]]
     try:
         runpy.run_module(f"deconfounded.{COMMANDS[name][0]}", run_name="__main__", alter_sys=True)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise

@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.batch import BatchEnv, check_number
 from deconfounded.envs.task import InputError, Painter, Task
 
 
@@ -105,12 +105,10 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def __init__(
         self, task: Task, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
     ) -> None:
-        for what, given in (("environments", n), ("episodes", episodes)):
-            if not isinstance(given, int | np.integer) or given < 1:
-                raise InputError(f"the number of {what} was {given!r}; it must be a whole number from 1 up")
+        check_number("episodes", episodes)
         self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode.NEXT_STEP}
-        self.task, self.num_envs, self.episodes, self.render_mode = task, n, episodes, render_mode
         self.batch = BatchEnv(task, n, privileged)
+        self.task, self.num_envs, self.episodes, self.render_mode = task, n, episodes, render_mode
         self._pictures, self._episode = _Pictures(self.batch), np.zeros(n, int)
         self.single_observation_space = _observation_space(task, privileged)
         self.single_action_space = copy.deepcopy(task.action_space)

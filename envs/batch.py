@@ -11,6 +11,20 @@ from numpy.typing import NDArray
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.task import InputError, Task
 
+MOST = 10_000_000  # environments
+
+
+def check_number(what: str, given: object, most: float = np.inf) -> None:
+    """Raises InputError for what is no whole number from 1 up, and at most so many."""
+    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+    if not whole or not 1 <= given <= most:  # type: ignore[operator]
+        limit = "up" if most == np.inf else f"to {most:,}"
+        raise InputError(f"the number of {what} was {given!r}; it must be a whole number from 1 {limit}")
+
+
+def _is_seed(given: object) -> bool:
+    return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(given >= 0)
+
 
 class BatchEnv:
     """N environments of one task; each has its own theta and three random streams (theta, start, noise).
@@ -20,6 +34,8 @@ class BatchEnv:
     """
 
     def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
+        """Raises InputError for a number of environments that cannot be."""
+        check_number("environments", n, MOST)
         self.task, self.n, self.privileged = task, n, privileged
         self.simulator = task.simulator(n)
         self.alive = np.zeros(n, bool)
@@ -38,10 +54,10 @@ class BatchEnv:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
         if seed is None:
             seed = [None] * self.n
-        elif isinstance(seed, int | np.integer):
+        elif isinstance(seed, int | np.integer) and _is_seed(seed):
             seed = [int(seed) + i for i in range(self.n)]
-        whole = isinstance(seed, list | tuple | np.ndarray) and len(seed) == self.n
-        if not whole or not all(one is None or (isinstance(one, int | np.integer) and one >= 0) for one in seed):
+        whole = isinstance(seed, list | tuple | np.ndarray) and np.shape(seed) == (self.n,)
+        if isinstance(seed, int) or not whole or not all(one is None or _is_seed(one) for one in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [
             [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seed
@@ -59,7 +75,9 @@ class BatchEnv:
         others draw a new one; `theta` [L] or [N, L] forces one. Neither moves the start or the noise. A theta that
         drifts is kept but for its drift. Raises InputError for a theta out of bounds and for a mask that is none.
         """
-        options = options or {}
+        options = {} if options is None else options
+        if not isinstance(options, dict):
+            raise InputError(f"reset options were {options!r}; they must be a dictionary")
         if unknown := set(options) - {"keep_theta", "theta"}:
             raise InputError(f"reset option {sorted(unknown)[0]!r} is unknown; there are keep_theta and theta")
         keep, forced = self._keep_mask(options.get("keep_theta", False)), options.get("theta")

@@ -24,7 +24,7 @@ _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco
 def backend() -> str:
     """The GL backend that works here: MUJOCO_GL if it is set, else egl or osmesa. Raises InputError if none does."""
     # A failed import leaves PyOpenGL on the wrong platform, so each is tried in a process of its own.
-    wanted = os.environ.get("MUJOCO_GL")
+    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()  # as mujoco reads it
     for name in (wanted,) if wanted else ("egl", "osmesa"):
         environ = {**os.environ, "MUJOCO_GL": name}
         if subprocess.run([sys.executable, "-c", _PROBE], env=environ, capture_output=True).returncode == 0:

@@ -278,8 +278,10 @@ class Task(ABC):
     def check_theta(self, theta: object, n: int) -> Array:
         """Any array-like -> [N, L]. Raises InputError for a wrong shape or a value out of bounds."""
         try:
-            array = np.asarray(theta, float)
-            array = np.broadcast_to(array, (n, len(self.latents))).copy()
+            array = np.asarray(theta)
+            if array.dtype.kind not in "iuf":
+                raise TypeError
+            array = np.broadcast_to(array.astype(float), (n, len(self.latents))).copy()
         except (TypeError, ValueError):
             raise InputError(
                 f"theta of {self.name} was {theta!r}; it must be {len(self.latents)} number(s), or one row for each"
@@ -302,7 +304,7 @@ class Task(ABC):
         width = 1 if isinstance(self.action_space, spaces.Discrete) else self.action_space.shape[0]
         try:
             array = np.asarray(action)
-            if array.dtype.kind in "USO":
+            if array.dtype.kind not in "biuf":
                 raise TypeError
             array = array.astype(float)
         except (TypeError, ValueError):

@@ -42,6 +42,8 @@ class Trials:
                 raise InputError(f"{name} of Trials must be an array of numbers ({error})") from None
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        if not isinstance(self.actions, int | np.integer) or self.actions < 0:
+            raise InputError(f"actions of Trials was {self.actions!r}; it must be how many there are, or 0")
         b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
         if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
             raise InputError(
@@ -75,17 +77,19 @@ class Trials:
 
         return dataset.read(source)[0]
 
-    def save(self, file: Path) -> None:
-        """Write an .npz file, atomically."""
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, obs=self.obs, action=self.action, mask=self.mask, actions=self.actions)
+    def save(self, file: Path, made_of: str = "") -> None:
+        """Write an .npz file, atomically. made_of: anything that `load` is to find in it."""
+        buffer, known = io.BytesIO(), {"actions": self.actions, "made_of": made_of}
+        np.savez_compressed(buffer, obs=self.obs, action=self.action, mask=self.mask, **known)  # type: ignore[arg-type]
         write_atomically(file, buffer.getvalue())
 
     @staticmethod
-    def load(file: Path) -> Trials:
-        """Read what `save` wrote. Raises InputError if the file is missing or damaged."""
+    def load(file: Path, made_of: str | None = None) -> Trials:
+        """Read what `save` wrote. Raises InputError if the file is missing or damaged, or made of something else."""
         try:
             with np.load(file, allow_pickle=False) as data:
+                if made_of not in (None, str(data["made_of"])):
+                    raise InputError("it was made of something else")
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
         except Exception as error:  # a file that is no zip, or half of one, fails in many ways
             raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None

@@ -146,6 +146,8 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         if source is not None:
             raise InputError(f"expert was {source}; that of {task.name} is its closed form, `expert_probs`")
         return DiscreteExpert(task)
+    if source is not None and (not isinstance(source, str | Path) or not str(source).strip()):
+        raise InputError(f"expert was {source!r}; it must be weights.safetensors, or path/file.py:name of a callable")
     if isinstance(source, str) and names_callable(source):
         expert = OwnExpert(task, outside.find("expert", source), source)
         if not callable(expert.call):
@@ -153,7 +155,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
         expert.mean(np.zeros((2, len(task.observation)), np.float32), lat)
         return expert
-    return NetworkExpert(task, _weights(task, Path(source) if source else path(task)))
+    return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source)))
 
 
 def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
@@ -186,5 +188,5 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
 
 def fingerprint(task: Task, source: str | Path | None = None) -> str:
     """SHA-256 of a file of weights, by default the task's own; or `closed form`."""
-    file = Path(source) if source else path(task)
+    file = path(task) if source is None else Path(source)
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "closed form"

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
-import json
 import shutil
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from safetensors.numpy import load_file
+from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
 from deconfounded.envs import InputError, outside
-from deconfounded.envs.files import check_folder, write_atomically, write_json
+from deconfounded.envs.files import check_folder, read_sealed, write_atomically, write_sealed
 from deconfounded.experts.demos import Agent
 
+ARRAYS = "agent.safetensors"
 CODE = "agent.py"  # of an agent from outside, kept beside its arrays
 
 
@@ -34,22 +35,21 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     if where.startswith("outside_") and code is not None:
         shutil.copy(code, folder / CODE)
         where = CODE
-    write_atomically(folder / "agent.safetensors", to_bytes(arrays))
+    write_atomically(folder / ARRAYS, content := to_bytes(arrays))
     about["versions"] = {name: version(name) for name in ("deconfounded-imitation", "numpy")}
-    write_json(folder / "agent.json", {"class": f"{where}:{cls.__qualname__}", "settings": settings, **about})
+    about["arrays"] = hashlib.sha256(content).hexdigest()
+    write_sealed(folder / "agent.json", {"class": f"{where}:{cls.__qualname__}", "settings": settings, **about})
 
 
 def describe(folder: Path) -> dict[str, Any]:
     """agent.json. Raises InputError if there is none, or it is damaged."""
     try:
-        about = json.loads((folder / "agent.json").read_text())
-        if [type(about[key]) for key in ("class", "settings")] != [str, dict]:
-            raise TypeError
-        return about
+        about = read_sealed(folder / "agent.json")
     except OSError:
         raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
-    except (ValueError, TypeError, KeyError):
-        raise InputError(f"{folder / 'agent.json'} is damaged; run the benchmark again") from None
+    if [type(about.get(key)) for key in ("class", "settings", "arrays")] != [str, dict, str]:
+        raise InputError(f"{folder / 'agent.json'} is of no agent; run the benchmark again")
+    return about
 
 
 def load(folder: Path | str) -> Agent:
@@ -57,6 +57,8 @@ def load(folder: Path | str) -> Agent:
 
     The class that agent.json names is imported, so that loading an agent is running its code.
     """
+    if not isinstance(folder, str | Path):
+        raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
     folder = Path(folder)
     about = describe(folder)
     try:
@@ -64,7 +66,10 @@ def load(folder: Path | str) -> Agent:
         cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
         if not (inspect.isclass(cls) and issubclass(cls, Agent)):
             raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
-        return cls.from_state(about["settings"], load_file(folder / "agent.safetensors"))
+        content = (folder / ARRAYS).read_bytes()
+        if hashlib.sha256(content).hexdigest() != about["arrays"]:
+            raise InputError(f"{folder / ARRAYS} is damaged, or of another agent; run the benchmark again")
+        return cls.from_state(about["settings"], from_bytes(content))
     except InputError:
         raise
     except Exception as error:  # whatever its class makes of arrays that are not its own

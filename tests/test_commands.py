@@ -4,28 +4,36 @@ from __future__ import annotations
 
 import importlib
 import json
+import multiprocessing
+import os
 import re
+import resource
+import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import certify, publish
+from deconfounded.__main__ import COMMANDS
+from deconfounded.benchmarks import certify, commands, cost, publish
 from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.output import pages, records, score
+from deconfounded.envs import render
+from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.envs.task import Array
 from deconfounded.envs.tasks.cartpole import Cartpole
 from deconfounded.experts.policy import Expert
+from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
 
 
 def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
-    import os
-
     return subprocess.run(
         [sys.executable, *args], cwd=ROOT, capture_output=True, text=True, env={**os.environ, **environ}, timeout=300
     )
@@ -54,6 +62,15 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--list", "--task", "nonsense"), "it lists all, and goes by itself"),
         (("benchmarks/run.py", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
+        (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
+        (("benchmarks/run.py", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
+        (("benchmarks/certify.py", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
+        (("benchmarks/speed.py", "--n", "100000000000000000000"), "it must be from 1 to 1,000,000"),
+        (
+            ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
+            "output folder /proc/none cannot be written",
+        ),
+        (("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"), "and from 0 up"),
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=0"), "--set seeds was '0'; it must be like 5"),
         (("benchmarks/run.py", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
         (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
@@ -136,6 +153,141 @@ def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     assert "not their settings.json" in refusal((*args, str(out), "--resume"), monkeypatch, capsys)
 
 
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+class TestSignals:
+    """One line, 128 + n, and nothing is left running."""
+
+    def test_while_a_command_is_imported(self, name: str, tmp_path: Path) -> None:
+        """By a mujoco that sends the signal in its own import."""
+        (tmp_path / "mujoco.py").write_text(f"import os, signal\nos.kill(os.getpid(), signal.{name})\n")
+        path = f"{tmp_path}{os.pathsep}{ROOT}"
+        for line in (("benchmarks/run.py", "--list"), ("-m", "deconfounded", "run", "--list")):
+            done = command(*line, PYTHONPATH=path)
+            assert (done.returncode, done.stderr) == (128 + getattr(signal, name), "interrupted\n")
+
+    def test_twice(self, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+        """The second one does not disturb what the first one has begun to clean up; after that all is as before."""
+        number, cleaned, before = getattr(signal, name), [], signal.getsignal(getattr(signal, name))
+
+        def main() -> None:
+            try:
+                signal.raise_signal(number)
+            finally:
+                signal.raise_signal(number)
+                cleaned.append(True)
+
+        with pytest.raises(SystemExit) as ended:
+            run_command(main, "it stays")
+        assert (ended.value.code, cleaned) == (128 + number, [True])
+        assert capsys.readouterr().err == "interrupted; it stays\n"
+        assert signal.getsignal(number) is before
+
+    def test_ignored_signals_stay_so(self, name: str) -> None:
+        """As under nohup."""
+        number = getattr(signal, name)
+        before = signal.signal(number, signal.SIG_IGN)
+        try:
+            run_command(lambda: signal.raise_signal(number))
+            assert signal.getsignal(number) is signal.SIG_IGN
+        finally:
+            signal.signal(number, before)
+
+
+class Deadly(pool.Job):
+    """Sends SIGTERM to the main process, and goes on."""
+
+    def run(self) -> str:
+        os.kill(os.getppid(), signal.SIGTERM)
+        threading.Event().wait()
+        return ""
+
+
+def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        run_command(lambda: pool.run_jobs([job], "deadly"), "kept")
+    assert (ended.value.code, capsys.readouterr().err) == (143, "interrupted; kept\n")
+    assert not multiprocessing.active_children()
+
+
+def test_every_command_listens_first() -> None:
+    """Before the imports that take long."""
+    for _, (name, _) in COMMANDS.items():
+        text = (ROOT / f"{name.replace('.', '/')}.py").read_text()
+        first = text.split("from __future__ import annotations\n\n")[1].partition("\n\nimport ")[0]
+        assert first.startswith('if __name__ == "__main__":'), name
+        assert "    stop_at_once()" in first.splitlines(), name
+
+
+def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever an import makes of a signal is an interruption; no memory is told as such."""
+
+    def interrupted() -> None:
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:
+            raise ImportError("numpy") from None
+
+    def greedy() -> None:
+        raise MemoryError("Unable to allocate 1. PiB")
+
+    for main, code, says in (
+        (interrupted, 143, "interrupted; nothing was written\n"),
+        (greedy, 2, "error: not enough memory: Unable to allocate 1. PiB\n"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            run_command(main)
+        assert (ended.value.code, capsys.readouterr().err) == (code, says)
+
+
+class TestFiles:
+    def test_a_full_disk(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        """It is told of which file, which holds what it held before; nothing half written stays."""
+        file, figure = tmp_path / "kept.json", pytest.importorskip("matplotlib.figure").Figure()
+        file.write_text("{}")
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        for write in (lambda: write_json(file, {"x": "y" * 1000}), lambda: save_figure(figure, file, 50)):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+            try:
+                with pytest.raises(SystemExit):
+                    run_command(write)
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            assert capsys.readouterr().err == f"error: {file}: File too large\n"
+            assert [one.name for one in tmp_path.iterdir()] == ["kept.json"]
+            assert file.read_text() == "{}"
+
+    def test_interrupted(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def interrupt(*_: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(os, "replace", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            write_json(tmp_path / "x.json", {})
+        assert not list(tmp_path.iterdir())
+
+    def test_what_is_no_plain_file_is_left_alone(self, tmp_path: Path) -> None:
+        for file, says in ((tmp_path, "is a folder"), (Path("/dev/null"), "is no plain file")):
+            with pytest.raises(envs.InputError, match=says):
+                check_file(file)
+
+    @pytest.mark.parametrize("change", [{"seeds": 4}, {"more": 1}, {"sha256": None}])
+    def test_sealed(self, change: dict[str, object], tmp_path: Path) -> None:
+        data = {"seeds": 3, "rate": 1e-3, "set": ["seeds=3"]}
+        write_sealed(tmp_path / "x.json", data)
+        assert read_sealed(tmp_path / "x.json") == data
+        write_json(tmp_path / "x.json", {**json.loads((tmp_path / "x.json").read_text()), **change})
+        with pytest.raises(envs.InputError, match="is damaged, or was changed by hand"):
+            read_sealed(tmp_path / "x.json")
+
+
+def test_cost_locks_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["cost", "--task", "bandit", "--out", str(tmp_path)])
+    monkeypatch.setattr(pool, "run_all", None)
+    with commands.locked(tmp_path / "0.25"), pytest.raises(envs.InputError, match="another command is at work"):
+        cost.main()
+
+
 def test_time_worked_counts_overlaps_once() -> None:
     assert records.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
@@ -147,6 +299,15 @@ def test_no_gl_is_only_a_note(backend: str) -> None:
     code = f"from deconfounded import envs; e = {made}; e.reset(seed=0); e.render()"
     done = command("-c", code, MUJOCO_GL=backend)
     assert "InputError: no GL for pictures" in done.stderr
+
+
+@pytest.mark.parametrize(("given", "meant"), [("EGL", "egl"), ("egl ", "egl"), ("OSMesa", "osmesa"), (" ", "egl")])
+def test_gl_by_another_spelling(given: str, meant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What mujoco takes for a backend is one, and is loaded by its own name."""
+    monkeypatch.setenv("MUJOCO_GL", given)
+    probed = subprocess.CompletedProcess("", 0)
+    monkeypatch.setattr(render.subprocess, "run", lambda *_, env, **__: probed if env["MUJOCO_GL"] == meant else None)
+    assert render.backend.__wrapped__() == meant
 
 
 class TestScore:
@@ -240,6 +401,9 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     (run / "adaptation.png").write_bytes(b"a picture")
     (run.parent / "certificates" / "bandit.json").write_text("{}")
     (docs / "bandit.webp").write_bytes(b"an old clip")
+    certificate = run.parent / "certificates" / "bandit.json"
+    certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
+    (docs / "bandit.gif").write_bytes(b"an old clip")
     (run / "video.mp4").write_bytes(b"junk")
     monkeypatch.setattr(publish, "DOCS", docs)
 
@@ -254,6 +418,23 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert kept() == ["bandit.webp"]
     file.write_text(json.dumps(shown[0]))
     (run / "video.mp4").unlink()
+    for text in ("{}", "[", '{"task": "bandit"}', certificate.read_text().replace('"passed"', '"<script>"', 1)):
+        certificate.write_text(text)
+        with pytest.raises(envs.InputError, match=r"bandit.json is no certificate of bandit v0"):
+            publish.keep(run)
+    certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
+    (run / "video.mp4").symlink_to("/etc/passwd")
+    with pytest.raises(envs.InputError, match=r"video.mp4 is a link"):
+        publish.keep(run)
+    (run / "video.mp4").unlink()
+    randoms = [run / "records" / records.place(record) for record in shown if record["method"] == "random"]
+    for one in randoms:
+        one.rename(one.with_suffix(".aside"))
+    with pytest.raises(envs.InputError, match="are without those of random"):
+        publish.keep(run)
+    for one in randoms:
+        one.with_suffix(".aside").rename(one)
+    assert kept() == ["bandit.gif"]
     publish.keep(run)
     assert kept() == sorted(
         [*(f"records/{records.place(one)}" for one in shown), "bandit.png", "certificates/bandit.json"]

@@ -29,6 +29,7 @@ from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import naive_rnn, wire
 from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.envs.files import write_sealed
 from deconfounded.experts import policy, saved
 from deconfounded.experts.demos import Trials, run_trials
 from tests.tools import tiny_preset
@@ -515,12 +516,16 @@ class TestSaved:
         (tmp_path / "agent.json").write_text("{")
         with pytest.raises(envs.InputError, match="is damaged"):
             deconfounded.load(tmp_path)
-        (tmp_path / "agent.json").write_text(
-            '{"class": "deconfounded.deconf.recurrent:RecurrentAgent", "settings": {}}'
-        )
-        (tmp_path / "agent.safetensors").write_bytes(b"half")
-        with pytest.raises(envs.InputError, match="is damaged"):
-            deconfounded.load(tmp_path)
+        about = {"class": "deconfounded.deconf.recurrent:RecurrentAgent", "settings": {}}
+        for arrays, says in (
+            (None, "is of no agent"),
+            ("0" * 64, r"agent\.safetensors is damaged, or of another agent"),
+            (hashlib.sha256(b"half").hexdigest(), r"is damaged \(.*\); run the benchmark again"),
+        ):
+            write_sealed(tmp_path / "agent.json", {**about, "arrays": arrays})
+            (tmp_path / "agent.safetensors").write_bytes(b"half")
+            with pytest.raises(envs.InputError, match=says):
+                deconfounded.load(tmp_path)
 
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
     def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

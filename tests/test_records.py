@@ -20,6 +20,7 @@ from deconfounded.benchmarks.engine import identity, pool
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.output import records
+from deconfounded.envs.files import PARTIAL, write_sealed
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Trials
 from tests.tools import tiny_preset
@@ -123,19 +124,54 @@ class TestKeptFiles:
         assert job.unfit(0, found) == "it was made with another method"
 
     def test_contents(self, job: BenchmarkJob) -> None:
-        assert "has shape (3, 1), for 4 trials" in self.spoilt(job, **{"blind_bc/returns": np.ones((3, 1))})
+        few = {"blind_bc/returns": np.ones((3, 1)), "blind_bc/objective": np.ones((3, 1))}
+        assert "has shape (3, 1), for 4 trials" in self.spoilt(job, **few)
         job.run()
         assert "NaN or infinity" in self.spoilt(job, **{"blind_bc/objective": np.full((4, 1), np.nan)})
         job.run()
         assert "another versions" in self.spoilt(job, identity={**identity.identity(job), "versions": {}})
         job.run()
-        assert "does not say" in self.spoilt(job, identity=[1])
+        assert "Eq. (1) (4,)" in self.spoilt(job, **{"blind_bc/objective": np.ones(4)})
+        for key, value, says in (
+            ("identity", [1], "does not say what it was made of"),
+            ("budget", {"expert_trials": "4"}, "does not say what data"),
+            ("agents", 3, "does not say what it was made of"),
+            ("arrays", ["theta", "more"], r"it lacks blind_bc/objective, "),
+        ):
+            job.run()
+            assert says in self.spoilt(job, **{key: value})
 
     def test_stray_names(self, job: BenchmarkJob) -> None:
         """blind_bc-00 is not one more seed."""
         shutil.copy(job.file(0), job.folder / "blind_bc-00.npz")
         shutil.copy(job.file(0), job.folder / "nonsense-0.npz")
         assert [one.seeds for one in pool.written(job, job.folder)] == [(0,), (1,)]
+
+    def test_a_file_over_another_s(self, job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
+        """What is shown again of a run has a seed once; demonstrations are those of their seed and expert."""
+        shown = job.context().demonstrations
+        first, second = (job.folder / f"demonstrations-{seed}.npz" for seed in (0, 1))
+        assert job.context().has_demonstrations(0)
+        shutil.copy(second, first)
+        assert not job.context().has_demonstrations(0)
+        assert job.context().demonstrations.sha256 == shown.sha256
+        assert job.context().has_demonstrations(0)
+        assert not replace(job, preset=replace(job.preset, expert_trials=3)).context().has_demonstrations(0)
+        shutil.copy(job.file(1), job.file(0))
+        assert [(method, seed) for method, seed, _ in pool.left_in(job.folder)] == [("blind_bc", 1)]
+        assert capsys.readouterr().out == "blind_bc-0.npz is left out: it is of blind_bc-1\n"
+
+    @pytest.mark.parametrize("text", ["[]", "{", '{"kind": "BenchmarkJob"}', "\xff", "[" * 100_000])
+    def test_settings_of_wrong_shape(self, text: str, tmp_path: Path) -> None:
+        (tmp_path / "settings.json").write_text(text, encoding="latin-1")
+        with pytest.raises(envs.InputError, match=r"settings\.json is damaged"):
+            pool.prepare(tmp_path, {"kind": "BenchmarkJob"}, resume=True)
+
+    def test_what_a_kill_left_half_written_goes(self, tmp_path: Path) -> None:
+        (tmp_path / "jobs").mkdir()
+        (tmp_path / "jobs" / f".naive_rnn-0.npz.77{PARTIAL}").write_bytes(b"half")
+        pool.prepare(tmp_path, {}, resume=False)
+        assert not list((tmp_path / "jobs").iterdir())
 
     def test_flipped_bits(self, job: BenchmarkJob) -> None:
         """Of 100 single flips, each is noticed, or changes nothing."""
@@ -200,6 +236,7 @@ class TestRecords:
             ({"task": "../../etc"}, "task "),
             ({"seed": -1}, "seed "),
             ({"returns": ["<script>"]}, r"returns\.0 "),
+            ({"machine": "<script>"}, "machine "),
             ({"spans": [[0, 1]]}, r"spans\.0\.0 "),
             ({"spans": [[1.8e9, 1.7e9]]}, "spans must end after they begin"),
             ({"tier": "0"}, "tier "),
@@ -260,7 +297,7 @@ def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.Mon
     with pytest.raises(envs.InputError, match=r"holds no settings.json"):
         report.main()
     about = {"reference": "bandit", "kind": "BenchmarkJob", "preset": "smoke", "set": []}
-    (tmp_path / "settings.json").write_text(json.dumps(about))
+    write_sealed(tmp_path / "settings.json", about)
     with pytest.raises(envs.InputError, match="no finished jobs of random and expert"):
         report.main()
     for method in ("random", "expert"):
@@ -284,9 +321,8 @@ def test_broken_pictures_leave_the_numbers(
     monkeypatch.setattr("deconfounded.benchmarks.output.report.pictures", broken)
     for method in ("random", "expert"):
         replace(job, method=method).run()
-    (tmp_path / "settings.json").write_text(
-        json.dumps({"reference": "bandit", "kind": "BenchmarkJob", "preset": "smoke", "set": []})
-    )
+    about = {"reference": "bandit", "kind": "BenchmarkJob", "preset": "smoke", "set": []}
+    write_sealed(tmp_path / "settings.json", about)
     monkeypatch.setattr("sys.argv", ["report", str(tmp_path)])
     run_command(report.main)
     assert "no pictures: an OpenGL platform library" in capsys.readouterr().out

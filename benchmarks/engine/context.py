@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import identity
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.data import Source
 from deconfounded.envs.streams import Array, Streams
@@ -48,7 +49,7 @@ class Context:
     ) -> None:
         """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load."""
         self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
-        self.folder = folder
+        self.folder, self.named_expert = folder, expert
         self.expert = policy.load(task, expert)
 
     @cached_property
@@ -65,16 +66,28 @@ class Context:
         seeds = [stream(DEMOS, seed) for seed in seeds]
         return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
 
+    def _kept(self, seed: int) -> tuple[Path, str]:
+        """Where a seed's demonstrations are kept, and what they are made of."""
+        assert self.folder is not None
+        made_of = identity.demonstrations(self.task, self.named_expert, self.preset.expert_trials, seed)
+        return self.folder / f"demonstrations-{seed}.npz", made_of
+
+    def has_demonstrations(self, seed: int) -> bool:
+        """Whether they are in the folder: whole, and of this seed, task and expert."""
+        try:
+            return bool(Trials.load(*self._kept(seed)))
+        except envs.InputError:
+            return False
+
     def _demonstrated(self, seed: int) -> Trials:
         """The demonstrations of one seed, made once: what is in the folder is taken from there."""
         if self.folder is None:
             return self._expert_trials(self.preset.expert_trials, [seed])
-        file = self.folder / f"demonstrations-{seed}.npz"
         try:
-            return Trials.load(file)
-        except envs.InputError:  # not there yet, or damaged
+            return Trials.load(*self._kept(seed))
+        except envs.InputError:
             trials = self._expert_trials(self.preset.expert_trials, [seed])
-            trials.save(file)
+            trials.save(*self._kept(seed))
             return trials
 
     @cached_property

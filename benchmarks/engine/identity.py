@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import os
 import platform
 import subprocess
@@ -60,6 +61,12 @@ def identity(job: Job) -> dict[str, Any]:
         "versions": versions(),
         "code": code(task, method.module, method.reference),
     }
+
+
+def demonstrations(task: envs.Task, source: str | None, trials: int, seed: int) -> str:
+    """SHA-256 of all that a seed's demonstrations depend on."""
+    known = [task.name, task.version, expert(task, source), trials, seed, versions(), code(task, "")]
+    return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
 
 def expert(task: envs.Task, source: str | None) -> str:

@@ -121,6 +121,9 @@ class BenchmarkJob(Job):
                 for name, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
+            notes = [
+                self._keep(name, agent) for name, agent in agents.items()
+            ]  # first: a seed's file says it is finished
             meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
             for i, seed in enumerate(self.seeds):
                 rows = context.rows(i)
@@ -131,7 +134,6 @@ class BenchmarkJob(Job):
                     if seed == 0:
                         arrays.update({f"{name}/{key}": value for key, value in clip.items()})
                 self.save(seed, arrays, monitor, meta)
-            notes = [self._keep(name, agent) for name, agent in agents.items()]
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
 
     def _keep(self, name: str, agent: Agent) -> str:

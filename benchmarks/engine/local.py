@@ -6,9 +6,10 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.queues import Queue
 
 from deconfounded import envs
@@ -34,7 +35,7 @@ class Local(Engine):
         context = multiprocessing.get_context("spawn")
         workers = min(cores(), len(jobs))
         ticks = context.Queue()
-        with ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,)) as executor:
+        with ended(ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,))) as executor:
             # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
             heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
             os.environ["OMP_NUM_THREADS"] = "1"
@@ -44,22 +45,29 @@ class Local(Engine):
                 del os.environ["OMP_NUM_THREADS"]
             else:
                 os.environ["OMP_NUM_THREADS"] = threads
-            try:
-                waiting = set(futures)
-                while waiting:
-                    while not ticks.empty():
-                        tick(ticks.get())
-                    for future in [f for f in waiting if f.done()]:
-                        waiting.remove(future)
-                        try:
-                            say(futures[future], future.result())
-                        except envs.InputError as error:
-                            say(futures[future], error)
-                    time.sleep(0.1)
-            except BrokenProcessPool:
-                raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
-            except BaseException:
-                for process in multiprocessing.active_children():
-                    process.terminate()
-                executor.shutdown(wait=False, cancel_futures=True)
-                raise
+            waiting = set(futures)
+            while waiting:
+                while not ticks.empty():
+                    tick(ticks.get())
+                for future in [f for f in waiting if f.done()]:
+                    waiting.remove(future)
+                    try:
+                        say(futures[future], future.result())
+                    except envs.InputError as error:
+                        say(futures[future], error)
+                time.sleep(0.1)
+
+
+@contextmanager
+def ended(executor: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
+    """The pool; when the work is over, or ends early by an error or a signal, none of its processes is left."""
+    try:
+        yield executor
+    except BaseException as error:
+        for process in multiprocessing.active_children():
+            process.kill()
+        if isinstance(error, BrokenProcessPool):
+            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)

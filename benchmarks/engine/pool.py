@@ -7,8 +7,6 @@ import io
 import json
 import re
 import time
-import zipfile
-import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +24,7 @@ from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.deconf.agents import Monitor, Training
-from deconfounded.envs.files import check_folder, write_atomically, write_json
+from deconfounded.envs.files import check_folder, read_sealed, sweep, write_atomically, write_sealed
 from deconfounded.experts.demos import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
@@ -80,7 +78,7 @@ class Job(ABC):
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
         known = {"identity": identity(self), "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
-        known["reference"] = self.about.reference
+        known |= {"reference": self.about.reference, "arrays": list(arrays)}
         whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
@@ -92,23 +90,47 @@ class Job(ABC):
 
     def unfit(self, seed: int, found: dict[str, Any]) -> str:
         """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
+        if why := broken(found):
+            return why
         meta, expected = found["meta"], json.loads(json.dumps(identity(self)))
-        told = meta.get("identity")
-        if not isinstance(told, dict) or not set(meta) >= REQUIRED:
-            return "it does not say what it was made of"
+        told = meta["identity"]
         if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
             return f"it was made with another {differ[0].replace('_', ' ')}"
         if meta["seed"] != seed:
             return f"it is of seed {meta['seed']}"
         for key, value in found.items():
-            if key.endswith("/returns") and (value.ndim != 2 or len(value) != self.preset.eval_trials):
+            if key.endswith("/returns") and len(value) != self.preset.eval_trials:
                 return f"{key} has shape {value.shape}, for {self.preset.eval_trials} trials"
-            if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
-                return f"{key} holds NaN or infinity"
         return ""
 
 
-REQUIRED = {"identity", "seed", "budget", "spans", "cpu_s"}  # of a file's meta
+META: dict[str, Any] = {  # what a file says of itself, and of what types
+    **{"identity": dict, "seed": int, "budget": dict, "spans": list, "cpu_s": (int, float), "arrays": list},
+    **{"machine": str, "commit": (str, type(None))},
+}
+OF_AGENT = ("returns", "objective", "probe")
+SCORED = {"agents": list, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
+
+
+def broken(found: dict[str, Any]) -> str:
+    """Why what a file holds cannot be what a job wrote; empty if it can."""
+    meta = found["meta"]
+    wanted = META | (SCORED if "agents" in meta else {})
+    right = all(isinstance(meta.get(key, ...), kind) for key, kind in wanted.items())
+    if not right or not isinstance(meta["identity"].get("method"), str):
+        return "it does not say what it was made of"
+    if not all(isinstance(amount, int) for amount in meta["budget"].values()):
+        return "it does not say what data it used"
+    if lost := {"meta", *meta["arrays"]} ^ set(found):
+        return f"it lacks {', '.join(sorted(lost))}"
+    for name in meta.get("agents", ()):
+        returns, objective, probe = (found.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
+        if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
+            return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
+    for key, value in found.items():
+        if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
+            return f"{key} holds NaN or infinity"
+    return ""
 
 
 def read(file: Path) -> dict[str, Any] | None:
@@ -117,7 +139,7 @@ def read(file: Path) -> dict[str, Any] | None:
         with np.load(file, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
         meta = json.loads(str(arrays["meta"]))
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile, zlib.error, NotImplementedError):
+    except Exception:  # damaged, which shows in many ways
         return None
     return {**arrays, "meta": meta} if isinstance(meta, dict) else None
 
@@ -279,7 +301,7 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
         for seed, job in sorted(shown.items())
     ]
-    run_jobs([job for job in first if not job.file(job.seeds[0]).exists()], label, engine)
+    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine)
     run_jobs(parts, label, engine)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()
@@ -302,8 +324,15 @@ def left_in(folder: Path) -> Finished:
     found = []
     for file in sorted(folder.glob("*-*.npz")):
         data = read(file)
-        if data is not None and set(data["meta"]) >= REQUIRED and "agents" in data["meta"]:
-            found.append((str(data["meta"]["identity"]["method"]), int(data["meta"]["seed"]), data))
+        if data is None or "agents" not in data["meta"]:
+            continue
+        why, meta = broken(data), data["meta"]
+        if not why and file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
+            why = f"it is of {name}"
+        if why:
+            print(f"{file.name} is left out: {why}")
+        else:
+            found.append((meta["identity"]["method"], meta["seed"], data))
     return found
 
 
@@ -326,20 +355,18 @@ def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]
 
 def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     """Make the output folder, or see that what it holds can be gone on with."""
-    check_folder(folder)
-    check_folder(folder / "jobs")
+    for place in (folder, folder / "jobs"):
+        check_folder(place)
+        sweep(place)
     file = folder / "settings.json"
     if not file.exists():
         if any((folder / "jobs").iterdir()):
             raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
-        write_json(file, settings)
+        write_sealed(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
     else:
-        try:
-            before = json.loads(file.read_text())
-        except ValueError:
-            raise envs.InputError(f"{file} is damaged; give another --out") from None
+        before = read_sealed(file)
         now = json.loads(json.dumps(settings))
         if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
             raise envs.InputError(f"{folder} holds a run with another {differ[0]}; give another --out, or remove it")

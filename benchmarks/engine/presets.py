@@ -16,6 +16,8 @@ from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 
+MOST = 1e9  # of any amount
+
 
 @dataclass(frozen=True)
 class Preset:
@@ -197,6 +199,6 @@ def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
     right = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
     least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not right or (number and not least <= value < float("inf")):
+    if not right or (number and not least <= value < MOST):
         raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
     return value

@@ -17,6 +17,7 @@ from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.pool import Finished, by_method
 from deconfounded.benchmarks.output.report import COLOURS
 from deconfounded.deconf.exact import ExactAgent
+from deconfounded.envs.files import save_figure
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.demos import Agent, ExpertAgent, run_trials
@@ -47,7 +48,7 @@ def figure_2(task: envs.Task, file: Path, rolled: int = 5) -> None:
         panel.imshow(shifted, cmap=colours, vmin=-0.5, vmax=4.5, aspect="auto", interpolation="nearest")
         panel.set(title=name, yticks=[])
     panels[-1].set(xlabel="step")
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 
@@ -83,5 +84,5 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
         panel.set(xlabel="share of training")
     panels[3].set(ylabel="best-arm pulls of 100")
     figure.legend(*panels[1].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=8)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)

@@ -175,6 +175,19 @@ def _nats(certificate: dict[str, Any]) -> list[str]:
     return [f"{value:,.2f}" if value < 10 else f"{value:,.0f}" for value in told]
 
 
+def check_certificate(file: Path, task: envs.Task) -> None:
+    """Raises InputError for a file that is no certificate of the task, as pages show it."""
+    try:
+        found = json.loads(file.read_bytes())
+        numbers = [check["measured"] for check in found["checks"].values()] + found["conditional"]["score"]
+        numbers += [found["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
+        whole = np.isfinite(np.array(numbers, float)).all() and found["verdict"] in ("passed", "failed")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        whole = False
+    if not whole or (found["task"], found["task_version"]) != (task.name, task.version):
+        raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
+
+
 def _certificate(task: envs.Task) -> str:
     found = _kept(DOCS / "certificates", task.name)
     if found is None:

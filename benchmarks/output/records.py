@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.output import score
-from deconfounded.envs.files import check_folder, write_json
+from deconfounded.envs.files import check_folder, unsealed, write_sealed
 from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]
@@ -109,18 +110,25 @@ def _no_number(text: str) -> None:
 def read(file: Path) -> Record:
     """A record from a file. Raises InputError if it is missing, damaged or none."""
     try:
-        return check(json.loads(file.read_text(), parse_constant=_no_number), str(file))
+        record = check(json.loads(file.read_bytes(), parse_constant=_no_number), str(file))
     except OSError as error:
         raise InputError(f"record {file} cannot be read: {error.strerror}") from None
-    except ValueError:
+    except InputError:
+        raise
+    except (ValueError, RecursionError):
         raise InputError(f"record {file} is not json") from None
+    try:  # a note is written by hand
+        note = {"note": record.pop("note")} if "note" in record else {}
+        return {**(unsealed(record) if "sha256" in record else record), **note}
+    except ValueError:
+        raise InputError(f"record {file} is damaged, or was changed by hand: its sha256 is of something else") from None
 
 
 def write(folder: Path, record: Record) -> None:
     """Keep a record in its place."""
     file = folder / place(record)
     check_folder(file.parent)
-    write_json(file, check(record, str(file)))
+    write_sealed(file, check(record, str(file)))
 
 
 def of_task(folder: Path, task: str, version: int, preset: str = "default") -> list[Record]:
@@ -138,6 +146,8 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         for key in COMMON:
             if record[key] != first[key]:
                 raise InputError(f"records with {key} {first[key]} and {record[key]} do not belong in one table")
+    if missing := [name for name in REFERENCES if name not in {record["method"] for record in records}]:
+        raise InputError(f"records of {first['task']} are without those of {missing[0]}, which scores need")
     by_method: dict[str, list[Record]] = {}
     for record in records:
         by_method.setdefault(record["method"], []).append(record)

@@ -21,7 +21,7 @@ from deconfounded.benchmarks.engine.jobs import CLIPPED
 from deconfounded.benchmarks.engine.pool import Finished
 from deconfounded.benchmarks.output import film, records, score
 from deconfounded.envs import outside
-from deconfounded.envs.files import write_atomically, write_json
+from deconfounded.envs.files import save_figure, write_atomically, write_json
 
 COLOURS = {
     "expert": "black",
@@ -99,7 +99,7 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 
@@ -114,7 +114,7 @@ def learning(curves: dict[str, list[dict[str, Any]]], title: str, file: Path) ->
                 panel.plot(*np.array(curve[kind]).T, color=COLOURS.get(name), lw=0.9, alpha=0.8, label=label)
         panel.set(xlabel="update", title=f"{title}: {kind} loss")
         panel.legend(frameon=False, fontsize=8)
-    figure.savefig(file, dpi=110)
+    save_figure(figure, file, 110)
     plt.close(figure)
 
 

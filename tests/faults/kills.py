@@ -1,0 +1,131 @@
+"""Kill a run at random moments and resume it: `python -m tests.faults.kills --out results/kills` (50 busy minutes)
+
+Small runs on the bandit, first undisturbed and then with all their processes killed (SIGKILL) again and again. What a
+kill finds finished must stay as it is, and what comes out in the end must be what the undisturbed run made, bit for
+bit: returns of every trial, agents, records and results, but for the time they took. Stop it as you like: it goes on
+from what is in --out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deconfounded.benchmarks.engine import pool
+from deconfounded.envs.files import write_json
+
+HERE = Path(__file__).parent
+AMOUNTS = ("seeds=2", "expert_trials=100", "explore_trials=50", "eval_trials=50", "naive.updates=120", "naive.batch=16")
+AMOUNTS += ("deconfounded.inference_updates=60", "deconfounded.imitation_updates=40", "deconfounded.final_updates=40")
+METHODS = ("blind_bc", "naive_rnn", "deconfounded")
+OF_TIME = ("cpu_s", "spans", "wall_s", "resumed", "sha256", "commit", "commits")
+
+
+def start(out: Path) -> subprocess.Popen[bytes]:
+    """The run, as the leader of a group of processes, with its output in a file beside `out`."""
+    line = [sys.executable, str(HERE / "often.py"), "--task", "bandit", "--preset", "smoke", "--out", str(out)]
+    line += ["--resume", "--methods", *METHODS, "--set", *AMOUNTS]
+    with out.with_suffix(".log").open("ab") as log:
+        return subprocess.Popen(line, stdout=log, stderr=log, start_new_session=True)
+
+
+def finished(out: Path) -> dict[str, str]:
+    """SHA-256 of each job's file that is whole."""
+    files = [file for file in sorted((out / "jobs").glob("*-*.npz")) if pool.read(file) is not None]
+    return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def timeless(data: Any) -> Any:
+    """The same without what tells of time."""
+    if isinstance(data, dict):
+        return {key: timeless(value) for key, value in data.items() if key not in OF_TIME}
+    return data
+
+
+def came_out(out: Path) -> dict[str, str]:
+    """SHA-256 of all that a finished run left, file by file, without what tells of time."""
+    found = {}
+    for file in sorted(file for file in out.rglob("*") if file.is_file()):
+        digest, name = hashlib.sha256(), str(file.relative_to(out))
+        if file.suffix == ".npz":
+            job = pool.read(file)
+            if job is None:  # demonstrations
+                digest.update(file.read_bytes())
+            else:
+                digest.update(json.dumps(timeless(job.pop("meta"))).encode())
+                for key in sorted(job):
+                    digest.update(key.encode() + np.ascontiguousarray(job[key]).tobytes())
+        elif file.suffix == ".json":
+            digest.update(json.dumps(timeless(json.loads(file.read_text()))).encode())
+        elif (
+            file.suffix in (".html", ".mp4", ".png") or name == ".lock"
+        ):  # the report tells of time, pictures are its own
+            continue
+        else:
+            digest.update(file.read_bytes())
+        found[name] = digest.hexdigest()
+    return found
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="a folder")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    whole, notes = args.out / "whole", args.out / "kills.json"
+    if not notes.exists():
+        shutil.rmtree(whole, ignore_errors=True)
+        begin = time.monotonic()
+        if start(whole).wait():
+            sys.exit(f"the undisturbed run failed: see {whole.with_suffix('.log')}")
+        write_json(notes, {"seconds": time.monotonic() - begin, "kills": [], "finished": 0, "wrong": []})
+    known, expected = json.loads(notes.read_text()), came_out(whole)
+    while len(known["kills"]) < args.kills or (args.out / f"run{known['finished']}").exists():
+        out, done = args.out / f"run{known['finished']}", len(known["kills"])
+        before, last = finished(out), done >= args.kills  # the last run may end
+        moment = float(np.random.default_rng([args.seed, done]).uniform(0, known["seconds"]))
+        run = start(out)
+        try:
+            code = run.wait(None if last else moment)
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            if run.poll() is None:
+                os.killpg(run.pid, signal.SIGKILL)
+                run.wait()
+        lost = [name for name, content in before.items() if finished(out).get(name) != content]
+        known["wrong"] += [f"{out.name}: {name} was finished, and is another now" for name in lost]
+        if code is None:
+            known["kills"].append(round(moment, 2))
+            print(
+                f"kill {done + 1} of {out.name} after {moment:.1f} s, {len(finished(out))} files finished", flush=True
+            )
+        else:
+            found = came_out(out)
+            differ = sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
+            known["wrong"] += [f"{out.name}: ended with {code}"] * bool(code)
+            known["wrong"] += [f"{out.name}: {name} is not as in the undisturbed run" for name in differ]
+            known["finished"] += 1
+            print(f"{out.name} came to its end: {len(found)} files, {len(differ)} differ", flush=True)
+        write_json(notes, known)
+    print(f"{len(known['kills'])} kills, {known['finished']} runs came to their end, {len(known['wrong'])} wrong")
+    print("\n".join(known["wrong"]))
+    sys.exit(bool(known["wrong"]))
+
+
+if __name__ == "__main__":
+    main()
