@@ -27,16 +27,16 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.benchmarks.engine.methods import DEMOS, stream
+from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
 from deconfounded.deconf.equations import belief_update
-from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.exact import ExactAgent, Grid, log_next
 from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 from deconfounded.experts.policy import Expert
 
 EPISODES = 5
@@ -68,6 +68,7 @@ class Witness(ExpertAgent):
         super().reset(rngs)
         if self.dynamics:
             self.beliefs.append(np.exp(self.log_belief))
+            self.log_belief = self.grid.drifted(self.log_belief)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
@@ -76,9 +77,8 @@ class Witness(ExpertAgent):
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        task = self.env.task
         log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
-        true = task.log_prob(self.env.state, self.env.simulator.outcome(self._state, action))
+        true = log_next(self.env.simulator, self._state, action, self.env.state, self.env.theta)
         self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
         acted = self.expert.log_prob(obs, action, self.env.theta)
         self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
@@ -136,10 +136,11 @@ def certify(
     one, zero = returns(witness).mean(), returns(RandomAgent(task.action_space)).mean()
     if one <= zero:
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
-    truth = env.theta.copy()  # the same in every run: seeds are shared
+    truth = thetas(task, trials, EPISODES, seed)  # the same in every run: seeds are shared
     done(STAGES[0])
     beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
     interventional = returns(ExactAgent(env, expert, False, grid))
+    static = returns(ExactAgent(env, expert, False, grid, static=True)) if task.drifts else None
     done(STAGES[1])
     conditional = returns(ExactAgent(env, expert, True, grid))
     done(STAGES[2])
@@ -173,8 +174,15 @@ def certify(
         "return_expert": float(one),
         "interventional": {"return": interventional.tolist(), "score": scored["int"].tolist()},
         "conditional": {"return": conditional.tolist(), "score": scored["cond"].tolist()},
+        **(
+            {}
+            if static is None
+            else {"static": {"return": static.tolist(), "score": normalise(static, zero, one).tolist()}}
+        ),
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
-        "inferability": [inferability(task, belief, witness.grid.theta, truth) for belief in beliefs],
+        "inferability": [
+            inferability(task, belief, witness.grid.theta, truth[:, i]) for i, belief in enumerate(beliefs)
+        ],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
         "grid": len(witness.grid.theta),
@@ -207,8 +215,10 @@ def picture(result: dict[str, Any], file: Path) -> None:
     left.set_xticks(range(len(ticks)), ticks)
     left.set_yticks(range(len(ticks)), ticks)
     figure.colorbar(image, ax=left)
-    for name, colour in (("interventional", "tab:green"), ("conditional", "tab:red")):
-        middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=colour, label=f"exact {name}")
+    lines = {"interventional": "tab:green", "conditional": "tab:red", "static": "tab:olive"}
+    for name in (name for name in lines if name in result):
+        label = "interventional, theta taken to stand still" if name == "static" else f"exact {name}"
+        middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=lines[name], label=label)
     middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
     middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title="exact policies")
     middle.legend(frameon=False)

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,8 @@ from deconfounded.envs import outside
 from deconfounded.envs.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
-    from deconfounded.benchmarks.engine.methods import Preset
-    from deconfounded.benchmarks.engine.pool import Finished, Job
+    from deconfounded.benchmarks.engine.pool import Engine, Finished, Job
+    from deconfounded.benchmarks.engine.presets import Preset
 
 KEPT = "what was finished is kept, and --resume goes on"
 
@@ -33,6 +34,9 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
+    made.add_argument(
+        "--cluster", metavar="ADDRESS", help="run on a Ray cluster: HOST:PORT, or auto for this machine's"
+    )
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
     return made
@@ -46,7 +50,14 @@ def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
         known = [*known, *(name for name, method in METHODS.items() if method.reference)]
     catalogue.check(args.preset, methods, args.seeds, known)
-    check_device(args.device)
+    if args.cluster is None:
+        check_device(args.device)
+    elif args.device not in ("cpu", "cuda"):
+        raise envs.InputError(
+            f"--device was {args.device}; with --cluster it must be cpu, or cuda: Ray gives a GPU a job"
+        )
+    elif not find_spec("ray"):
+        raise envs.InputError("--cluster needs Ray; `pip install deconfounded-imitation[cluster]` brings it")
     return list(dict.fromkeys(methods))
 
 
@@ -87,6 +98,17 @@ def about(
     }
 
 
+def engine(cluster: str | None) -> Engine:
+    """What jobs run on: processes of this machine, or the Ray cluster of that address."""
+    if cluster is None:
+        from deconfounded.benchmarks.engine.local import Local
+
+        return Local()
+    from deconfounded.benchmarks.engine.cluster import Cluster
+
+    return Cluster(cluster)
+
+
 def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
@@ -108,7 +130,8 @@ def run(
             for method in methods
             for guest in [catalogue.guest(method)]
         ]
-        finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}")
+        with engine(args.cluster) as where:
+            finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
     return finished, {**described, "resumed": resumed}
 
 

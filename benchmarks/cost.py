@@ -85,9 +85,9 @@ def main() -> None:
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]
         jobs = [BenchmarkJob(task.reference, settings, name, tuple(range(args.seeds)), own / "jobs") for name in wanted]
-        with commands.locked(own):
+        with commands.locked(own), commands.engine(args.cluster) as engine:
             prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), args.resume)
-            finished, _ = run_all(jobs, args.device, label)
+            finished, _ = run_all(jobs, args.device, label, engine)
         made = records.of_run(finished, args.preset, args.set, task.episodes)
         results = records.gather(made)["methods"]
         zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, stream
+from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.envs.files import check_folder
 from deconfounded.experts import dataset, policy
 from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials

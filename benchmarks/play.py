@@ -87,7 +87,7 @@ def main() -> None:
     if args.video is not None:
         import imageio.v2 as imageio
 
-        from deconfounded.benchmarks.output.report import frame_rate
+        from deconfounded.benchmarks.output.film import frame_rate
 
         imageio.mimsave(args.video, frames, fps=frame_rate(task), macro_block_size=8)
         print(f"-> {args.video}")

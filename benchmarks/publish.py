@@ -1,8 +1,8 @@
 """Keep a finished run in docs/: `python benchmarks/publish.py results/slippery_cartpole-default`
 
 Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
-certificate; makes a small GIF of the video; and brings the pages up to date that show them (`pages.py`). All of it is
-looked at before anything is changed.
+certificate; makes a small animated picture of the video; and brings the pages up to date that show them (`pages.py`).
+All of it is looked at before anything is changed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import tempfile
 from pathlib import Path
 
 import imageio.v3 as imageio
-import numpy as np
 from PIL import Image
 
 from deconfounded import envs
@@ -27,12 +26,10 @@ from deconfounded.benchmarks.output import pages, records
 from deconfounded.benchmarks.output.pages import DOCS
 
 
-def gif(video: Path, file: Path) -> None:
-    """Every third frame at half of the size."""
-    frames = imageio.imread(video)[::3]
-    size = (frames.shape[2] // 2, frames.shape[1] // 2)
-    small = np.array([Image.fromarray(frame).resize(size) for frame in frames])
-    imageio.imwrite(file, small, duration=120, loop=0)
+def clip(video: Path, file: Path) -> None:
+    """Every other frame, as an animated .webp."""
+    first, *others = (Image.fromarray(frame) for frame in imageio.imread(video)[::2])
+    first.save(file, save_all=True, append_images=others, duration=100, loop=0, quality=60, method=4)
 
 
 def keep(run: Path) -> None:
@@ -48,10 +45,8 @@ def keep(run: Path) -> None:
         raise envs.InputError(
             f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
         )
-    if results["task"] not in envs.suite():
-        raise envs.InputError(
-            f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.suite())}"
-        )
+    if results["task"] not in envs.SUITE:
+        raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
     task = envs.get(results["task"])
     if results["task_version"] != task.version:
         raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")
@@ -60,18 +55,18 @@ def keep(run: Path) -> None:
         if file.suffix == ".json":
             pages.check_certificate(file, task)
     with tempfile.TemporaryDirectory() as scratch:
-        clip = Path(scratch) / "clip.gif"
+        small = Path(scratch) / "clip.webp"
         if (run / "video.mp4").exists():
             try:
-                gif(run / "video.mp4", clip)
+                clip(run / "video.mp4", small)
             except Exception as error:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
         for record in found:
             records.write(DOCS / "records", record)
         shutil.copy(run / "adaptation.png", DOCS / f"{task.name}.png")
-        (DOCS / f"{task.name}.gif").unlink(missing_ok=True)
-        if clip.exists():
-            shutil.copy(clip, DOCS / f"{task.name}.gif")
+        (DOCS / f"{task.name}.webp").unlink(missing_ok=True)
+        if small.exists():
+            shutil.copy(small, DOCS / f"{task.name}.webp")
     for file in certificates:
         shutil.copy(file, DOCS / "certificates")
 

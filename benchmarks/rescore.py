@@ -17,7 +17,7 @@ from typing import Any
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.benchmarks.engine.methods import EVALUATION, stream
+from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
 from deconfounded.envs.files import check_file, write_json

@@ -22,8 +22,9 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import catalogue
-from deconfounded.benchmarks.engine.methods import MAKERS, Context, Preset
-from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.presets import Preset, preset
 from deconfounded.deconf.agents import Monitor
 from deconfounded.experts.demos import Agent
 

@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, nargs="+", default=SIZES, help="environments; default: 1 to 4096")
     parser.add_argument("--out", type=place, default=Path("results") / "speed", help="output folder")
     args = parser.parse_args()
-    physics = [name for name in envs.suite() if isinstance(envs.get(name), envs.MujocoTask)]
+    physics = [name for name in envs.SUITE if isinstance(envs.get(name), envs.MujocoTask)]
     tasks = [envs.get(name) for name in args.task or physics]
     for task in tasks:
         if not isinstance(task, envs.MujocoTask):

@@ -44,6 +44,7 @@ def verdict(record: records.Record, again: records.Record) -> tuple[str, list[st
 def rerun(record: records.Record, task: envs.Task, method: str, expert: str | None, device: str) -> records.Record:
     """The same seed, made again in a folder that goes away."""
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.pool import run_all
     from deconfounded.benchmarks.engine.presets import changed, preset
 
@@ -53,7 +54,7 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
         folder = Path(scratch) / "jobs"
         folder.mkdir()
         job = BenchmarkJob(task.reference, settings, method, (record["seed"],), folder, expert, record["salt"], guest)
-        finished, _ = run_all([job], device, f"{task.name}, {method}")
+        finished, _ = run_all([job], device, f"{task.name}, {method}", Local())
         every = records.of_run(finished, record["preset"], record["set"], task.episodes)
         made = [one for one in every if one["method"] == record["method"]]
     if not made:

@@ -67,16 +67,16 @@ def fit(
 ) -> MemorylessAgent:
     """Clone the expert step by step; trials are in as many equal groups as there are generators in rng.
 
-    theta [B, F]: features of each trial's theta, for the oracle, whose agent then asks `side` for those [N, F] of the
-    environments it acts in. Without both: blind BC.
+    theta [B, E, F]: features of each episode's theta, for the oracle, whose agent then asks `side` for those [N, F] of
+    the environments it acts in. Without both: blind BC.
     """
     rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     scaler = Scaler(data.obs, data.mask)
     features = scaler(data.obs)
     if theta is not None:
-        each = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], 1, -1)
-        features = torch.cat([features, each.expand(-1, -1, features.shape[2], -1)], -1)
+        each = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], *theta.shape[1:])
+        features = torch.cat([features, each.repeat_interleave(trials.mask.shape[2], 2)], -1)
     policy = ActionHead(features.shape[-1], config.width, signature, draws)
     agent = MemorylessAgent(policy, scaler, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.agents import Checkpoint, LearnedAgent, Monitor, ramp
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
+from deconfounded.deconf.drift import apart, choose_kept
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.models import LatentModel
 from deconfounded.deconf.models import new as new_model
@@ -57,6 +58,7 @@ class DeconfoundedConfig:
     # Use the explorations of all rounds; else each round's alone, with demonstrations drawn anew if there is a source.
     accumulate: bool = True
     fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
+    drifts: bool = False  # theta changes between the episodes of a trial: see deconf/drift.py
     device: str = "cpu"
     random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
 
@@ -97,6 +99,7 @@ class DeconfoundedAgent(LearnedAgent):
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
         self._latent: Tensor | None = None
+        self._memory = self.model.forget(self._memory)
 
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] to act under now."""
@@ -166,7 +169,9 @@ def fit(
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
-    shown, first = drawn(trials, rngs), explore(None, rngs)
+    each = apart if config.drifts else lambda trials: trials
+    shown, first = each(drawn(trials, rngs)), explore(None, rngs)
+    episodes, first = first.mask.shape[1], each(first)
     signature = Signature.of(shown)
     if Signature.of(first) != signature:
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
@@ -175,6 +180,8 @@ def fit(
     obs, change = scalers(seen.joined(expert))
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
     model, policy = agent.model, agent.policy  # the model is in its eval mode but for its updates
+    if config.drifts:
+        model.kept.fill_(0.5)  # while it explores
 
     inferences = config.rounds * config.inference_updates
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
@@ -198,10 +205,10 @@ def fit(
     for i in range(begin, config.rounds):
         if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
-            new = Batch.of(explore(explorer, rngs), seeds, device)
+            new = Batch.of(each(explore(explorer, rngs)), seeds, device)
             seen = seen.joined(new) if config.accumulate else new
             if not config.accumulate:
-                expert = Batch.of(drawn(trials, rngs), seeds, device)
+                expert = Batch.of(each(drawn(trials, rngs)), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
             beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
@@ -216,12 +223,14 @@ def fit(
         for _ in range(config.imitation_updates):
             imitate(done, imitation)
             done += 1
-        fresh = None if shown is trials else expert.tensors
+        fresh = None if isinstance(trials, Trials) else expert.tensors
         checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=seen.tensors, expert=fresh)
     final = Adam([policy], config.imitation_rate, config.final_updates)
     for _ in range(config.final_updates):
         imitate(done, final)
         done += 1
+    if config.drifts:
+        choose_kept(model, seen[:, -(len(first) // seeds) :], episodes, draws)
     return agent
 
 

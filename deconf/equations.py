@@ -2,7 +2,7 @@
 
 theta: hidden latent; theta_hat: learned latent; tau_:t = (s_0, a_0, ..., s_t): history. K counts values of theta.
 Arrays and tensors may have more axes in front; losses average over the last one, where `mask` is 1. Eq. (4) is
-the bandit itself: envs/bandit.py.
+the bandit itself: envs/tasks/bandit.py.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from deconfounded.deconf.equations import belief_update
 from deconfounded.envs import BatchEnv, MujocoTask
 from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Simulator
 from deconfounded.experts.demos import Agent
 from deconfounded.experts.policy import Expert, sample_rows
 
@@ -22,11 +23,31 @@ LEFT_OUT = 1e-4  # of the mass: a value that has less is not simulated
 AT_LEAST = 2
 
 
+def log_next(
+    simulator: Simulator,
+    state: Array,
+    action: Array,
+    next_state: Array,
+    theta: Array,
+    rows: NDArray[np.int64] | None = None,
+) -> Array:
+    """log p(s' | s, a, theta) [M], of its physics and of its readings; but for what is the same for every theta.
+
+    state, next_state [M, S], action [M, A], theta [M, L]; rows [M]: the simulator's environment of that theta.
+    """
+    task = simulator.task
+    told = task.log_sense(next_state, theta)
+    if task.moves_state:
+        told = told + task.log_prob(next_state, simulator.outcome(state, action, rows))
+    return told
+
+
 class Grid:
     """K equally likely thetas (`Task.theta_grid`), and what one transition of each of N environments says of them."""
 
     def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
         self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k)
+        self._next = env.task.transition(k) if env.task.drifts else None
         self._simulator = env.task.simulator(len(self.theta))
         for i, theta in enumerate(self.theta):
             self._simulator.set_theta(i, theta)
@@ -36,6 +57,12 @@ class Grid:
     def prior(self, n: int) -> Array:
         """Log-belief [N, K] before any evidence."""
         return np.full((n, len(self.theta)), -np.log(len(self.theta)))
+
+    def drifted(self, log_belief: Array) -> Array:
+        """The log-belief [N, K] of the next episode's theta: that of a theta which walks, or else the same."""
+        if self._next is None:
+            return log_belief
+        return np.log(np.exp(log_belief) @ self._next + 1e-300)
 
     def log_dynamics(self, state: Array, action: Array, next_state: Array, log_belief: Array | None = None) -> Array:
         """log p(s' | s, a, theta) [N, K]; state, next_state [N, S], action [N, A].
@@ -49,13 +76,14 @@ class Grid:
         """
         n, k = len(state), len(self.theta)
         wanted = np.ones((n, k), bool)
-        if log_belief is not None and isinstance(self.env.task, MujocoTask) and k > AT_LEAST:
+        simulated = isinstance(self.env.task, MujocoTask) and self.env.task.moves_state
+        if log_belief is not None and simulated and k > AT_LEAST:
             wanted = log_belief >= np.log(LEFT_OUT)
             np.put_along_axis(wanted, np.argpartition(log_belief, -AT_LEAST)[:, -AT_LEAST:], True, -1)
         row, value = np.nonzero(wanted)
-        outcome = self._simulator.outcome(state[row], action[row], value)
         found = np.zeros((n, k))
-        found[row, value] = self.env.task.log_prob(next_state[row], outcome)
+        theta = self.theta[value]
+        found[row, value] = log_next(self._simulator, state[row], action[row], next_state[row], theta, value)
         if (some := ~wanted.all(-1)).any():
             nearest = np.where(wanted[some, None], self._distance, np.inf).argmin(-1)
             found[some] = np.take_along_axis(found[some], nearest, -1)
@@ -72,18 +100,22 @@ class ExactAgent(Agent):
     """Samples theta from the grid posterior every step, and acts as the expert of that theta.
 
     conditional: count the expert's own probability of the actions taken as evidence too, Eq. (3): the causal delusion.
-    Reads the environment's state, never its theta.
+    static: take theta to be the same in all episodes, even where it drifts. Reads the environment's state, never its
+    theta.
     """
 
-    def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, k: int = 21) -> None:
-        self.env, self.expert, self.conditional = env, expert, conditional
+    def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, k: int = 21, static: bool = False) -> None:
+        self.env, self.expert, self.conditional, self.static = env, expert, conditional, static
         self.grid = Grid(env, expert, k)
 
     def begin(self, n: int) -> None:
-        self.log_belief = self.grid.prior(n)
+        self.log_belief, self._first = self.grid.prior(n), True
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
+        if not (self._first or self.static):
+            self.log_belief = self.grid.drifted(self.log_belief)
+        self._first = False
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state

@@ -69,7 +69,7 @@ class Given:
 
     @property
     def theta(self) -> NDArray[np.float64]:
-        """The encoded theta [B, F] of each demonstration, about unit size."""
+        """The encoded theta [B, E, F] of each demonstration's episodes, about unit size."""
         return self._ask("theta")
 
     def explore(self, agent: Agent | None = None, trials: int | None = None) -> Trials:

@@ -16,19 +16,31 @@ from torch.nn import functional as F
 from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief
 from deconfounded.deconf.data import Batch, Draws, Signature, take
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
-from deconfounded.deconf.nets import Adam, DynamicsHead, Inputs, Scaler, sample_index
+from deconfounded.deconf.nets import Adam, DynamicsHead, Inputs, Scaler, per_seed, sample_index
 from deconfounded.envs.task import InputError
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 
 
 class LatentModel(nn.Module, ABC):
-    """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat."""
+    """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
+
+    `kept` [S] is the share of a memory that is left when an episode ends: 1, but where theta drifts.
+    """
 
     kind: str
     latent: int
     width: int
     inputs: Inputs
+    kept: Tensor
+
+    def __init__(self, draws: Draws) -> None:
+        super().__init__()
+        self.register_buffer("kept", torch.ones(len(draws), device=draws.device))
+
+    def forget(self, memory: Tensor) -> Tensor:
+        """The memory [S, N, M] with which the next episode of a trial begins."""
+        return torch.lerp(self.start(memory.shape[1]), memory, per_seed(self.kept[:, None], memory))
 
     @abstractmethod
     def start(self, n: int) -> Tensor:
@@ -55,6 +67,10 @@ class LatentModel(nn.Module, ABC):
         """What the belief says in one point: its mean, or its probabilities; for probes."""
 
     @abstractmethod
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        """log p_psi(s' | s, a, theta_hat) [S, N] of a step (no time axis), under what the memory [S, N, M] says."""
+
+    @abstractmethod
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         """[S], to minimise, on trials [S, B, T]; steps: how many of them to predict, None for all."""
 
@@ -76,7 +92,7 @@ class VariationalModel(LatentModel):
     def __init__(
         self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> None:
-        super().__init__()
+        super().__init__(draws)
         self.kind, self.latent, self.width = kind, latent, width
         self.encoder: Belief = BELIEFS[kind](latent, width, signature, obs, change, draws)  # type: ignore[abstract]
         self.inputs = self.encoder.inputs
@@ -100,6 +116,10 @@ class VariationalModel(LatentModel):
 
     def point(self, belief: Tensor) -> Tensor:
         return belief.chunk(2, -1)[0]
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        theta_hat = self.sample(self.belief(memory), draws)
+        return self.dynamics.log_prob(step.obs, step.action, step.next_obs, theta_hat)[..., 0]
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         index = batch.draw_steps(steps, draws)
@@ -127,7 +147,7 @@ class DiscreteModel(LatentModel):
     def __init__(
         self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> None:
-        super().__init__()
+        super().__init__(draws)
         self.latent, self.width, self.inputs = latent, width, Inputs(signature, obs)
         self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
 
@@ -153,6 +173,12 @@ class DiscreteModel(LatentModel):
 
     def point(self, belief: Tensor) -> Tensor:
         return belief
+
+    def forget(self, memory: Tensor) -> Tensor:
+        return super().forget(memory).log_softmax(-1)
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        return torch.logsumexp(memory + self._evidence(step), -1)
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         """The mean over histories of n = 1, 2, 4, ... steps: a trial of T is dealt, step by step, into T / n of them.

@@ -16,6 +16,7 @@ from torch import Tensor
 from deconfounded.deconf.agents import Monitor, ramp
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take
 from deconfounded.deconf.deconfounded import DeconfoundedAgent, final_belief
+from deconfounded.deconf.drift import apart, choose_kept
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, Adam, scalers
@@ -42,12 +43,14 @@ class OfflineConfig:
     synthetic: int = 128  # trials a synthesis
     random_share: float = 0.1  # of synthetic actions that are uniformly random
     learning_rate: float = 1e-3
+    drifts: bool = False  # theta changes between the episodes of a trial: see deconf/drift.py
     device: str = "cpu"
 
 
 def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
-    rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
+    rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
+    trials = apart(trials) if config.drifts else trials
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
@@ -87,6 +90,8 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
+    if config.drifts:
+        choose_kept(online, data[:, : 64 * each], each, draws)
     return agent
 
 

@@ -20,6 +20,7 @@ COMMANDS = {
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
     "report": ("benchmarks.report", "make a run's report again, without training"),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
+    "table": ("benchmarks.table", "make the records that are missing"),
     "publish": ("benchmarks.publish", "keep a finished run in docs/"),
     "pages": ("benchmarks.pages", "write the pages of docs/ anew"),
     "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),

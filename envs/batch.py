@@ -72,8 +72,8 @@ class BatchEnv:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
         options: `keep_theta` True, or a mask [N], goes on with the theta at hand (the next episode of a trial), the
-        others draw a new one; `theta` [L] or [N, L] forces one. Neither moves the start or the noise. Raises
-        InputError for a theta out of bounds and for a mask that is none.
+        others draw a new one; `theta` [L] or [N, L] forces one. Neither moves the start or the noise. A theta that
+        drifts is kept but for its drift. Raises InputError for a theta out of bounds and for a mask that is none.
         """
         options = {} if options is None else options
         if not isinstance(options, dict):
@@ -93,10 +93,15 @@ class BatchEnv:
         rows = self._every if where is None else np.flatnonzero(where)
         theta_rng, start_rng, noise_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
         new = ~keep[rows]
-        if new.any():
-            drawing = Streams([rng for rng, draws in zip(theta_rng, new, strict=True) if draws])
-            theta = self.task.sample_theta(drawing) if forced is None else forced[rows]
-            for i, row in zip(rows[new].tolist(), theta, strict=True):
+        for which, is_new in ((new, True), (~new, False)):
+            if not which.any() or not (is_new or self.task.drifts):
+                continue
+            drawing = Streams([rng for rng, draws in zip(theta_rng, which, strict=True) if draws])
+            if not is_new:
+                theta = self.task.drifted(self.theta[rows[which]], drawing)
+            else:
+                theta = self.task.sample_theta(drawing) if forced is None else forced[rows]
+            for i, row in zip(rows[which].tolist(), theta, strict=True):
                 self.simulator.set_theta(i, row)
         start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
         if first:
@@ -144,6 +149,7 @@ class BatchEnv:
         on = slice(None) if rows is None else rows
         before, taken, noise = self.state[on], checked[on], self._noise[self._every[on], self._steps[on]]
         after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
+        after = task.sense(after, self.theta[on], noise)
         reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)
         reward[on] = task.reward(before, taken, after, self.theta[on])
         terminated[on] = task.terminated(after)

@@ -20,7 +20,7 @@ from deconfounded.envs import contract_physics, contract_protocols
 from deconfounded.envs.adapters import GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.probe import actions, far_thetas, refused, require, same, streams
+from deconfounded.envs.probe import Skipped, actions, far_thetas, refused, require, same, streams
 from deconfounded.envs.task import Task
 
 
@@ -70,13 +70,18 @@ def privileged_view(task: Task) -> None:
 
 
 def keep_theta(task: Task) -> None:
-    """A trial keeps its theta and gets a new start or noise; the next trial gets a new theta."""
+    """A trial keeps its theta, but for what drifts, and gets a new start or noise; the next trial gets a new theta."""
     batch = BatchEnv(task, 16)
     batch.reset(1)
     theta = batch.theta.copy()
     first = [batch.step(action)[0] for action in actions(task, 16, 3)]
     batch.reset(options={"keep_theta": True})
-    same(batch.theta, theta, "thetas before and after a reset with keep_theta")
+    for i, latent in enumerate(task.latents):
+        before, after = theta[:, i], batch.theta[:, i]
+        if latent.drift:
+            require((before != after).all(), f"{latent.name}, which drifts, stood still from one episode to the next")
+        else:
+            same(after, before, f"{latent.name} before and after a reset with keep_theta")
     again = [batch.step(action)[0] for action in actions(task, 16, 3)]
     require((np.array(first) != np.array(again)).any(), "two episodes of a trial are the same: neither start nor noise")
     batch.reset()
@@ -84,8 +89,13 @@ def keep_theta(task: Task) -> None:
 
 
 def theta_follows_its_distribution(task: Task) -> None:
-    """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003)."""
+    """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003).
+
+    So is that of what they drift to.
+    """
     draws = task.sample_theta(streams(*range(2000)))
+    if task.drifts:
+        draws = task.drifted(draws, streams(*range(2000, 4000)))
     for i, latent in enumerate(task.latents):
         if latent.distribution == "categorical":
             counts = (draws[:, i, None] == latent.grid(0)).mean(0)
@@ -226,9 +236,38 @@ def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     require(ratio.std() > 0, f"log_prob of {task.name} is the same for two outcomes that differ")
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
         fall = task.log_prob(p, p) - task.log_prob(drawn, p)
-        right, bound = noise.shape[1] / 2, 4 * fall.std() / np.sqrt(m)
+        right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
         found = f"log_prob of {task.name} falls by {fall.mean():.3f} under its own noise; it must be {right:g}"
         require(abs(fall.mean() - right) < bound, found)
+
+
+def log_sense_is_the_density_of_the_readings(task: Task) -> None:
+    """As above, of what sensors read in one state under one theta, and under another near by; 4,000 draws.
+
+    A task whose theta moves no state must do so, and have readings that tell.
+    """
+    batch, m = BatchEnv(task, 1), 4000
+    thetas = task.theta_grid(9)[[0, -1]]
+    batch.reset(0)
+    action = actions(task, 1, 1)[0]
+    outcomes = task.outcome(np.repeat(batch.state, 2, 0), np.repeat(action, 2, 0), thetas)
+    if not task.moves_state:
+        same(outcomes[1], outcomes[0], f"outcomes of thetas {thetas.tolist()}, which is said to move no state,")
+    state = np.repeat(outcomes[:1], m, 0)
+    noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
+    drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), noise)
+    if (drawn == state).all():
+        require(task.moves_state, f"theta of {task.name} moves no state, and its sensors read nothing")
+        raise Skipped("this task has no sensors of theta")
+    near = thetas[1]
+    for _ in range(30):  # so near that the ratio's variance is small
+        fall = task.log_sense(drawn, thetas[0]) - task.log_sense(drawn, near)
+        if fall.mean() < 0.3:
+            break
+        near = thetas[0] + (near - thetas[0]) / 2
+    off, error = abs(np.exp(-fall).mean() - 1), np.exp(-fall).std() / np.sqrt(m)
+    require(off < 4 * error + 1e-9, f"log_sense of {task.name}: the mean ratio of densities is {1 + off:.4f}, not 1")
+    require(fall.std() > 0, f"log_sense of {task.name} is the same for two thetas")
 
 
 CONTRACT: dict[str, Callable[[Task], None]] = {
@@ -239,6 +278,7 @@ CONTRACT: dict[str, Callable[[Task], None]] = {
         *(any_batch_size, seed_streams, seed_kinds, forced_theta_moves_nothing_else),
         *(starts_vary_and_nothing_is_constant, observations_share_no_memory),
         *(theta_out_of_bounds, wrong_actions, reset_options, log_prob_is_the_density_of_the_noise),
+        log_sense_is_the_density_of_the_readings,
         *contract_physics.CHECKS,
     )
 }

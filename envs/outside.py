@@ -6,6 +6,7 @@ import hashlib
 import importlib
 import importlib.util
 import inspect
+import os
 import sys
 import traceback
 from pathlib import Path
@@ -13,6 +14,8 @@ from types import ModuleType
 from typing import Any
 
 from deconfounded.envs.task import InputError
+
+SENT = "DECONFOUNDED_OUTSIDE"  # in the environment of a worker elsewhere: the folder that such files were sent to
 
 
 def is_outside(reference: str) -> bool:
@@ -29,10 +32,10 @@ def find(kind: str, reference: str) -> Any:
     where, _, name = reference.rpartition(":")
     if not where or not name:
         raise InputError(f"{kind} was {reference!r}; from outside it must be path/file.py:name or package.module:name")
-    if where.endswith(".py") and not Path(where).is_file():
+    if where.endswith(".py") and not here(Path(where)).is_file():
         raise InputError(f"{kind} {reference!r}: there is no file {where}")
     try:
-        module = _run(Path(where)) if where.endswith(".py") else importlib.import_module(where)
+        module = _run(here(Path(where))) if where.endswith(".py") else importlib.import_module(where)
     except InputError:
         raise
     except (Exception, SystemExit) as error:
@@ -64,9 +67,15 @@ def file(reference: str) -> Path | None:
     """Where it is defined, without running it; None for a module that has no file."""
     where, _, _ = reference.rpartition(":")
     if where.endswith(".py"):
-        return Path(where).resolve()
+        return here(Path(where)).resolve()
     spec = importlib.util.find_spec(where)
     return Path(spec.origin).resolve() if spec is not None and spec.origin else None
+
+
+def here(path: Path) -> Path:
+    """Where a file is on this machine: where it always was, or where a cluster sent it."""
+    sent = Path(os.environ[SENT], *path.parts[1:]) if SENT in os.environ and path.is_absolute() else path
+    return sent if sent.exists() else path
 
 
 def source(of: Any) -> Path | None:

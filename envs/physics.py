@@ -43,6 +43,15 @@ class Edit(Protocol):
     def slope(self, angle: float) -> None:
         """Turn gravity about the y axis, so that the world rises along x; rad."""
 
+    def wind(self, x: float, y: float, z: float) -> None:
+        """Velocity of the medium, which the MJCF gives a density or a viscosity; m/s."""
+
+    def joint_stiffness(self, name: str, value: float) -> None:
+        """Spring of a hinge or slide joint; N m/rad or N/m."""
+
+    def actuator_gain(self, name: str, scale: float) -> None:
+        """Scale what a motor makes of its control; of -1, it is wired the wrong way round."""
+
     def tendon_friction(self, name: str, value: float) -> None:
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
 
@@ -93,6 +102,15 @@ class ModelEdit:
     def slope(self, angle: float) -> None:
         self.model.opt.gravity[:] = _uphill(self._nominal.opt.gravity, angle)
 
+    def wind(self, x: float, y: float, z: float) -> None:
+        self.model.opt.wind[:] = x, y, z
+
+    def joint_stiffness(self, name: str, value: float) -> None:
+        self.model.joint(name).stiffness[0] = value
+
+    def actuator_gain(self, name: str, scale: float) -> None:
+        self.model.actuator(name).gainprm[0] = self._nominal.actuator(name).gainprm[0] * scale
+
     def tendon_friction(self, name: str, value: float) -> None:
         self.model.tendon_frictionloss[self.model.tendon(name).id] = value
 
@@ -128,6 +146,15 @@ class SpecEdit:
     def slope(self, angle: float) -> None:
         self.spec.option.gravity = _uphill(self.spec.option.gravity, angle)
 
+    def wind(self, x: float, y: float, z: float) -> None:
+        self.spec.option.wind = x, y, z
+
+    def joint_stiffness(self, name: str, value: float) -> None:
+        self.spec.joint(name).stiffness[0] = value
+
+    def actuator_gain(self, name: str, scale: float) -> None:
+        self.spec.actuator(name).gainprm[0] *= scale
+
     def tendon_friction(self, name: str, value: float) -> None:
         self.spec.tendon(name).frictionloss = value
 
@@ -154,15 +181,17 @@ class Physics(Simulator):
         self._edits[i].finish()
 
     def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
-        shape = (len(state), self._mujoco_task.substeps, state.shape[1])
+        width, physical = state.shape[1], state.shape[1] - self._mujoco_task.readings
+        shape = (len(state), self._mujoco_task.substeps, physical)
         if self._buffer.size < (size := int(np.prod(shape))):  # kept: large arrays are slow to get anew
             self._buffer = np.empty(size)
-        return self._roll(state, action[:, None], rows, self._buffer[:size].reshape(shape))[:, -1].copy()
+        rolled = self._roll(state[:, :physical], action[:, None], rows, self._buffer[:size].reshape(shape))[:, -1]
+        return np.pad(rolled, ((0, 0), (0, width - physical))) if width > physical else rolled.copy()
 
     def rollout(self, state: Array, action: Array) -> Array:
-        """Open loop: states [n, S] and actions [n, T, A] -> noise-free states [n, T * substeps, S]."""
-        steps = action.shape[1] * self._mujoco_task.substeps
-        return self._roll(state, action, None, np.empty((len(state), steps, state.shape[1])))
+        """Open loop: states [n, S] and actions [n, T, A] -> noise-free states [n, T * substeps, S - readings]."""
+        steps, physical = action.shape[1] * self._mujoco_task.substeps, state.shape[1] - self._mujoco_task.readings
+        return self._roll(state[:, :physical], action, None, np.empty((len(state), steps, physical)))
 
     def _roll(self, state: Array, action: Array, rows: NDArray[np.int64] | None, out: Array) -> Array:
         n, steps, _ = out.shape
@@ -192,11 +221,13 @@ class Physics(Simulator):
 class MujocoTask(Task):
     """A task whose outcome is MuJoCo's next state: x' = f(x, a, theta) + w, w ~ N(0, diag sigma^2), a control step.
 
-    The state [S] is MuJoCo's full physics state (time, qpos, qvel, act). Joints are read by name.
+    The state [S] is MuJoCo's full physics state (time, qpos, qvel, act), and after it what the task's sensors read.
+    Joints are read by name.
     """
 
     substeps: ClassVar[int] = 2  # physics steps a control step
     process_noise: ClassVar[dict[str, tuple[float, ...]]]  # joint -> std of (position, velocity) a control step
+    readings: ClassVar[int] = 0  # columns, at the end of the state, that `sense` fills with what its noise gives them
     # Of ball and free joints, see envs/noise.py. A coordinate without noise counts as no evidence: it must be of no
     # consequence, or one that theta does not move.
 
@@ -247,7 +278,8 @@ class MujocoTask(Task):
         pairs = [zip(self._address(joint), pair, strict=True) for joint, pair in joints.items()]
         values = [(at, np.asarray(value, float)) for pair in pairs for at, value in pair]
         rows = (value.shape if isinstance(at, int) else value.shape[:-1] for at, value in values)
-        state = np.zeros((*np.broadcast_shapes((1,), *rows), mujoco.mj_stateSize(self.model, STATE.value)))
+        width = mujoco.mj_stateSize(self.model, STATE.value) + self.readings
+        state = np.zeros((*np.broadcast_shapes((1,), *rows), width))
         state[:, 1 : 1 + self.model.nq] = self.model.qpos0
         for at, value in values:
             state[:, at] = value
@@ -279,7 +311,8 @@ class MujocoTask(Task):
         return render.Painter(spec.compile())
 
     def sample_noise(self, rng: Streams) -> Array:
-        return rng.standard_normal((rng.groups, self.horizon, self.noise.size))
+        """Unit normal: of the process first, then a column for each reading."""
+        return rng.standard_normal((rng.groups, self.horizon, self.noise.size + self.readings))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
         physics = self.simulator(len(state))

@@ -49,11 +49,6 @@ def _where(cls: type[Task]) -> str:
     return str(outside.source(cls) or cls.__module__)
 
 
-def suite() -> list[str]:
-    """The tasks that are ours."""
-    return [name for name, cls in TASKS.items() if cls.__module__.startswith(__package__)]
-
-
 def names() -> list[str]:
     """The tasks that are registered, and those that installed packages offer as entry points."""
     return list(dict.fromkeys([*TASKS, *(point.name for point in entry_points(group=GROUP))]))

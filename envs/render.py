@@ -91,8 +91,9 @@ class Painter:
         atexit.register(weakref.finalize(self, _close, self._renderer))
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
-        """Full physics state [S] -> picture [H, W, 3]."""
-        mujoco.mj_setState(self._model, self._data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+        """State [S], whatever follows the full physics state in it -> picture [H, W, 3]."""
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+        mujoco.mj_setState(self._model, self._data, state[: mujoco.mj_stateSize(self._model, kind)], kind)
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, "view")
         return self._renderer.render()

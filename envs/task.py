@@ -6,8 +6,9 @@ Shape letters, used in the whole project:
     B trials         E episodes      T steps         K grid values of theta
     Z noise draws a step             D dimensions of a learned latent
 
-A *trial* is E episodes in a row under one hidden theta. A discrete action is one integer column, so that
-actions are always [N, A]. A task holds no state of its own: states, thetas and random streams are passed in.
+A *trial* is E episodes in a row under one hidden theta, or under one that drifts from each to the next. A discrete
+action is one integer column, so that actions are always [N, A]. A task holds no state of its own: states, thetas and
+random streams are passed in.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from deconfounded.envs.streams import Array, Streams
 
@@ -36,7 +38,9 @@ class Latent:
     """One hidden physical parameter and its distribution p(theta).
 
     distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
-    low..high, equally likely. Raises InputError for bounds that do not fit it.
+    low..high, equally likely. drift: where it is not 0, the latent's quantile u = cdf(theta) walks at random from each
+    episode of a trial to the next: u' = u + N(0, drift^2), reflected at 0 and 1, so that every episode's theta has the
+    distribution. Raises InputError for bounds that do not fit the distribution, and for a drift that is none.
     """
 
     name: str
@@ -44,6 +48,7 @@ class Latent:
     low: float
     high: float
     distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
+    drift: float = 0.0
 
     def __post_init__(self) -> None:
         rules = {
@@ -58,6 +63,10 @@ class Latent:
         right, holds = rules[self.distribution]
         if not (holds and -np.inf < self.low < self.high < np.inf):
             raise InputError(f"{self.name} was {self.low:g} to {self.high:g}, {self.distribution}; it must be {right}")
+        if not 0 <= self.drift <= 1 or (self.drift and self.distribution == "categorical"):
+            raise InputError(
+                f"drift of {self.name} was {self.drift:g}; it must be from 0 to 1, and 0 of a categorical latent"
+            )
 
     def ppf(self, u: Array) -> Array:
         """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""
@@ -86,6 +95,25 @@ class Latent:
         if self.distribution == "categorical":
             return (np.asarray(theta)[..., None] == self.grid(0)).astype(float)
         return (2 * self.cdf(np.asarray(theta)) - 1)[..., None]
+
+    def drifted(self, theta: Array, normal: Array) -> Array:
+        """theta [...] of the next episode of a trial, by standard normal draws of the same shape."""
+        u = np.abs(self.cdf(theta) + self.drift * normal) % 2  # unfolded, the reflected walk is periodic
+        return self.ppf(np.minimum(u, 2 - u)).clip(self.low, self.high)
+
+    def transition(self, k: int) -> Array:
+        """P(value j in the next episode | value i) [K, K] of `grid(k)`, from each value to the bins of all.
+
+        The walk's density is a sum over its images, u' + 2 m and -u' + 2 m. Rows and columns sum to one.
+        """
+        k = self.features if self.distribution == "categorical" else k
+        if not self.drift:
+            return np.eye(k)
+        u, edges = (np.arange(k) + 0.5) / k, np.arange(k + 1) / k
+        images = 2.0 * np.arange(-3, 4)[:, None, None]
+        ahead = ndtr((edges + images - u[:, None]) / self.drift)
+        behind = ndtr((images - edges - u[:, None]) / self.drift)
+        return np.diff(ahead, axis=-1).sum(0) - np.diff(behind, axis=-1).sum(0)
 
     @property
     def features(self) -> int:
@@ -121,7 +149,8 @@ class Task(ABC):
     """A family of MDPs M_theta with theta ~ p(theta), an observation that hides theta, and a reward for scoring.
 
     Transitions have two parts: a deterministic *outcome* (the next state of a physics engine, or the probability
-    of a pay-out) and noise that acts on it, so that p(s'|s, a, theta) has a closed form.
+    of a pay-out) and noise that acts on it, so that p(s'|s, a, theta) has a closed form. Sensors may tell of theta,
+    too: their readings are part of the state, and have a likelihood of their own (`sense`, `log_sense`).
     """
 
     name: ClassVar[str]
@@ -132,6 +161,7 @@ class Task(ABC):
     horizon: ClassVar[int]
     episodes: ClassVar[int] = 5  # of one trial
     control_dt: ClassVar[float] = 1.0  # s
+    moves_state: ClassVar[bool] = True  # False: theta acts through reward and readings alone, not through outcomes
     expert_noise: ClassVar[float] = 0.0  # std of the expert's action around its mean; the action range is [-1, 1]
     action_space: ClassVar[spaces.Box | spaces.Discrete]
     observation: ClassVar[dict[str, tuple[float, float]]]  # name -> bounds, in the order of `observe`
@@ -155,6 +185,17 @@ class Task(ABC):
     @abstractmethod
     def log_prob(self, next_state: Array, outcome: Array) -> Array:
         """log p(s'|s, a, theta) [...] of next states [..., S] whose noise-free outcome is given."""
+
+    def sense(self, state: Array, theta: Array, noise: Array) -> Array:
+        """State [N, S] after noise, theta [N, L], unit noise [N, Z] -> the state with what its sensors read.
+
+        By default there are none. At the start of an episode nothing is read yet, as `init_state` knows no theta.
+        """
+        return state
+
+    def log_sense(self, state: Array, theta: Array) -> Array:
+        """log p [...] of the readings in states [..., S], given what else is in them and theta [..., L]."""
+        return np.zeros(np.broadcast_shapes(state.shape[:-1], theta.shape[:-1]))
 
     @abstractmethod
     def observe(self, state: Array) -> Array:
@@ -202,14 +243,33 @@ class Task(ABC):
         u = rng.random((rng.groups, len(self.latents)))
         return np.stack([lat.ppf(u[:, i]) for i, lat in enumerate(self.latents)], -1)
 
+    @property
+    def drifts(self) -> bool:
+        """Whether theta changes between the episodes of a trial."""
+        return any(lat.drift for lat in self.latents)
+
+    def drifted(self, theta: Array, rng: Streams) -> Array:
+        """theta [N, L] of a trial's next episode; rng has a generator for each environment."""
+        normal = rng.standard_normal((rng.groups, len(self.latents)))
+        return np.stack([lat.drifted(theta[:, i], normal[:, i]) for i, lat in enumerate(self.latents)], -1)
+
     def theta_grid(self, k: int) -> Array:
         """[K, L] equally likely thetas: k values of one latent; of L, k^(2 / (L + 1)) each, and all their combinations.
 
         Of two latents, 21 makes 7 x 7. A categorical latent has all of its values, whatever k.
         """
-        each = max(2, int(k ** (2 / (len(self.latents) + 1)))) if len(self.latents) > 1 else k
-        axes = np.meshgrid(*(lat.grid(each) for lat in self.latents), indexing="ij")
+        axes = np.meshgrid(*(lat.grid(self._each(k)) for lat in self.latents), indexing="ij")
         return np.stack([axis.ravel() for axis in axes], -1)
+
+    def _each(self, k: int) -> int:
+        return max(2, int(k ** (2 / (len(self.latents) + 1)))) if len(self.latents) > 1 else k
+
+    def transition(self, k: int) -> Array:
+        """P(theta of the next episode | of this one) [K, K] on `theta_grid(k)`."""
+        found: Array = np.ones((1, 1))
+        for lat in self.latents:
+            found = np.kron(found, lat.transition(self._each(k)))
+        return found
 
     def encode_theta(self, theta: Array) -> Array:
         """theta [..., L] -> features [..., F] of about unit size, for experts and oracles alone."""

@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
-from deconfounded.experts.demos import Agent, Trials, run_trials
+from deconfounded.experts.demos import Agent, Trials, run_trials, thetas
 
 HORIZON = "deconf_horizon"  # of the data set's metadata: T, which no episode need last
 
@@ -34,11 +34,11 @@ class _Noting(BatchEnv):
 
 
 def collect(task: Task, n: int, agent: Any, seed: int) -> tuple[Trials, Array, list[list[list[Array]]]]:
-    """n trials of an agent, made for an environment -> Trials, theta [N, L], and reward and ends of each step."""
+    """n trials of an agent, made for an environment -> Trials, theta [N, E, L], and reward and ends of each step."""
     env = _Noting(task, n)
     made: Agent = agent(env)
     trials, _ = run_trials(env, made, task.episodes, seed)
-    return trials, env.theta.copy(), env.steps
+    return trials, thetas(task, n, task.episodes, seed), env.steps
 
 
 def write(
@@ -82,7 +82,7 @@ def write(
                         infos={},
                     )
                 )
-                about.append({"trial": b, "episode": e, "theta": theta[b]})
+                about.append({"trial": b, "episode": e, "theta": theta[b, e]})
         made = minari.create_dataset_from_buffers(
             identity,
             buffers,
@@ -99,7 +99,7 @@ def write(
 
 
 def read(source: Path | str) -> tuple[Trials, Array | None]:
-    """The Trials of a data set's folder, and its thetas [B, L] if it has them: those are for scoring alone.
+    """The Trials of a data set's folder, and its thetas [B, E, L] if it has them: those are for scoring alone.
 
     Raises InputError if there is no data set, or if its episodes do not say which trial they belong to.
     """
@@ -132,8 +132,9 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
         obs[at][: n + 1], obs[at][n + 1 :] = episode.observations, episode.observations[-1]
         action[at][:n] = np.reshape(episode.actions, (n, width))
         mask[at][:n] = True
-    first = {int(one["trial"]): one.get("theta") for one in about}
-    theta = None if any(value is None for value in first.values()) else np.array([first[i] for i in range(b)])
+    told = {(int(one["trial"]), int(one["episode"])): one.get("theta") for one in about}
+    whole = all(value is not None for value in told.values())
+    theta = np.array([[told[i, j] for j in range(e)] for i in range(b)]) if whole else None
     return Trials(obs, action, mask, int(found.action_space.n) if discrete else 0), theta  # type: ignore[attr-defined]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs import BatchEnv, InputError
+from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.files import write_atomically
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.policy import Expert
@@ -176,6 +176,26 @@ class RandomAgent(Agent):
         return 2 * self._rng.random((len(obs), *self.space.shape)) - 1
 
 
+def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
+    """theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
+    env = BatchEnv(task, n)
+    env.reset(trial_seeds(n, seed))
+    found = [env.theta.copy()]
+    for _ in range(1, episodes):
+        if task.drifts:
+            env.reset(options={"keep_theta": True})
+        found.append(env.theta.copy())
+    return np.stack(found, 1)
+
+
+def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
+    """The environments' seeds for n trials. Raises InputError where several seeds do not have as many each."""
+    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(one) for one in seed]
+    if n % len(seeds):
+        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
+    return [one + i for one in seeds for i in range(n // len(seeds))]
+
+
 def run_trials(
     env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
 ) -> tuple[Trials, Array]:
@@ -185,16 +205,14 @@ def run_trials(
     after another, each of which goes as it would go alone. theta: forced [N, L], else drawn from p(theta).
     """
     task, n = env.task, env.n
-    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(one) for one in seed]
-    if n % len(seeds):
-        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
+    each = trial_seeds(n, seed)
+    seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
     action: NDArray[np.float32] | None = None
     for e in range(episodes):
         if e == 0:
-            each = [one + i for one in seeds for i in range(n // len(seeds))]
             now = env.reset(each, None if theta is None else {"theta": theta})
             agent.begin(n)
         else:

@@ -17,9 +17,9 @@ from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
 from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.physics import Edit, ModelEdit
-from deconfounded.envs.slippery_cartpole import SlipperyCartpole
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
+from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 
 
 class MissingFile(SlipperyCartpole):

@@ -24,9 +24,9 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.output import pages, records, score
 from deconfounded.envs import render
-from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.envs.task import Array
+from deconfounded.envs.tasks.cartpole import Cartpole
 from deconfounded.experts.policy import Expert
 from tests.tools import tiny_preset
 
@@ -37,6 +37,16 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, *args], cwd=ROOT, capture_output=True, text=True, env={**os.environ, **environ}, timeout=300
     )
+
+
+def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command that must end with code 2 says, in this process."""
+    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
+    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
+    with pytest.raises(SystemExit) as ended:
+        run_command(importlib.import_module(name).main)
+    assert ended.value.code == 2
+    return capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -87,12 +97,7 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
 def test_bad_input_is_one_line(
     args: tuple[str, ...], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
-    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
-    with pytest.raises(SystemExit) as ended:
-        run_command(importlib.import_module(name).main)
-    assert ended.value.code == 2
-    told = capsys.readouterr().err
+    told = refusal(args, monkeypatch, capsys)
     assert says in told
     assert len(told.strip().splitlines()) == 1
 
@@ -112,7 +117,7 @@ def test_bad_input_from_the_shell() -> None:
     assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
 
 
-def test_smoke_run_resumes(tmp_path: Path) -> None:
+def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
     out, args = tmp_path / "out", ("benchmarks/run.py", "--task", "bandit", "--preset", "smoke", "--out")
     first = command(*args, str(out), "--methods", "blind_bc", "conditional", "interventional", MUJOCO_GL="off")
@@ -130,12 +135,9 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert header == "method,seed,trial,best_arm,episode,return,score,objective"
     assert len(lines) == results["eval_trials"] * 5
 
-    again = command(*args, str(out))
-    assert again.returncode == 2
-    assert "--resume" in again.stderr
-    other = command(*args[:-2], "default", "--out", str(out), "--resume")
-    assert other.returncode == 2
-    assert "another preset" in other.stderr
+    assert "--resume" in refusal((*args, str(out)), monkeypatch, capsys)
+    other = (*args[:-2], "default", "--out", str(out), "--resume")
+    assert "another preset" in refusal(other, monkeypatch, capsys)
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
     (out / "jobs" / "random-0.npz").write_bytes(b"half a file")
@@ -148,7 +150,7 @@ def test_smoke_run_resumes(tmp_path: Path) -> None:
     assert repeated["resumed"] == 3
 
     (out / "settings.json").unlink()
-    assert "not their settings.json" in command(*args, str(out), "--resume").stderr
+    assert "not their settings.json" in refusal((*args, str(out), "--resume"), monkeypatch, capsys)
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
@@ -397,6 +399,8 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for record in shown:
         records.write(run / "records", record)
     (run / "adaptation.png").write_bytes(b"a picture")
+    (run.parent / "certificates" / "bandit.json").write_text("{}")
+    (docs / "bandit.webp").write_bytes(b"an old clip")
     certificate = run.parent / "certificates" / "bandit.json"
     certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
     (docs / "bandit.gif").write_bytes(b"an old clip")
@@ -411,7 +415,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         file.write_text(json.dumps(record))
         with pytest.raises(envs.InputError, match=says):
             publish.keep(run)
-        assert kept() == ["bandit.gif"]
+        assert kept() == ["bandit.webp"]
     file.write_text(json.dumps(shown[0]))
     (run / "video.mp4").unlink()
     for text in ("{}", "[", '{"task": "bandit"}', certificate.read_text().replace('"passed"', '"<script>"', 1)):

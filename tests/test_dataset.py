@@ -12,7 +12,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import data
-from deconfounded.benchmarks.engine.methods import DEMOS, EXPLORATION, Context, stream
+from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
 from deconfounded.deconf import naive_rnn
 from deconfounded.experts import dataset, policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
@@ -75,7 +75,7 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
 def test_the_standard_sets_are_the_same() -> None:
     """Of the bandit, which a second makes; on MuJoCo the last bits are the machine's kind's."""
     kept = json.loads((Path(__file__).parents[1] / "docs" / "data.json").read_text())
-    assert set(kept) == {f"{name}-v{envs.get(name).version}" for name in envs.suite()}
+    assert set(kept) == {f"{name}-v{envs.get(name).version}" for name in envs.SUITE}
     for kind, purpose in (("expert", DEMOS), ("random", EXPLORATION)):
         env = envs.BatchEnv(envs.get("bandit"), 256)
         expert = ExpertAgent(env, policy.load(env.task))

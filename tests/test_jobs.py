@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,33 +39,34 @@ def settings(name: str, fresh: bool) -> Any:
     )
 
 
-@pytest.mark.parametrize("share", [0.45, 0.8, 0.9])
-@pytest.mark.parametrize(
-    ("kind", "task", "method", "fresh"),
-    [
-        (BenchmarkJob, "slippery_cartpole", "deconfounded", False),
-        (BenchmarkJob, "slippery_cartpole", "naive_rnn", False),
-        (FigureJob, "bandit", "deconfounded_gru", True),
-        (FigureJob, "bandit", "naive_rnn", True),
-    ],
+KINDS = (
+    (BenchmarkJob, "slippery_cartpole", "deconfounded", False),
+    (BenchmarkJob, "slippery_cartpole", "naive_rnn", False),
+    (FigureJob, "bandit", "deconfounded_gru", True),
+    (FigureJob, "bandit", "naive_rnn", True),
 )
+
+
+@pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"{kind[0].__name__}-{kind[1]}-{kind[2]}")
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[pool.Job]:
+    """A job that ran from beginning to end; it and those that follow keep a checkpoint of each update."""
+    kind, task, method, fresh = request.param
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(paper, "POINTS", 8)
+        patch.setattr(pool, "SAVE_EVERY_S", 0.0)
+        patch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+        job: pool.Job = kind(task, settings(task, fresh), method, (0, 1), tmp_path_factory.mktemp("whole"))
+        job.run()
+        yield job
+
+
+@pytest.mark.parametrize("share", [0.45, 0.8, 0.9])
 def test_interrupted_training_goes_on(
-    kind: type[pool.Job],
-    task: str,
-    method: str,
-    fresh: bool,
-    share: float,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    whole: pool.Job, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A job that was killed and begun again writes, bit for bit, what it would have written."""
-    monkeypatch.setattr(paper, "POINTS", 8)
-    monkeypatch.setattr(pool, "SAVE_EVERY_S", 0.0)
-    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
-    whole, broken = (kind(task, settings(task, fresh), method, (0, 1), tmp_path / name) for name in ("whole", "broken"))
-    for job in (whole, broken):
-        job.folder.mkdir()
-    whole.run()
+    broken = replace(whole, folder=tmp_path / "broken")
+    broken.folder.mkdir()
 
     def unplugged(
         self: pool.JobMonitor, done: int, total: int, losses: dict[str, float], agent: Agent | None = None

@@ -12,8 +12,9 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import evaluate
-from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, EXPLORATION, MAKERS, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import dagger, deconfounded, models, naive_rnn, offline
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.cloning import CloningConfig
@@ -114,7 +115,7 @@ class TestData:
         made, _ = run_trials(env, ExpertAgent(env, context.expert), task.episodes, [stream(DEMOS, s) for s in seeds])
         np.testing.assert_array_equal(context.demonstrations.obs, made.obs)
         np.testing.assert_array_equal(context.demonstrations.action, made.action)
-        np.testing.assert_array_equal(context.demonstrated_theta, env.theta)
+        np.testing.assert_array_equal(context.demonstrated_theta, np.stack([env.theta] * task.episodes, 1))
         assert not np.array_equal(made.action[:4], made.action[4:])
 
     def test_kept_demonstrations_are_the_same(self, tmp_path: Any) -> None:
@@ -182,7 +183,7 @@ class TestData:
         for _ in range(2):
             context.explore(None, [np.random.default_rng(seed) for seed in (0, 1)])
         evaluate(context, RandomAgent(task.action_space), False)
-        thetas = np.concatenate([*made[:1], *made[2:], context.demonstrated_theta])[:, 0]
+        thetas = np.concatenate([*made[:1], *made[2:], context.demonstrated_theta[:, 0]])[:, 0]
         np.testing.assert_array_equal(made[0], made[1])  # the same generators
         assert len(np.unique(thetas)) == len(thetas) == 3 * 8
         same = {stream(purpose, seed) for purpose in (DEMOS, EXPLORATION, EVALUATION) for seed in range(100)}

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
+import multiprocessing.forkserver
 import os
 import queue
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +23,10 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
 from deconfounded.benchmarks.engine import catalogue, identity, pool, presets
+from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
-from deconfounded.benchmarks.engine.methods import DEMOS, EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import naive_rnn, wire
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs.files import write_sealed
@@ -153,19 +158,19 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ("x = 1\ndef f(:", "Task", r"invalid syntax \(SyntaxError, mine.py:2\)"),
         ("open('gone.txt')", "Task", r"gone.txt' \(FileNotFoundError, mine.py:1\)"),
         ("raise SystemExit('bye')", "Task", r"bye \(SystemExit, mine.py:1\)"),
-        ("from deconfounded.envs.cartpole import Cartpole as Task", "Task", "name of Cartpole in .* was None"),
+        ("from deconfounded.envs.tasks.cartpole import Cartpole as Task", "Task", "name of Cartpole in .* was None"),
         (
             "from deconfounded.envs import Task as T\nclass Task(T):\n    name = 'mine'",
             "Task",
             "task mine of .* lacks appl",
         ),
         (
-            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'Odd name!'",
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Task(Bandit):\n    name = 'Odd name!'",
             "Task",
             "'Odd name!'; it",
         ),
         (
-            "from deconfounded.envs.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Task(Bandit):\n    name = 'tilted_cartpole'",
             "Task",
             "'tilted_cartpole' of .* is taken by .*; give it another name",
         ),
@@ -247,6 +252,22 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
     return context, Guest(context, "mine", f"{folder}/mine.py:fit", uses)
 
 
+@pytest.fixture(scope="module")
+def server() -> Iterator[BaseContext]:
+    """A process that has imported what a guest's does, and from which guests are then forked."""
+    made = multiprocessing.get_context("forkserver")
+    made.set_forkserver_preload(["deconfounded.benchmarks.engine.guest", "deconfounded.deconf.given"])
+    yield made
+    multiprocessing.forkserver._forkserver._stop()  # type: ignore[attr-defined]
+
+
+@pytest.fixture
+def forked(server: BaseContext, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guests begin as forks of the server, without seconds of imports each; in other tests, as they do in a run."""
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method: server)
+
+
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -267,6 +288,7 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize(
     ("text", "says"),
     [

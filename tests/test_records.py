@@ -14,6 +14,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
+from deconfounded.benchmarks import table as table_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import identity, pool
 from deconfounded.benchmarks.engine.catalogue import METHODS
@@ -43,8 +44,8 @@ class TestIdentity:
             ("deconf/dagger.py", {"dagger"}),
             ("deconf/exact.py", {"conditional", "interventional"}),
             ("deconf/recurrent.py", {"naive_rnn", "dagger"}),
-            ("envs/icy_road.py", set()),
-            ("envs/slippery_cartpole.py", set(METHODS)),
+            ("envs/tasks/icy_road.py", set()),
+            ("envs/tasks/slippery_cartpole.py", set(METHODS)),
             ("envs/render.py", set()),
             ("benchmarks/output/pages.py", set()),
             ("benchmarks/engine/jobs.py", set(METHODS)),
@@ -68,7 +69,7 @@ class TestIdentity:
         """Its file, that of a class it stands on, and its MJCF."""
         monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
         (tmp_path / "base_body.py").write_text(
-            "from deconfounded.envs.bandit import Bandit\nclass Base(Bandit): pass\n"
+            "from deconfounded.envs.tasks.bandit import Bandit\nclass Base(Bandit): pass\n"
         )
         (tmp_path / "mine.py").write_text("from base_body import Base\nclass Mine(Base):\n    name = 'mine'\n")
         task = envs.get(f"{tmp_path}/mine.py:Mine")
@@ -326,3 +327,27 @@ def test_broken_pictures_leave_the_numbers(
     run_command(report.main)
     assert "no pictures: an OpenGL platform library" in capsys.readouterr().out
     assert (tmp_path / "report.html").stat().st_size > 0
+
+
+def test_table_makes_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All of it at first; then nothing, but for a record that is gone, or of other code."""
+
+    def table(*more: str) -> str:
+        line = ["table", "--tasks", "bandit", "--methods", "random", "--preset", "smoke", "--seeds", "2", *more]
+        monkeypatch.setattr("sys.argv", [*line, "--set", "eval_trials=4", "--out", str(tmp_path)])
+        table_command.main()
+        return capsys.readouterr().out
+
+    assert "bandit, random: 2 of 2 seeds are missing" in table("--list")
+    table()
+    place = tmp_path / "records" / "bandit-v0" / "smoke"
+    assert sorted(file.name for file in place.iterdir()) == [
+        f"{m}-{i}.json" for m in ("expert", "random") for i in (0, 1)
+    ]
+    assert table() == table("--list") == ""
+    (place / "expert-1.json").unlink()
+    other = json.loads((place / "random-0.json").read_text())
+    (place / "random-0.json").write_text(json.dumps({**other, "code": "0" * 64}))
+    assert table("--list").splitlines() == [f"bandit, {m}: 1 of 2 seeds are missing" for m in ("expert", "random")]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import MAKERS, Context
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf import cloning
@@ -19,7 +20,7 @@ from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 
 N, EPISODES = 48, 3
 
@@ -87,9 +88,9 @@ def test_who_sees_theta_can_clone(name: str) -> None:
     env = envs.BatchEnv(envs.get(name), 64)
     expert, encode = policy.load(env.task), env.task.encode_theta
     trials, _ = run_trials(env, ExpertAgent(env, expert), env.task.episodes, seed=1)
-    own = envs.BatchEnv(env.task, N)
+    own, shown = envs.BatchEnv(env.task, N), encode(thetas(env.task, 64, env.task.episodes, 1))
     config = CloningConfig(updates=1500)
-    oracle = cloning.fit(trials, config, np.random.default_rng(0), encode(env.theta), lambda: encode(own.theta))
+    oracle = cloning.fit(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
     assert scores(own, oracle)[-1] > 0.9
 
 

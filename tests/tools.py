@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from deconfounded.benchmarks.engine.methods import Preset
+from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig

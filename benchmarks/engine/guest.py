@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import GUEST, Context, stream
+from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array

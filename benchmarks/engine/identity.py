@@ -33,7 +33,7 @@ FRAMEWORK = tuple(
     ROOT / f"{name}.py"
     for name in (
         *("envs/task", "envs/batch", "envs/streams", "experts/demos", "experts/policy"),
-        *("benchmarks/engine/methods", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
+        *("benchmarks/engine/context", "benchmarks/engine/jobs", "benchmarks/engine/measure"),
     )
 )
 GUESTS = tuple(ROOT / f"{name}.py" for name in ("benchmarks/engine/guest", "deconf/given", "deconf/wire"))
@@ -75,7 +75,7 @@ def expert(task: envs.Task, source: str | None) -> str:
         return policy.fingerprint(task, source)
     file = outside.file(source)
     digest = hashlib.sha256(source.rpartition(":")[2].encode())
-    for one in sorted(closure([file]) if file else ()):
+    for one in sorted(closure([file]) if file else (), key=_wherever):
         digest.update(one.read_bytes())
     return digest.hexdigest()
 
@@ -117,11 +117,16 @@ def code(task: envs.Task, module: str, reference: str = "") -> str:
     bases = [file for cls in type(task).__mro__ if (file := outside.source(cls)) and _counts(file)]
     files = {*FRAMEWORK, *closure([*own, *bases]), *(GUESTS if reference else ())}
     digest = hashlib.sha256()
-    for file in sorted(files, key=lambda file: (file.name, str(file))):
+    for file in sorted(files, key=_wherever):
         digest.update(file.name.encode() + b"\0" + file.read_bytes())
     mjcf = task.home / f"{task.name}.xml"
     digest.update(mjcf.read_bytes() if mjcf.is_file() else b"")
     return digest.hexdigest()
+
+
+def _wherever(file: Path) -> tuple[str, bytes]:
+    """What to sort files by, so that it does not matter where they lie."""
+    return file.name, file.read_bytes()
 
 
 def _counts(file: Path) -> bool:

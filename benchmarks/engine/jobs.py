@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
-from deconfounded.benchmarks.engine.methods import EVALUATION, MAKERS, Allowed, Context, stream
+from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.pool import Job, JobMonitor
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved
-from deconfounded.experts.demos import Agent, run_trials
+from deconfounded.experts.demos import Agent, run_trials, thetas
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
@@ -27,19 +28,19 @@ CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in 
 class Recorder(Agent):
     """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
-    The clip is of episode number task.episodes of that trial of the first seed whose first latent is nearest the
-    quantile: the same trial for every method, as seeds are shared.
+    The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
+    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
+    an action, and each step after it; with what the agent knows then.
     """
 
-    def __init__(self, agent: Agent, env: envs.BatchEnv, quantile: float = 0.85) -> None:
-        self.agent, self.env, self.quantile = agent, env, quantile
+    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
+        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
 
     def begin(self, n: int) -> None:
         self.agent.begin(n)
         self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
         self.episode = 0
-        self.states: list[Array] = []
-        self.actions: list[Array] = []
+        self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
         """An episode is over."""
@@ -54,6 +55,16 @@ class Recorder(Agent):
             self.note()
         self.agent.reset(rngs)
         self.episode += 1
+        self._film(np.zeros(self.env.task.action_space.shape or (1,)))
+
+    def _film(self, action: Array) -> None:
+        if not self.filmed or self.episode > self.env.task.episodes:
+            return
+        row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
+        if (known := self.agent.features()) is not None:
+            row["known"] = known[self.trial].copy()
+        for kind, value in row.items():
+            self.clip.setdefault(kind, []).append(value)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         return self.agent.act(obs)
@@ -62,9 +73,8 @@ class Recorder(Agent):
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         self.agent.observe(obs, action, next_obs, alive)
-        if self.episode == self.env.task.episodes and alive[self.trial]:
-            self.states.append(self.env.state[self.trial].copy())
-            self.actions.append(action[self.trial])
+        if alive[self.trial]:
+            self._film(action[self.trial])
 
 
 class CurveMonitor(JobMonitor):
@@ -106,7 +116,10 @@ class BenchmarkJob(Job):
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {self.method: guests.enter_context(contextlib.closing(guest))}
             trained = monitor.worked()
-            found = {name: evaluate(context, agent, self.about.learned, self.salt) for name, agent in agents.items()}
+            found = {
+                name: evaluate(context, agent, self.about.learned, self.salt, name in CLIPPED and 0 in self.seeds)
+                for name, agent in agents.items()
+            }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
             notes = [
                 self._keep(name, agent) for name, agent in agents.items()
@@ -114,11 +127,11 @@ class BenchmarkJob(Job):
             meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
             for i, seed in enumerate(self.seeds):
                 rows = context.rows(i)
-                arrays: dict[str, Any] = {"theta": context.env.theta[rows]}
+                arrays: dict[str, Any] = {}
                 for name, (per_trial, probes, clip) in found.items():
                     arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
                     arrays[f"{name}/probe"] = probes[i]
-                    if seed == 0 and name in CLIPPED:
+                    if seed == 0:
                         arrays.update({f"{name}/{key}": value for key, value in clip.items()})
                 self.save(seed, arrays, monitor, meta)
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
@@ -150,18 +163,25 @@ def spaces(task: envs.Task) -> dict[str, int]:
 
 
 def evaluate(
-    context: Context, agent: Agent, learned: bool, salt: str = ""
+    context: Context, agent: Agent, learned: bool, salt: str = "", filmed: bool = False
 ) -> tuple[dict[str, Array], Array, dict[str, Array]]:
-    """Deploy in all seeds' trials: returns and Eq. (1) [N, E], probes [S, E or 0], and a clip of the first seed."""
+    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
     task, seeds = context.task, context.seeds
     # Learned agents go on for twice the episodes they were trained on.
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
-    recorder = Recorder(agent, context.env)
-    trials, returns = run_trials(context.env, recorder, episodes, [stream(EVALUATION, seed, salt) for seed in seeds])
+    recorder = Recorder(agent, context.env, filmed)
+    streams = [stream(EVALUATION, seed, salt) for seed in seeds]
+    trials, returns = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    objective = measure.objective(context.expert, trials, context.env.theta)
-    features, theta = np.array(recorder.known), task.encode_theta(context.env.theta)
+    theta = thetas(task, context.env.n, episodes, streams)
+    objective = measure.objective(context.expert, trials, theta)
+    encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = np.array([[measure.probe(known[rows], theta[rows]) for known in features] for rows in groups])
-    clip = {"state": np.array(recorder.states), "action": np.array(recorder.actions), "trial": np.array(recorder.trial)}
-    return {"returns": returns, "objective": objective}, probes, clip
+    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    clip = {key: np.array(value) for key, value in recorder.clip.items()}
+    if filmed:
+        clip["trial"] = np.array(recorder.trial)
+    if "known" in clip:  # theta, as it can be read off at the end of the last episode
+        clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
+    r2 = np.array([[score for score, _ in each] for each in probes])
+    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip

@@ -1,24 +1,17 @@
-"""Jobs, one (method, some seeds) each, side by side in processes. What is in a job's files is finished, and kept."""
+"""Jobs, one (method, some seeds) each, side by side on an engine. What is in a job's files is finished, and kept."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-import multiprocessing
-import os
 import re
-import signal
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from multiprocessing.queues import Queue
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -26,13 +19,12 @@ import torch
 from deconfounded import envs
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
-from deconfounded.benchmarks.engine.guest import die_with_parent
+from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
-from deconfounded.benchmarks.engine.methods import Context, Preset
+from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.deconf.agents import Monitor, Training
 from deconfounded.envs.files import check_folder, read_sealed, sweep, write_atomically, write_sealed
-from deconfounded.envs.physics import cores
 from deconfounded.experts.demos import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
@@ -68,6 +60,11 @@ class Job(ABC):
     def file(self, seed: int) -> Path:
         """An .npz file."""
         return self.folder / f"{self.method}-{seed}.npz"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an interrupted job goes on from."""
+        return self.folder / f".{self.method}-{'-'.join(map(str, self.seeds))}.pt"
 
     @property
     def ticks(self) -> int:
@@ -151,6 +148,10 @@ class DemonstrationJob(Job):
     """Makes what all methods imitate with a seed, so that no two of them do."""
 
     @property
+    def about(self) -> Method:
+        return Method(())
+
+    @property
     def ticks(self) -> int:
         return 20
 
@@ -164,13 +165,18 @@ class DemonstrationJob(Job):
         return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
 
-_ticks: Queue[int]  # of this worker process, to the main one
+class Ticks(Protocol):
+    """Where a worker process tells how far it has come."""
+
+    def put(self, ticks: int) -> None: ...
 
 
-def start_worker(ticks: Queue[int]) -> None:
-    """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
+_ticks: Ticks  # of this worker process
+
+
+def tell(ticks: Ticks) -> None:
+    """Let the jobs of this process tell their progress there."""
     global _ticks
-    die_with_parent()
     _ticks = ticks
 
 
@@ -184,7 +190,7 @@ class JobMonitor(Monitor):
         super().__init__()
         self.ticks, self.share, self.told = job.ticks, share, 0
         self.device = job.preset.naive.device
-        self.file = job.folder / f".{job.method}-{'-'.join(map(str, job.seeds))}.pt"
+        self.file = job.checkpoint
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []
         self.cpu_start, self.cpu_before, self.elsewhere = time.process_time(), 0.0, 0.0
@@ -251,7 +257,28 @@ def know_guests(folder: Path) -> None:
                 print(f"{file.name} is left out: {error}")
 
 
-def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, int]:
+class Engine(ABC):
+    """Where jobs run, one core or one GPU each. Use it in a `with`: after that nothing of it is left running."""
+
+    def __enter__(self) -> Engine:
+        return self
+
+    def __exit__(self, *error: object) -> None:  # noqa: B027 (processes of this machine need nothing here)
+        """Let it go."""
+
+    @abstractmethod
+    def slots(self, device: str) -> int:
+        """How many jobs that train on such a device to make of a method's seeds."""
+
+    @abstractmethod
+    def run(self, jobs: list[Job], tick: Callable[[int], None], say: Callable[[Job, str | Exception], None]) -> None:
+        """Run them side by side, first come, first served; a job's files are in its folder when it has ended.
+
+        tick: to be told of progress; say: what became of a job, an InputError if it failed: the others go on.
+        """
+
+
+def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tuple[Finished, int]:
     """Run what has no file yet; returns all that is in the folder now, and how many files were there before.
 
     every: a job for each method, with all seeds, in one folder.
@@ -267,15 +294,15 @@ def run_all(every: Sequence[Job], device: str, label: str) -> tuple[Finished, in
     parts = [
         replace(job, seeds=part)
         for job, missing in zip(every, left, strict=True)
-        for part in groups(job.about, missing, device)
+        for part in groups(job.about, missing, engine.slots(device))
     ]
     shown = {seed: job for job in parts if "demonstrations" in job.about.uses for seed in job.seeds}
     first: list[Job] = [
         DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
         for seed, job in sorted(shown.items())
     ]
-    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label)
-    run_jobs(parts, label)
+    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine)
+    run_jobs(parts, label, engine)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()
     done = written(every[0], folder)
@@ -317,12 +344,12 @@ def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def groups(method: Method, left: list[int], device: str) -> list[tuple[int, ...]]:
-    """Seeds to run side by side: as many groups as cores, or one on a GPU; references and guests share nothing."""
+def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]:
+    """Seeds to run side by side: as many groups as there are slots; references and guests share nothing."""
     if not left:
         return []
     alone = not method.learned or method.reference
-    n = len(left) if alone else min(cores(), len(left)) if device == "cpu" else 1
+    n = len(left) if alone else min(slots, len(left))
     return [tuple(map(int, part)) for part in np.array_split(left, n)]
 
 
@@ -345,53 +372,19 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             raise envs.InputError(f"{folder} holds a run with another {differ[0]}; give another --out, or remove it")
 
 
-@contextmanager
-def ended(pool: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
-    """The pool; when the work is over, or ends early by an error or a signal, none of its processes is left."""
-    try:
-        yield pool
-    except BaseException as error:
-        for process in multiprocessing.active_children():
-            process.kill()
-        if isinstance(error, BrokenProcessPool):
-            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def run_jobs(jobs: list[Job], label: str) -> None:
-    """Run jobs side by side, one core each, longest first."""
+def run_jobs(jobs: list[Job], label: str, engine: Engine) -> None:
+    """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say."""
     if not jobs:
         return
-    context = multiprocessing.get_context("spawn")
-    workers = min(cores(), len(jobs))
-    progress = Progress(sum(job.ticks for job in jobs), label)
-    ticks = context.Queue()
-    with ended(ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,))) as pool:
-        # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
-        heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
-        os.environ["OMP_NUM_THREADS"] = "1"
-        futures = {pool.submit(job.run): job for job in jobs}
-        signal.signal(signal.SIGINT, heard)
-        if threads is None:
-            del os.environ["OMP_NUM_THREADS"]
-        else:
-            os.environ["OMP_NUM_THREADS"] = threads
-        waiting, failed = set(futures), list[envs.InputError]()
-        while waiting:
-            while not ticks.empty():
-                progress.update(ticks.get())
-            for future in [f for f in waiting if f.done()]:
-                waiting.remove(future)
-                job = futures[future]
-                try:
-                    told = future.result()
-                except envs.InputError as error:  # a guest's, say: the others go on
-                    failed.append(error)
-                    told = f"failed: {error}"
-                progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
-            time.sleep(0.1)
+    progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
+
+    def say(job: Job, told: str | Exception) -> None:
+        if isinstance(told, Exception):
+            failed.append(told)
+            told = f"failed: {told}"
+        progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
+
+    engine.run(jobs, progress.update, say)
     progress.close()
     if failed:
         raise failed[0]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args, get_type_hints
 
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.methods import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
@@ -18,6 +17,27 @@ from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 
 MOST = 1e9  # of any amount
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Amounts of data and training. Trials are of task.episodes episodes each."""
+
+    seeds: int
+    expert_trials: int
+    explore_trials: int  # a round
+    eval_trials: int
+    query_trials: int  # a round
+    fresh: int  # expert trials drawn anew for each update of naive_rnn, and round of what does not accumulate; or 0
+    grid: int
+    deconfounded: DeconfoundedConfig
+    discrete: DeconfoundedConfig
+    offline: OfflineConfig
+    naive: RecurrentConfig
+    dagger: DaggerConfig
+    cloning: CloningConfig
+
+
 CONFIGS = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")  # of a preset's fields
 
 _ON_CONTROL = DeconfoundedConfig(
@@ -63,7 +83,9 @@ _BANDIT = Preset(
     fresh=0,
     grid=0,
     deconfounded=replace(_ON_BANDIT, latent=5, beta=5e-3, inference_updates=1200, inference_steps=3200),
-    discrete=replace(_ON_BANDIT, model="discrete", latent=10, inference_updates=1600),
+    discrete=replace(
+        _ON_BANDIT, model="discrete", latent=10, inference_updates=400, imitation_updates=200, final_updates=800
+    ),
     offline=OfflineConfig(
         latent=5,
         offline_batch=64,
@@ -78,7 +100,7 @@ _BANDIT = Preset(
         learning_rate=3e-3,
     ),
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    dagger=DaggerConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    dagger=DaggerConfig(updates=500, batch=128, chunk=50, learning_rate=1e-2),
     cloning=CloningConfig(updates=500),
 )
 
@@ -142,7 +164,10 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
         amounts = _smoke(amounts)
     if name == "paper":
         amounts = _PAPER if amounts is _BANDIT else replace(amounts, seeds=10)
-    return replace(amounts, **{part: replace(getattr(amounts, part), device=device) for part in CONFIGS})
+    told: dict[str, dict[str, Any]] = {part: {"device": device} for part in CONFIGS}
+    for part in ("deconfounded", "discrete", "offline"):
+        told[part] |= {"drifts": task.drifts}
+    return replace(amounts, **{part: replace(getattr(amounts, part), **values) for part, values in told.items()})
 
 
 def changed(settings: Preset, changes: Sequence[str]) -> Preset:
@@ -157,7 +182,7 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
             raise envs.closest("--set part", part, list(CONFIGS))
         of = getattr(settings, part) if part else settings
         known = {name: now for name, now in asdict(of).items() if name not in CONFIGS}
-        if field not in known or field == "device":
+        if field not in known or field in ("device", "drifts"):
             raise envs.closest("--set amount", key, [f"{part}.{name}" if part else name for name in known])
         kind = get_type_hints(type(of))[field]
         new = {field: _parsed(key, value, get_args(kind) or (kind,), known[field])}

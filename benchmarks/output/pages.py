@@ -46,14 +46,14 @@ def _kept(folder: Path, name: str) -> dict[str, Any] | None:
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
     """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
-    for name in envs.suite():
+    for name in envs.SUITE:
         if found := _kept(DOCS / "certificates", name):
             yield envs.get(name), found
 
 
 def _published() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
     """In the registry's order, the tasks that have records in docs/, and what these come to."""
-    for name in envs.suite():
+    for name in envs.SUITE:
         task = envs.get(name)
         if found := records.of_task(DOCS / "records", name, task.version):
             yield task, records.gather(found, list(METHODS))
@@ -93,8 +93,8 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         if folder.name != f"{task.name}-v{task.version}"
     ):
         parts.append(f"Superseded, and not to be compared: the records of {', '.join(old)}.")
-    if (DOCS / f"{task.name}.gif").exists():
-        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.gif)")
+    if (DOCS / f"{task.name}.webp").exists():
+        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
     return "\n\n".join(parts)
 
 
@@ -262,7 +262,7 @@ def card(task: envs.Task) -> str:
 def tasks_page() -> str:
     """docs/tasks.md: all cards."""
     head = "# Tasks\n\nMade by `python benchmarks/pages.py` from the tasks' own classes and docs/certificates."
-    return "\n\n".join([head, *(card(envs.get(name)) for name in envs.suite())]) + "\n"
+    return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"
 
 
 def write() -> None:

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import matplotlib
 
 matplotlib.use("Agg")
@@ -15,13 +14,12 @@ import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.jobs import CLIPPED
 from deconfounded.benchmarks.engine.pool import Finished
-from deconfounded.benchmarks.output import records, score
+from deconfounded.benchmarks.output import film, records, score
 from deconfounded.envs import outside
 from deconfounded.envs.files import save_figure, write_atomically, write_json
 
@@ -72,11 +70,14 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
             curves[method].append(curve)
         for name in CLIPPED:
             if f"{name}/state" in data:
-                theta = data["theta"][int(data[f"{name}/trial"])]
-                clips[name] = {"state": data[f"{name}/state"], "action": data[f"{name}/action"], "theta": theta}
+                clip = {key: data[f"{name}/{key}"] for key in ("state", "action", "episode")}
+                clip["theta"] = data[f"{name}/theta"][int(data[f"{name}/trial"]), : task.episodes]
+                if f"{name}/read" in data:
+                    clip["belief"] = film.decoded(task, data[f"{name}/read"])
+                clips[name] = clip
     learning(curves, task.name, folder / "learning.png")
     try:
-        video(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
+        film.write(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except Exception as error:  # no GL, or no encoder: the run is good all the same
         print(f"no video: {outside.told(error)}")
 
@@ -117,36 +118,6 @@ def learning(curves: dict[str, list[dict[str, Any]]], title: str, file: Path) ->
     plt.close(figure)
 
 
-def _labelled(frame: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
-    from PIL import Image, ImageDraw
-
-    image = Image.fromarray(frame)
-    ImageDraw.Draw(image).text((8, 6), text, fill=(20, 20, 20), font_size=16)
-    return np.asarray(image)
-
-
-def frame_rate(task: envs.Task) -> int:
-    """Of a video, a second: real time, but no more than 25; 5 where steps have no time of their own."""
-    return min(25, round(1 / task.control_dt)) if task.control_dt < 1 else 5
-
-
-def video(task: envs.Task, clips: dict[str, dict[str, NDArray[np.float64]]], file: Path) -> None:
-    """Recorded states of several agents under one theta, side by side. Raises InputError where no GL works.
-
-    A clip holds state [T, S], action [T, A] and theta [L].
-    """
-    columns = []
-    for name, clip in clips.items():
-        paint = task.painter(clip["theta"])
-        frames = zip(clip["state"], clip["action"], strict=True)
-        columns.append([_labelled(paint(state, action), name) for state, action in frames])
-    columns = [column for column in columns if column]
-    writer: Any
-    with imageio.get_writer(file, fps=frame_rate(task), quality=6, macro_block_size=8) as writer:
-        for t in range(max(len(frames) for frames in columns)):  # who failed early stands still
-            writer.append_data(np.concatenate([frames[min(t, len(frames) - 1)] for frames in columns], 1))
-
-
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ results.task }}</title>
 <style>body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}
 img,video{max-width:100%}table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:right;
@@ -158,7 +129,7 @@ border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}</sty
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}{% endfor %}</tr>
 {% endfor %}</table>
 {% for name, data in pictures %}<h2>{{ name }}</h2><img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
-{% endfor %}{% if movie %}<h2>One hidden theta, last episode of a trial</h2>
+{% endfor %}{% if movie %}<h2>One hidden theta, first and last episode of a trial</h2>
 <video controls loop muted src="data:video/mp4;base64,{{ movie }}"></video>{% endif %}
 <h2>How it was made</h2><pre>{{ how }}</pre></html>
 """

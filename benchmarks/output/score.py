@@ -81,10 +81,9 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
         for name in data["meta"]["agents"]:
             returns, objective = data[f"{name}/returns"], data[f"{name}/objective"]
             values = np.stack([returns, normalise(returns, zero, one), objective], -1).round(4)
-            for trial, (theta, episodes) in enumerate(zip(data["theta"], values.tolist(), strict=True)):
-                drawn = [f"{value:.6g}" for value in theta]
-                for episode, row in enumerate(episodes):
-                    out.writerow([name, seed, trial, *drawn, episode + 1, *row])
+            for trial, (theta, episodes) in enumerate(zip(data[f"{name}/theta"], values.tolist(), strict=True)):
+                for episode, (now, row) in enumerate(zip(theta, episodes, strict=True)):
+                    out.writerow([name, seed, trial, *(f"{value:.6g}" for value in now), episode + 1, *row])
     return text.getvalue()
 
 

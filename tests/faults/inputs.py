@@ -27,8 +27,8 @@ import numpy as np
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.jobs import spaces
-from deconfounded.benchmarks.engine.methods import Context
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.cloning import CloningConfig, fit
 from deconfounded.experts import policy, saved

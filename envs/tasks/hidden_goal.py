@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from deconfounded.envs.physics import Edit
-from deconfounded.envs.puck import Puck
 from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.tasks.puck import Puck
 
 
 class HiddenGoal(Puck):

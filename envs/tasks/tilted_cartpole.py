@@ -9,9 +9,9 @@ Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward:
 
 from __future__ import annotations
 
-from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.physics import Edit
 from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.tasks.cartpole import Cartpole
 
 
 class TiltedCartpole(Cartpole):

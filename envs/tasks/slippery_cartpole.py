@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from deconfounded.envs.cartpole import Cartpole
 from deconfounded.envs.physics import Edit
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.tasks.cartpole import Cartpole
 
 SPIN = 10.0  # rad/s
 

@@ -1,0 +1,162 @@
+"""What methods are handed: data of one task and some seeds, made when first asked for, and no more than they declare.
+
+Learned methods get trials without theta; only the oracle gets theta, and only references get the environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import identity
+from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.data import Source
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.experts import policy
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials, thetas
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.presets import Preset
+
+DEMOS, EXPLORATION, EVALUATION, GUEST = 1, 2, 3, 4  # each purpose has seeds of its own
+
+
+def stream(purpose: int, seed: int, salt: str = "") -> int:
+    """A seed for one purpose of one run, far from all others; with a salt, one that nobody can have looked at."""
+    return int(np.random.SeedSequence([purpose, seed, *salt.encode()]).generate_state(1)[0] >> 1)
+
+
+class Context:
+    """One task, preset and some seeds: data, made when first asked for, and the environments agents are scored in.
+
+    Seeds lie side by side: trials are in as many equal groups as there are seeds.
+    """
+
+    def __init__(
+        self,
+        task: envs.Task,
+        preset: Preset,
+        seeds: Sequence[int],
+        monitor: Monitor | None = None,
+        folder: Path | None = None,
+        expert: str | None = None,
+    ) -> None:
+        """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load."""
+        self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
+        self.folder, self.named_expert = folder, expert
+        self.expert = policy.load(task, expert)
+
+    @cached_property
+    def env(self) -> envs.BatchEnv:
+        """The environments that agents are scored in."""
+        return envs.BatchEnv(self.task, self.preset.eval_trials * len(self.seeds))
+
+    def rows(self, i: int) -> slice:
+        """Trials, of those that agents are scored in, of the i-th seed."""
+        return slice(i * self.preset.eval_trials, (i + 1) * self.preset.eval_trials)
+
+    def _expert_trials(self, n: int, seeds: Sequence[int]) -> Trials:
+        env = envs.BatchEnv(self.task, n * len(seeds))
+        seeds = [stream(DEMOS, seed) for seed in seeds]
+        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
+
+    def _kept(self, seed: int) -> tuple[Path, str]:
+        """Where a seed's demonstrations are kept, and what they are made of."""
+        assert self.folder is not None
+        made_of = identity.demonstrations(self.task, self.named_expert, self.preset.expert_trials, seed)
+        return self.folder / f"demonstrations-{seed}.npz", made_of
+
+    def has_demonstrations(self, seed: int) -> bool:
+        """Whether they are in the folder: whole, and of this seed, task and expert."""
+        try:
+            return bool(Trials.load(*self._kept(seed)))
+        except envs.InputError:
+            return False
+
+    def _demonstrated(self, seed: int) -> Trials:
+        """The demonstrations of one seed, made once: what is in the folder is taken from there."""
+        if self.folder is None:
+            return self._expert_trials(self.preset.expert_trials, [seed])
+        try:
+            return Trials.load(*self._kept(seed))
+        except envs.InputError:
+            trials = self._expert_trials(self.preset.expert_trials, [seed])
+            trials.save(*self._kept(seed))
+            return trials
+
+    @cached_property
+    def demonstrations(self) -> Trials:
+        """Expert trials, without theta."""
+        self.monitor.spend("expert_trials", [self.preset.expert_trials] * len(self.seeds))
+        return joined([self._demonstrated(seed) for seed in self.seeds])
+
+    @property
+    def demonstrated_theta(self) -> Array:
+        """theta [B, E, L] of the demonstrations' episodes, drawn once more from their seeds: for the oracle alone."""
+        n = self.preset.expert_trials * len(self.seeds)
+        return thetas(self.task, n, self.task.episodes, [stream(DEMOS, seed) for seed in self.seeds])
+
+    def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
+        """Fresh expert trials."""
+        self.monitor.spend("expert_trials", [self.preset.fresh] * len(rngs))
+        return self._expert_trials(self.preset.fresh, [int(rng.integers(2**31)) for rng in rngs])
+
+    def source(self, fresh: bool) -> Source:
+        """What there is to imitate: the fixed set of trials, or what draws fresh ones."""
+        return self.demonstrate if fresh else self.demonstrations
+
+    @property
+    def rngs(self) -> list[np.random.Generator]:
+        """For initial weights and batches; the same for every method of a seed."""
+        return [np.random.default_rng([seed, 0]) for seed in self.seeds]
+
+    def _roll_out(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, list[int]]:
+        env = envs.BatchEnv(self.task, n * len(rngs))
+        self.monitor.spend("exploration_trials", [n] * len(rngs))
+        seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
+        behaviour = agent or RandomAgent(self.task.action_space)
+        return run_trials(env, behaviour, self.task.episodes, seeds)[0], seeds
+
+    def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None) -> Trials:
+        """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
+        return self._roll_out(n or self.preset.explore_trials, agent, rngs)[0]
+
+    def query(
+        self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None
+    ) -> tuple[Trials, NDArray[np.float32]]:
+        """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
+        trials, seeds = self._roll_out(n or self.preset.query_trials, agent, rngs)
+        self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
+        shape = trials.action.shape
+        obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
+        theta = thetas(self.task, len(trials), self.task.episodes, seeds)
+        random = Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
+        labels = [self.expert.act(obs[:, t], theta[:, t // shape[2]], random) for t in range(obs.shape[1])]
+        return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
+
+
+class Allowed:
+    """A context of which a method gets what it declares that it uses."""
+
+    FREE = ("preset", "rngs", "monitor", "seeds", "task")
+    OPENS: ClassVar[dict[str, tuple[str, ...]]] = {
+        "demonstrations": ("demonstrations", "source"),
+        "exploration": ("explore",),
+        "queries": ("query",),
+        "theta": ("demonstrated_theta", "env"),
+        "environment": ("env", "expert"),
+    }
+
+    def __init__(self, context: Context, uses: Sequence[str]) -> None:
+        self._context, self._open = context, {*self.FREE, *(name for use in uses for name in self.OPENS[use])}
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in self._open:
+            raise AttributeError(f"a method asked for {name}, and does not declare that it uses it")
+        return getattr(self._context, name)

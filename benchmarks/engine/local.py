@@ -1,0 +1,73 @@
+"""Jobs in processes of this machine, one a core."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing.queues import Queue
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine.guest import die_with_parent
+from deconfounded.benchmarks.engine.pool import Engine, Job
+from deconfounded.envs.physics import cores
+
+
+def start_worker(ticks: Queue[int]) -> None:
+    """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
+    die_with_parent()
+    pool.tell(ticks)
+
+
+class Local(Engine):
+    """Processes that write their jobs' files themselves."""
+
+    def slots(self, device: str) -> int:
+        return cores() if device == "cpu" else 1
+
+    def run(self, jobs: list[Job], tick: Callable[[int], None], say: Callable[[Job, str | Exception], None]) -> None:
+        context = multiprocessing.get_context("spawn")
+        workers = min(cores(), len(jobs))
+        ticks = context.Queue()
+        with ended(ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,))) as executor:
+            # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
+            heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
+            os.environ["OMP_NUM_THREADS"] = "1"
+            futures = {executor.submit(job.run): job for job in jobs}
+            signal.signal(signal.SIGINT, heard)
+            if threads is None:
+                del os.environ["OMP_NUM_THREADS"]
+            else:
+                os.environ["OMP_NUM_THREADS"] = threads
+            waiting = set(futures)
+            while waiting:
+                while not ticks.empty():
+                    tick(ticks.get())
+                for future in [f for f in waiting if f.done()]:
+                    waiting.remove(future)
+                    try:
+                        say(futures[future], future.result())
+                    except envs.InputError as error:
+                        say(futures[future], error)
+                time.sleep(0.1)
+
+
+@contextmanager
+def ended(executor: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
+    """The pool; when the work is over, or ends early by an error or a signal, none of its processes is left."""
+    try:
+        yield executor
+    except BaseException as error:
+        for process in multiprocessing.active_children():
+            process.kill()
+        if isinstance(error, BrokenProcessPool):
+            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)

@@ -1,0 +1,90 @@
+"""Make the records that are missing, method by method and task by task: `deconf table`
+
+Every method on every task of the suite: ten seeds of those that a default run makes, the paper's comparison and the
+exact policies, and five of all others. A record that is there, and would come out the same today (its code, settings,
+expert and versions are those of now), stays; the others are made, and kept as soon as they are done. Stopped, it goes
+on where it was. The first five seeds of everything come first.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.pool import Job
+
+SEEDS, FEWER = 10, 5
+SAME = ("settings", "expert", "code", "versions", "salt")
+
+
+def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
+    """The seeds of a method that belong in the table, from `least` up to `most`."""
+    return tuple(range(least, most if method in (*DEFAULT, *REFERENCES) else min(most, FEWER)))
+
+
+def missing(job: Job, preset: str, kept: Path) -> tuple[int, ...]:
+    """The job's seeds of which the folder `kept` has no record, or one that would come out otherwise today."""
+    from deconfounded.benchmarks.engine.identity import identity
+    from deconfounded.benchmarks.output import records
+
+    expected = json.loads(json.dumps(identity(job)))
+    place, there = kept / f"{expected['task']}-v{expected['task_version']}" / preset, set()
+    for seed in job.seeds:
+        for file in place.glob(f"{job.method}*-{seed}.json"):
+            record = records.read(file)
+            if record["job"] == job.method and all(record[key] == expected[key] for key in SAME):
+                there.add(seed)
+    return tuple(seed for seed in job.seeds if seed not in there)
+
+
+def main() -> None:
+    """The command line."""
+    parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
+    parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
+    parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
+    args = parser.parse_args()
+    tasks = [envs.get(name) for name in args.tasks]
+    asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
+    methods = [name for name in METHODS if name in asked]
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output.pages import DOCS
+
+    folder = args.out or Path("results") / "table"
+    kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
+    for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds)):
+        for task in tasks:
+            settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
+            for method in methods:
+                job = BenchmarkJob(task.reference, settings, method, seeds_of(method, least, most), own / "jobs")
+                left = missing(job, args.preset, kept)
+                if not left or args.list:
+                    if left:
+                        print(f"{task.name}, {method}: {len(left)} of {len(job.seeds)} seeds are missing")
+                    continue
+                with commands.locked(own), commands.engine(args.cluster) as engine:
+                    prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), resume=True)
+                    label = f"{task.name}, {method}, seeds {left[0]} to {left[-1]}"
+                    finished, _ = run_all([replace(job, seeds=left)], args.device, label, engine)
+                    new = [one for one in finished if one[0] == method and one[1] in left]
+                    for record in records.of_run(new, args.preset, args.set, task.episodes):
+                        records.write(kept, record)
+
+
+if __name__ == "__main__":
+    run_command(main, commands.KEPT)

@@ -1,0 +1,25 @@
+"""The suite's tasks, a file each, and the bodies that several share (cartpole.py, puck.py).
+
+A new one is a file here, an MJCF in assets/ and its name below; one of your own can stay in your own folder.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+from deconfounded.envs.registry import register
+
+SUITE = (
+    "bandit",
+    "tilted_cartpole",
+    "slippery_cartpole",
+    "heavy_payload",
+    "icy_road",
+    "slippery_walker",
+    "hidden_goal",
+    "forked_path",
+    "rolling_deck",
+)
+
+for _name in SUITE:  # a task's class has its file's name, in camel case
+    register(getattr(importlib.import_module(f"{__name__}.{_name}"), _name.title().replace("_", "")))

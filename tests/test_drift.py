@@ -1,0 +1,134 @@
+"""Latents that walk from episode to episode: their distribution, the exact filter, and how learned beliefs forget."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from deconfounded import envs
+from deconfounded.deconf import models
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.drift import choose_kept
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.models import LatentModel
+from deconfounded.deconf.nets import Scaler
+from deconfounded.envs.streams import Array
+from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
+from deconfounded.experts import policy
+from deconfounded.experts.demos import ExpertAgent, run_trials, thetas
+
+
+class Walking(TiltedCartpole):
+    """tilted_cartpole, whose tilt walks."""
+
+    latents = (envs.Latent("tilt", "rad", -0.3, 0.3, drift=0.15),)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "loguniform"])
+def test_transition_is_that_of_the_walk(distribution: str) -> None:
+    """Of 200,000 walks from each bin's middle, as many end in each bin: within 5 standard errors and .002."""
+    latent, k, n = envs.Latent("x", "m", 1.0, 4.0, distribution, 0.3), 7, 200_000  # type: ignore[arg-type]
+    matrix, rng = latent.transition(k), np.random.default_rng(0)
+    np.testing.assert_allclose(matrix.sum(0), 1, atol=1e-9)
+    np.testing.assert_allclose(matrix.sum(1), 1, atol=1e-9)
+    for i, value in enumerate(latent.grid(k)):
+        ends = latent.cdf(latent.drifted(np.full(n, value), rng.standard_normal(n)))
+        share = np.bincount(np.minimum((ends * k).astype(int), k - 1), minlength=k) / n
+        np.testing.assert_allclose(share, matrix[i], atol=5 * np.sqrt(0.25 / n) + 0.002)
+
+
+def test_what_does_not_drift_stays() -> None:
+    """Its matrix is the identity; a categorical latent cannot drift."""
+    np.testing.assert_array_equal(envs.Latent("x", "m", 1.0, 4.0).transition(5), np.eye(5))
+    with pytest.raises(envs.InputError, match=r"drift of x was 0\.1"):
+        envs.Latent("x", "", 0, 3, "categorical", 0.1)
+
+
+def test_thetas_are_those_of_the_trials() -> None:
+    """Drawn once more from their seeds, episode by episode; they move, and stay where they may be."""
+    task, seen = Walking(), list[Array]()
+
+    class Noting(ExpertAgent):
+        def reset(self, rngs: object) -> None:
+            super().reset(rngs)  # type: ignore[arg-type]
+            seen.append(self.env.theta.copy())
+
+    env = envs.BatchEnv(task, 4)
+    run_trials(env, Noting(env, policy.load(envs.get("tilted_cartpole"))), 3, [5, 9])
+    np.testing.assert_array_equal(thetas(task, 4, 3, [5, 9]), np.stack(seen, 1))
+    assert (np.diff(np.stack(seen, 1), axis=1) != 0).all()
+    assert np.abs(seen).max() <= 0.3
+
+
+def test_the_exact_filter_spreads_between_episodes() -> None:
+    """After an episode the belief is sharp; in the next it is the transition's; taken as static, it stays as it was."""
+    task = Walking()
+    expert = policy.load(envs.get("tilted_cartpole"))
+    env = envs.BatchEnv(task, 3)
+    env.reset(0)
+    for static in (False, True):
+        agent = ExactAgent(env, expert, False, 11, static)
+        agent.begin(3)
+        agent.reset([np.random.default_rng(0)])
+        np.testing.assert_allclose(np.exp(agent.log_belief), 1 / 11)
+        agent.log_belief = np.log(np.eye(11)[[0, 5, 10]] + 1e-300)
+        agent.reset([np.random.default_rng(0)])
+        expected = np.eye(11) if static else Grid(env, expert, 11).env.task.transition(11)
+        np.testing.assert_allclose(np.exp(agent.log_belief), expected[[0, 5, 10]], atol=1e-12)
+
+
+class Average(LatentModel):
+    """Knows theta ~ N(0, 1) from readings theta + N(0, 1): memory (their sum, their number), exact Gaussian beliefs."""
+
+    def __init__(self, draws: Draws) -> None:
+        super().__init__(draws)
+
+    def start(self, n: int) -> Tensor:
+        return torch.zeros(len(self.kept), n, 2)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return memory + torch.cat([step.next_obs, torch.ones_like(step.next_obs)], -1) * step.mask[..., None]
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        variance = 1 / (1 + memory[..., 1])
+        return torch.distributions.Normal(memory[..., 0] * variance, (1 + variance).sqrt()).log_prob(
+            step.next_obs[..., 0]
+        )
+
+    last = belief = sample = point = loss = None  # type: ignore[assignment]
+
+
+def test_how_much_to_keep_is_seen_without_theta() -> None:
+    """Of thetas that stay, nearly all is kept; of thetas drawn anew, nothing; each seed decides for itself."""
+    generator, b, e, t = torch.Generator().manual_seed(0), 400, 6, 5
+    stays = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
+    anew = torch.randn(b, e, 1, generator=generator)
+    theta = torch.stack([stays, anew]).reshape(2, b * e, 1, 1).expand(2, b * e, t, 1)
+    readings = theta + torch.randn(theta.shape, generator=generator)
+    episodes = Batch(readings, readings, readings, torch.ones(2, b * e, t))
+    model = Average(Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+    choose_kept(model, episodes, e, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+    assert model.kept[0] >= 0.8  # .9 is a nat or so from 1
+    assert model.kept[1] == 0
+
+
+@pytest.mark.parametrize("kind", ["evidence", "discrete"])
+def test_forgetting(kind: str) -> None:
+    """What is kept whole stays as it was, to the bit; of what is not kept, nothing; and in between, in between."""
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    unit = Scaler(draws.normal(50, 2), torch.ones(1, 50))
+    model = models.new(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
+    step = Batch(draws.normal(4, 2), draws.normal(4, 1), draws.normal(4, 2), torch.ones(1, 4))
+    memory = model.update(model.start(4), step)
+    assert torch.equal(model.forget(memory), memory) or kind == "discrete"
+    torch.testing.assert_close(model.forget(memory), memory)
+    model.kept.fill_(0)
+    torch.testing.assert_close(model.forget(memory), model.start(4))
+    model.kept.fill_(0.5)
+    half = model.belief(model.forget(memory))
+    if kind == "discrete":
+        torch.testing.assert_close(half.sum(-1), torch.ones(1, 4))
+        torch.testing.assert_close(half, (whole := model.belief(memory).sqrt()) / whole.sum(-1, keepdim=True))
+    assert not torch.allclose(half, model.belief(memory))
