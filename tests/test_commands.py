@@ -22,6 +22,7 @@ from deconfounded.__main__ import COMMANDS
 from deconfounded.benchmarks import certify, commands, cost, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import pages, records, score
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
@@ -205,7 +206,7 @@ class Deadly(pool.Job):
 def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_command(lambda: pool.run_jobs([job], "deadly"), "kept")
+        run_command(lambda: pool.run_jobs([job], "deadly", Local()), "kept")
     assert (ended.value.code, capsys.readouterr().err) == (143, "interrupted; kept\n")
     assert not multiprocessing.active_children()
 
@@ -399,11 +400,9 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for record in shown:
         records.write(run / "records", record)
     (run / "adaptation.png").write_bytes(b"a picture")
-    (run.parent / "certificates" / "bandit.json").write_text("{}")
-    (docs / "bandit.webp").write_bytes(b"an old clip")
     certificate = run.parent / "certificates" / "bandit.json"
     certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
-    (docs / "bandit.gif").write_bytes(b"an old clip")
+    (docs / "bandit.webp").write_bytes(b"an old clip")
     (run / "video.mp4").write_bytes(b"junk")
     monkeypatch.setattr(publish, "DOCS", docs)
 
@@ -434,7 +433,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         publish.keep(run)
     for one in randoms:
         one.with_suffix(".aside").rename(one)
-    assert kept() == ["bandit.gif"]
+    assert kept() == ["bandit.webp"]
     publish.keep(run)
     assert kept() == sorted(
         [*(f"records/{records.place(one)}" for one in shown), "bandit.png", "certificates/bandit.json"]
