@@ -18,6 +18,7 @@ SUITE = (
     "slippery_walker",
     "hidden_goal",
     "forked_path",
+    "icy_stop",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
