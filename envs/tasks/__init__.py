@@ -19,6 +19,7 @@ SUITE = (
     "hidden_goal",
     "forked_path",
     "icy_stop",
+    "weak_thruster",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
