@@ -8,8 +8,8 @@ Latent: grip, the friction coefficient of tyre on track, log-uniform: times the 
 tendon over car and wheel (N). Noise a step: std .004 m and .08 m/s of the car, .5 rad/s of the wheel, whose speed is a
 servo's; none of the line, which theta does not touch, nor of the wheel's angle, which is of no consequence.
 
-Action: the wheel's speed at its rim, 3 m/s more than in units of 3 m/s: there is no reverse. Reward: at d m from the line, .9
-exp(-8 d^2) + .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m beyond the line.
+Action: the speed of the wheel's rim, from 0 (at -1) to 6 m/s (at 1): there is no reverse. Reward: at d m from the line,
+.9 exp(-8 d^2) + .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m beyond the line.
 """
 
 from __future__ import annotations
