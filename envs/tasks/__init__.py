@@ -20,6 +20,7 @@ SUITE = (
     "forked_path",
     "icy_stop",
     "weak_thruster",
+    "lopsided_block",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
