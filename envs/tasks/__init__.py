@@ -19,6 +19,9 @@ SUITE = (
     "hidden_goal",
     "forked_path",
     "rolling_deck",
+    "icy_stop",
+    "weak_thruster",
+    "lopsided_block",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
