@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from torch import Tensor
 
 from deconfounded.deconf.agents import Checkpoint, LearnedAgent, Monitor
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
 from deconfounded.deconf.nets import Adam, Scaler
+from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+
+Kind = TypeVar("Kind", bound=LearnedAgent)
 
 
 class Config(Protocol):
@@ -32,21 +35,18 @@ class Learner(Protocol):
         """From trials [S, B, T]; label [S, B, T, A]: the expert's action at each step."""
 
 
-Start = Callable[[Signature, Scaler, Draws], LearnedAgent]
-"""An agent that knows nothing yet; the scaler is of the expert's observations."""
-
-
 def clone(
     trials: Source,
     config: Config,
     rng: Rngs,
-    start: Start,
-    teach: Callable[[LearnedAgent, int, Monitor], Learner],
+    start: Callable[[Signature, Scaler, Draws], Kind],
+    teach: Callable[[Kind, int, Monitor], Learner],
     monitor: Monitor | None = None,
-) -> LearnedAgent:
+) -> Kind:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng.
 
-    Or clone what draws them: fresh ones for every batch. teach: what trains the agent on trials of so many steps.
+    Or clone what draws them: fresh ones for every batch. start: makes an agent that knows nothing yet; the scaler is of
+    the expert's observations. teach: makes what trains it, on trials of so many steps.
     """
     rngs, monitor = listed(rng), monitor or Monitor()
     shown = drawn(trials, rngs)
@@ -64,3 +64,8 @@ def clone(
         learner.learn(batch, batch.action)
         checkpoint.save(done=learner.done)
     return agent
+
+
+def by_chunks(config: RecurrentConfig) -> Callable[[RecurrentAgent, int, Monitor], Cloner]:
+    """Teaches as naive_rnn is taught."""
+    return lambda agent, steps, monitor: Cloner(agent, config, steps, monitor)

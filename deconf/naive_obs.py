@@ -15,10 +15,10 @@ from torch import Tensor
 
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.beliefs import GruMemory
-from deconfounded.deconf.clones import clone
+from deconfounded.deconf.clones import by_chunks, clone
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source
 from deconfounded.deconf.nets import ActionHead, Scaler
-from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.recurrent import RecurrentAgent, RecurrentConfig
 
 
 class DroppingMemory(GruMemory):
@@ -45,7 +45,7 @@ class ObsAgent(RecurrentAgent):
     """Acts on observations, past and present."""
 
     @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> ObsAgent:
         memory = ObsMemory(width, signature, obs, draws)
         return ObsAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
 
@@ -65,7 +65,7 @@ class DroppingAgent(RecurrentAgent):
     noise: Draws
 
     @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> DroppingAgent:
         memory = DroppingMemory(width, signature, obs, draws)
         agent = DroppingAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
         agent.noise = draws
@@ -85,28 +85,21 @@ class DroppingAgent(RecurrentAgent):
         return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
+def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> ObsAgent:
     """naive_obs. Trials are in as many equal groups as there are generators in rng."""
 
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def start(signature: Signature, obs: Scaler, draws: Draws) -> ObsAgent:
         return ObsAgent.new(config.width, signature, obs, draws)
 
-    def teach(agent: RecurrentAgent, steps: int, monitor: Monitor) -> Cloner:
-        return Cloner(agent, config, steps, monitor)
-
-    return clone(trials, config, rng, start, teach, monitor)
+    return clone(trials, config, rng, start, by_chunks(config), monitor)
 
 
-def fit_dropout(trials: Source, config: DropoutConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
+def fit_dropout(trials: Source, config: DropoutConfig, rng: Rngs, monitor: Monitor | None = None) -> DroppingAgent:
     """naive_dropout. Trials are in as many equal groups as there are generators in rng."""
 
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def start(signature: Signature, obs: Scaler, draws: Draws) -> DroppingAgent:
         agent = DroppingAgent.new(config.width, signature, obs, draws)
-        assert isinstance(agent, DroppingAgent)
         agent.dropout = config.dropout
         return agent
 
-    def teach(agent: RecurrentAgent, steps: int, monitor: Monitor) -> Cloner:
-        return Cloner(agent, config, steps, monitor)
-
-    return clone(trials, config, rng, start, teach, monitor)
+    return clone(trials, config, rng, start, by_chunks(config), monitor)

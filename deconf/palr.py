@@ -15,11 +15,11 @@ from torch import Tensor
 
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.beliefs import GruMemory
-from deconfounded.deconf.clones import clone
+from deconfounded.deconf.clones import by_chunks, clone
 from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, Source, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.nets import ActionHead, Scaler
-from deconfounded.deconf.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.recurrent import RecurrentAgent, RecurrentConfig
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class PalrAgent(RecurrentAgent):
     noise: Draws
 
     @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
         agent = PalrAgent(
             GruMemory(width, signature, obs, draws), ActionHead(width + signature.obs, width, signature, draws)
         )
@@ -78,30 +78,27 @@ class PalrAgent(RecurrentAgent):
     def leakage(self, memories: Tensor, batch: Batch, label: Tensor) -> Tensor:
         """HSCIC [S] of the memory [S, B, T, W] before each step and the action taken last, given the expert's next."""
         assert self.config is not None
+        if batch.mask.shape[2] < 2:
+            return memories.new_zeros(len(memories))
         encode, later = self.policy.signature.encode_action, batch[:, :, 1:]
         index = later.draw_steps(self.config.samples, self.noise)
-        if not bool((later.mask.flatten(1).sum(1) > 0).all()):  # where a chunk is all padding, nothing leaks
-            return memories.new_zeros(len(memories))
         columns = (memories[:, :, 1:], encode(batch.action[:, :, :-1]), encode(label[:, :, 1:]))
         drawn = (take_steps(column, index) for column in columns)
         # Seed by seed: a product over a stack may take another order for one seed than for several.
-        return torch.stack([hscic(*one, self.config.ridge) for one in zip(*drawn, strict=True)])
+        found = torch.stack([hscic(*one, self.config.ridge) for one in zip(*drawn, strict=True)])
+        return found * (later.mask.flatten(1).sum(1) > 0)  # of padding alone, nothing leaks
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
         return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-def fit(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
+def fit(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> PalrAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
 
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def start(signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
         agent = PalrAgent.new(config.width, signature, obs, draws)
-        assert isinstance(agent, PalrAgent)
         agent.config = config
         return agent
 
-    def teach(agent: RecurrentAgent, steps: int, monitor: Monitor) -> Cloner:
-        return Cloner(agent, config, steps, monitor)
-
-    return clone(trials, config, rng, start, teach, monitor)
+    return clone(trials, config, rng, start, by_chunks(config), monitor)
