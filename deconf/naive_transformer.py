@@ -46,7 +46,7 @@ def normed(x: Tensor) -> Tensor:
 def rotated(x: Tensor, position: Tensor) -> Tensor:
     """Rotary position: x [..., H, T, D] turned, pair by pair of its D, by angles that grow with position [..., 1, T].
 
-    So the product of two depends on how far they are apart. Wave lengths are from 6 to 6,000 steps.
+    So the product of two depends on how far they are apart; its waves are 6 to some thousand steps long.
     """
     half = x.shape[-1] // 2
     speed = 1000.0 ** -(torch.arange(half, device=x.device) / half)
