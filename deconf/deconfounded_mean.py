@@ -116,9 +116,7 @@ def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tens
     return torch.cat([model.encoder.posterior(model.encoder(trials[:, i])[:, :, :-1])[0] for i in indices], 1)
 
 
-def fit(
-    trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None
-) -> MeanAgent:
+def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
     """trials: of the expert, without theta, in as many equal groups as there are generators in rng.
 
     explore: called once a round. Raises InputError for less than one round.

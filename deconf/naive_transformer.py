@@ -198,6 +198,7 @@ class Teacher:
 
 def fit(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor | None = None) -> TransformerAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
+
     def start(signature: Signature, obs: Scaler, draws: Draws) -> TransformerAgent:
         shape = {"width": config.width, "layers": config.layers, "heads": config.heads, "window": 1}
         return TransformerAgent.new(shape, signature, obs, draws)
