@@ -49,6 +49,8 @@ class MeanConfig:
 class MeanAgent(DeconfoundedAgent):
     """Acts on the mean of its belief."""
 
+    model: VariationalModel
+
     @staticmethod
     def new(
         kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws

@@ -5,8 +5,8 @@ the reward. Practice is in environments without theta, which are stepped far mor
 reward of the task is seen. What the policy does is so made to look like the expert's mixture over theta: it need not be
 what the expert does under *this* theta, unless the transitions show it.
 
-RecurrentPPO is sb3-contrib's. A trial is one episode of it, so that its LSTM outlives the resets. Each seed has its own,
-one after another, with random numbers of its own; discriminators are trained side by side.
+RecurrentPPO is sb3-contrib's. A trial is one episode of it, so that its LSTM outlives the resets. Seeds practise one
+after another, each with random numbers of its own; their discriminators are trained side by side.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ class Lstm(nn.Module):
 
     def __init__(self, inputs: int, width: int, draws: Draws) -> None:
         super().__init__()
+        self.width = width
         self.input, self.recurrent = Linear(inputs, 4 * width, draws), Linear(width, 4 * width, draws)
 
     def forward(self, x: Tensor, state: Tensor) -> Tensor:
@@ -91,7 +92,7 @@ class GailAgent(LearnedAgent):
 
     def __init__(self, lstm: Lstm, policy: PpoHead, obs: Scaler) -> None:
         super().__init__(policy)
-        self.lstm, self.obs, self.width = lstm, obs, policy.net[0].weight.shape[1]
+        self.lstm, self.obs, self.width = lstm, obs, lstm.width
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> GailAgent:
@@ -132,7 +133,7 @@ class GailAgent(LearnedAgent):
     @torch.no_grad()
     def take(self, i: int, policy: Any) -> None:
         """The weights of Stable-Baselines3's policy, for seed i."""
-        lstm, net = policy.lstm_actor, self.policy.net
+        lstm = policy.lstm_actor
         for own, weight, bias in (
             (self.lstm.input, lstm.weight_ih_l0, lstm.bias_ih_l0),
             (self.lstm.recurrent, lstm.weight_hh_l0, lstm.bias_hh_l0),
@@ -140,8 +141,8 @@ class GailAgent(LearnedAgent):
             own.weight[i], own.bias[i, 0] = weight.T, bias
         theirs = [*policy.mlp_extractor.policy_net, policy.action_net]
         linear = [layer for layer in theirs if isinstance(layer, nn.Linear)]
-        for own, layer in zip((net[0], net[2], net[4]), linear, strict=True):
-            own.weight[i], own.bias[i, 0] = layer.weight.T, layer.bias
+        for mine, layer in zip(filter(lambda x: isinstance(x, Linear), self.policy.net), linear, strict=True):
+            mine.weight[i], mine.bias[i, 0] = layer.weight.T, layer.bias
         if not self.policy.signature.actions:
             self.policy.log_std[i, 0] = policy.log_std
 
@@ -166,8 +167,8 @@ class Discriminator(nn.Module):
     @torch.no_grad()
     def reward(self, *step: NDArray[np.float32]) -> NDArray[np.float32]:
         """The logit [N] of transitions: observation, action, next observation; of one seed's discriminator alone."""
-        rows = [torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step]
-        return self(Batch(*rows, rows[0][..., 0]))[0].cpu().numpy()
+        obs, action, then = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
+        return self(Batch(obs, action, then, obs[..., 0]))[0].cpu().numpy()
 
     def of_seed(self, i: int) -> Discriminator:
         """A copy of the i-th seed's."""
@@ -239,8 +240,8 @@ def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monit
             agent.take(i, player.ppo.policy)
         monitor.spend("exploration_trials", begun)
         monitor.spend("interactions", [config.envs * config.steps] * seeds)
-        rows = [torch.as_tensor(np.stack(column), device=config.device) for column in zip(*own, strict=True)]
-        seen = Batch(*rows, torch.ones_like(rows[0][..., 0]))[:, None]
+        before, action, then = (torch.as_tensor(np.stack(x), device=config.device) for x in zip(*own, strict=True))
+        seen = Batch(before, action, then, torch.ones_like(before[..., 0]))[:, None]
         losses = []
         for _ in range(config.discriminator_updates):
             real, fake = (x.steps(x.draw_steps(config.discriminator_batch, draws)) for x in (expert, seen))

@@ -56,19 +56,25 @@ def rotated(x: Tensor, position: Tensor) -> Tensor:
 
 
 class Cache:
-    """Keys and values [R, H, window, D] of each layer's latest tokens in R trials; number i is at i modulo window."""
+    """Keys and values [N, H, window, D] of each layer's latest tokens in N trials; number i is at i modulo window.
 
-    def __init__(self, layers: int, rows: int, heads: int, window: int, width: int, device: torch.device) -> None:
-        self.kept = [torch.zeros(2, rows, heads, window, width, device=device) for _ in range(layers)]
-        self.count = torch.zeros(rows, dtype=torch.int64, device=device)  # of tokens that are there to stay
-        self.window, self.rows = window, torch.arange(rows, device=device)
+    Of one seed: how far it is filled decides how sums are taken, and is no business of other seeds.
+    """
 
-    def put(self, layer: int, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Write the next token's [R, H, D]; returns all keys and values, and which of them count [R, 1, 1, window]."""
-        kept, filled = self.kept[layer], min(int(self.count.max()) + 1, self.window)
-        kept[:, self.rows, :, self.count % self.window] = torch.stack([key, value])
+    def __init__(self, layers: int, n: int, heads: int, window: int, width: int, device: torch.device) -> None:
+        self.kept = [[torch.zeros(n, heads, window, width, device=device) for _ in range(2)] for _ in range(layers)]
+        self.count = torch.zeros(n, dtype=torch.int64, device=device)  # of tokens that are there to stay
+        self.window, self.rows = window, torch.arange(n, device=device)
+
+    def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+        """Write each trial's next token, and look at it and those before it; all [N, H, 1, D]."""
+        position = self.count[:, None, None]
+        filled = min(int(self.count.max()) + 1, self.window)
+        for kept, new in zip(self.kept[layer], (rotated(key, position), value), strict=True):
+            kept[self.rows, :, self.count % self.window] = new[:, :, 0]
+        keys, values = (kept[:, :, :filled] for kept in self.kept[layer])
         real = torch.arange(filled, device=key.device) <= self.count[:, None]
-        return kept[0, :, :, :filled], kept[1, :, :, :filled], real[:, None, None]
+        return F.scaled_dot_product_attention(rotated(query, position), keys, values, real[:, None, None])
 
 
 class Transformer(nn.Module):
@@ -83,29 +89,26 @@ class Transformer(nn.Module):
         self.widen = nn.ModuleList(Linear(width, 4 * width, draws) for _ in range(layers))
         self.narrow = nn.ModuleList(Linear(4 * width, width, draws) for _ in range(layers))
 
-    def forward(self, tokens: Tensor, cache: Cache | None = None) -> Tensor:
-        """With a cache, tokens [S, N, 1, I] are each trial's next, and are kept in it."""
+    def forward(self, tokens: Tensor, caches: list[Cache] | None = None) -> Tensor:
+        """With caches, one for each seed, tokens [S, N, 1, I] are each trial's next, and are kept in them."""
         x = self.embed(tokens)
         for i in range(self.depth):
-            x = x + self.mix[i](self._attention(i, self.attend[i](normed(x)), cache))
+            x = x + self.mix[i](self._attention(i, self.attend[i](normed(x)), caches))
             x = x + self.narrow[i](F.gelu(self.widen[i](normed(x))))
         return normed(x)
 
-    def _attention(self, layer: int, projected: Tensor, cache: Cache | None) -> Tensor:
+    def _attention(self, layer: int, projected: Tensor, caches: list[Cache] | None) -> Tensor:
         """[S, B, T, 3 W] -> [S, B, T, W]."""
-        shape = projected.shape[:-1]
-        flat = projected.flatten(0, 1).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)  # [3, S B, H, T, D]
-        query, key, value = flat.unbind()
-        if cache is None:
-            position = torch.arange(shape[-1], device=flat.device)[None]
+        each = projected.unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5)  # [3, S, B, H, T, D]
+        if caches is None:
+            position = torch.arange(projected.shape[2], device=projected.device)[None]
+            query, key, value = (x.flatten(0, 1) for x in each)
             query, key = rotated(query, position), rotated(key, position)
             mixed = F.scaled_dot_product_attention(query, key, value, is_causal=True)
+            mixed = mixed.unflatten(0, projected.shape[:2])
         else:
-            position = cache.count[:, None, None]
-            query, key = rotated(query, position), rotated(key, position)
-            keys, values, real = cache.put(layer, key[:, :, 0], value[:, :, 0])
-            mixed = F.scaled_dot_product_attention(query, keys, values, real)
-        return mixed.transpose(1, 2).flatten(2).reshape(*shape, self.width)
+            mixed = torch.stack([cache.attend(layer, *each[:, s].unbind()) for s, cache in enumerate(caches)])
+        return mixed.transpose(2, 3).flatten(3)
 
 
 class TransformerAgent(LearnedAgent):
@@ -145,8 +148,9 @@ class TransformerAgent(LearnedAgent):
 
     def begin(self, n: int) -> None:
         super().begin(n)
-        net, rows = self.net, self.seeds * self._n
-        self._cache = Cache(net.depth, rows, net.heads, net.window, net.width // net.heads, self.device)
+        net = self.net
+        sizes = (net.depth, self._n, net.heads, net.window, net.width // net.heads, self.device)
+        self._caches = [Cache(*sizes) for _ in range(self.seeds)]
         signature = self.policy.signature
         told = signature.action_features + signature.obs + 1
         self._before = torch.zeros(self.seeds, self._n, told, device=self.device)
@@ -155,11 +159,12 @@ class TransformerAgent(LearnedAgent):
     def choose(self, obs: Tensor) -> Tensor:
         """Its token stays if the step takes place: in a trial that waits for the others, it is written over."""
         scaled = self.obs(obs)
-        self._known = self.net(torch.cat([scaled, self._before], -1)[:, :, None], self._cache)[:, :, 0]
+        self._known = self.net(torch.cat([scaled, self._before], -1)[:, :, None], self._caches)[:, :, 0]
         return self.policy.sample(torch.cat([self._known, scaled], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
-        self._cache.count += step.mask.flatten().long()
+        for cache, mask in zip(self._caches, step.mask, strict=True):
+            cache.count += mask.long()
         self._before = torch.where(step.mask[..., None] > 0, self.before(step), self._before)
 
     def features(self) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn, less what its memory tells of its last action.
+"""Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn, whose memory is to forget its last action.
 
 What the memory knows of the action just taken is to be no more than what the expert's next action explains. The penalty
 is kernel-based, the Hilbert-Schmidt conditional independence criterion, HSCIC (Park and Muandet, 2020): the dependence
@@ -85,7 +85,7 @@ class PalrAgent(RecurrentAgent):
         columns = (memories[:, :, 1:], encode(batch.action[:, :, :-1]), encode(label[:, :, 1:]))
         drawn = (take_steps(column, index) for column in columns)
         # Seed by seed: a product over a stack may take another order for one seed than for several.
-        found = torch.stack([hscic(*one, self.config.ridge) for one in zip(*drawn, strict=True)])
+        found = torch.stack([hscic(x, y, given, self.config.ridge) for x, y, given in zip(*drawn, strict=True)])
         return found * (later.mask.flatten(1).sum(1) > 0)  # of padding alone, nothing leaks
 
     @torch.no_grad()

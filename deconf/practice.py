@@ -29,7 +29,7 @@ class Practice(VecEnv):
         """seed: of each environment. mean, std [O]: of the expert's observations."""
         self._batch, self._mean, self._std, self._reward = BatchEnv(task, n), mean, std, reward
         self._seed, self._actions = list(seed), int(getattr(task.action_space, "n", 0))
-        self._features = self._actions or task.action_space.shape[0]
+        self._features = self._actions or int(np.prod(task.action_space.shape or 1))
         width = len(task.observation) + self._features + 1
         seen = spaces.Box(-np.inf, np.inf, (width,), np.float32)
         super().__init__(n, seen, task.action_space)

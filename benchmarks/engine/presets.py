@@ -193,7 +193,7 @@ def _smoke(full: Preset) -> Preset:
         mean=replace(
             full.mean, **amounts, **({"inference_updates": 400} if bandit else {**few, "inference_updates": 20})
         ),
-        gail=replace(full.gail, rounds=30 if bandit else 2),
+        gail=replace(full.gail, rounds=20 if bandit else 2),
         rma=replace(full.rma, updates=500 if bandit else 60, rounds=2, teacher_updates=400),
         transformer=replace(full.transformer, updates=200 if bandit else 10),
         dropout=replace(full.dropout, updates=500 if bandit else 60),
