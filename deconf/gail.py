@@ -134,14 +134,15 @@ class GailAgent(LearnedAgent):
     def take(self, i: int, policy: Any) -> None:
         """The weights of Stable-Baselines3's policy, for seed i."""
         lstm = policy.lstm_actor
-        for own, weight, bias in (
+        for gate, weight, bias in (
             (self.lstm.input, lstm.weight_ih_l0, lstm.bias_ih_l0),
             (self.lstm.recurrent, lstm.weight_hh_l0, lstm.bias_hh_l0),
         ):
-            own.weight[i], own.bias[i, 0] = weight.T, bias
+            gate.weight[i], gate.bias[i, 0] = weight.T, bias
         theirs = [*policy.mlp_extractor.policy_net, policy.action_net]
         linear = [layer for layer in theirs if isinstance(layer, nn.Linear)]
-        for mine, layer in zip(filter(lambda x: isinstance(x, Linear), self.policy.net), linear, strict=True):
+        ours = [layer for layer in self.policy.net if isinstance(layer, Linear)]
+        for mine, layer in zip(ours, linear, strict=True):
             mine.weight[i], mine.bias[i, 0] = layer.weight.T, layer.bias
         if not self.policy.signature.actions:
             self.policy.log_std[i, 0] = policy.log_std
