@@ -1,7 +1,7 @@
 """Tier 3: expert queries, after DAgger (Ross et al., 2011). A recurrent policy learns from labels on its own roll-outs.
 
-This is on-policy distillation of a privileged expert: SequIL, and the counterfactual teaching of Ortega et al. (2021),
-are names for it where theta is hidden. It differs from DAgger in that roll-outs are the imitator's from the first on.
+It is on-policy distillation of a privileged expert: others call it SequIL, or counterfactual teaching (Ortega et al.,
+2021). Other than DAgger's, its roll-outs are never the expert's, nor a mixture with it: the first are random.
 
 The expert, which sees theta, is asked what it would do at each step that the imitator comes to. Actions in these
 histories are the imitator's, and so no evidence of theta: at its optimum this is the interventional policy (Ortega et

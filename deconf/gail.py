@@ -15,6 +15,7 @@ import contextlib
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -213,6 +214,8 @@ def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monit
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    if find_spec("sb3_contrib") is None:
+        raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
     rngs, monitor, signature = listed(rng), monitor or Monitor(), Signature.of(trials)
     seeds, draws = len(rngs), Draws(rngs, config.device)
     expert = Batch.of(trials, seeds, config.device)
@@ -256,10 +259,8 @@ def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monit
 
 def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
     """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
-    try:
-        from sb3_contrib import RecurrentPPO
-    except ImportError:
-        raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]") from None
+    from sb3_contrib import RecurrentPPO
+
     widths = [config.width, config.width]
     policy = {
         "lstm_hidden_size": config.width,

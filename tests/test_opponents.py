@@ -426,6 +426,21 @@ class TestGail:
         np.testing.assert_array_equal(np.random.get_state()[1], numbers)  # noqa: NPY002
 
 
+def test_gail_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gail, "find_spec", lambda name: None)
+    with pytest.raises(envs.InputError, match=r"^gail needs sb3-contrib; install deconfounded-imitation\[train\]$"):
+        made("gail")
+
+
+@pytest.mark.parametrize("method", ["deconfounded_mean", "gail", "rma"])
+def test_no_rounds_is_one_line(method: str) -> None:
+    part = {"deconfounded_mean": "mean"}.get(method, method)
+    preset = tiny_preset()
+    settings = replace(preset, **{part: replace(getattr(preset, part), rounds=0)})
+    with pytest.raises(envs.InputError, match="^rounds was 0; it must be at least 1$"):
+        MAKERS[method](Context(envs.get("bandit"), settings, [0]))
+
+
 class Unplugged(Monitor):
     """Keeps what training needs to go on; the first time, training ends when it has been saved `lasts` times."""
 
