@@ -26,7 +26,7 @@ from deconfounded.deconf.recurrent import RecurrentAgent, RecurrentConfig
 class PalrConfig(RecurrentConfig):
     """penalty: weight of the HSCIC; samples: steps of a chunk that it is estimated on; ridge: of its regression."""
 
-    penalty: float = 1.0
+    penalty: float = 0.1
     samples: int = 128
     ridge: float = 1e-2
 

@@ -437,7 +437,7 @@ def test_no_rounds_is_one_line(method: str) -> None:
     part = {"deconfounded_mean": "mean"}.get(method, method)
     preset = tiny_preset()
     settings = replace(preset, **{part: replace(getattr(preset, part), rounds=0)})
-    with pytest.raises(envs.InputError, match="^rounds was 0; it must be at least 1$"):
+    with pytest.raises(envs.InputError, match=r"^rounds was 0; it must be at least 1$"):
         MAKERS[method](Context(envs.get("bandit"), settings, [0]))
 
 
