@@ -20,17 +20,35 @@ def normalise(returns: Array, random: float, expert: float) -> Array:
     return (returns - random) / (expert - random)
 
 
-def bootstrap(values: Array) -> list[float] | None:
-    """95% percentile-bootstrap interval of the mean over seeds; None for a single seed.
+def bootstrap(values: Array) -> Array | None:
+    """95% percentile-bootstrap intervals [..., 2] of means over seeds, of values [S, ...]; None for a single seed.
 
-    Of few seeds it is too narrow: of three it is just their range, which holds the mean three times in four.
+    Of few seeds they are too narrow: of three they are just the range, which holds the mean three times in four.
     """
     if len(values) < 2:
         return None
-    if np.ptp(values) == 0:
-        return [float(values[0])] * 2
     interval = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=0).confidence_interval
-    return [float(interval.low), float(interval.high)]
+    return np.stack([interval.low, interval.high], -1)
+
+
+def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, dict[str, list[Any]]]:
+    """The mean over seeds of training curves, by kind of loss; of those that were noted at the same updates.
+
+    Where the method did something else for a while, the loss is None at one update in between: not to be bridged.
+    """
+    found = {}
+    for kind in dict.fromkeys(kind for curve in curves for kind in curve):
+        every = [curve[kind] for curve in curves if kind in curve]
+        update = every[0]["update"]
+        loss = np.mean([one["loss"] for one in every if one["update"] == update], 0)
+        gaps = 1 + np.flatnonzero(np.diff(update) > 1.5 * np.median(np.diff(update))) if len(update) > 1 else []
+        at = np.insert(np.array(update), gaps, [update[i - 1] + 1 for i in gaps])
+        between = np.insert(loss, gaps, np.nan)
+        found[kind] = {
+            "update": at.tolist(),
+            "loss": [None if np.isnan(value) else float(f"{value:.4g}") for value in between],
+        }
+    return found
 
 
 def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
@@ -53,12 +71,14 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
     for name, seeds in by_method.items():
         returns = means(name, "returns")
         scores = normalise(returns, random, expert)
+        band = bootstrap(scores)
         methods[name] = {
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
             "score_last": round(float(scores[:, episodes - 1].mean()), 4),
-            "ci95": bootstrap(scores[:, episodes - 1]),
+            "ci95": None if band is None else band[episodes - 1].tolist(),
+            "band": None if band is None else band.round(4).tolist(),
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": means(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
             "tier": seeds[0]["tier"],
@@ -67,6 +87,8 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
+        if curves := [record["curve"] for record in seeds if "curve" in record]:
+            methods[name]["curve"] = mean_curve(curves)
     return methods
 
 
