@@ -67,8 +67,8 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
 
 
 def thinned(curve: dict[str, list[tuple[int, float]]]) -> dict[str, dict[str, list[Any]]]:
-    """Losses (update, loss) by kind as a record holds them: four digits, and at least 50 points if there are as many."""
-    found = {}
+    """Losses (update, loss) by kind as a record holds them: four digits, at least 50 points if there are as many."""
+    found: dict[str, dict[str, list[Any]]] = {}
     for kind, points in curve.items():
         kept = [(update, loss) for update, loss in points[:: max(len(points) // 50, 1)] if np.isfinite(loss)]
         found[kind] = {"update": [at for at, _ in kept], "loss": [float(f"{loss:.4g}") for _, loss in kept]}
