@@ -279,12 +279,8 @@ function draw(details) {
   const box = details.querySelector(".learning");
   const trained = rows.filter((r) => !r.method.endsWith("_episode")); // the same agent, deployed otherwise
   const kinds = [...new Set(trained.flatMap((r) => Object.keys(r.curve)))];
-  for (const kind of kinds) {
-    const figure = document.createElement("figure");
-    figure.innerHTML = `<h3>${text(kind[0].toUpperCase() + kind.slice(1))} loss</h3><div></div>`;
-    box.append(figure);
-    learning(figure.lastElementChild, kind, trained.filter((r) => r.curve[kind]), { h: 200 });
-  }
+  box.innerHTML = kinds.map((kind) => `<figure><h3>${text(kind[0].toUpperCase() + kind.slice(1))} loss</h3><div></div></figure>`).join("");
+  kinds.forEach((kind, i) => learning(box.children[i].lastElementChild, kind, trained.filter((r) => r.curve[kind]), { h: 200 }));
 }
 
 const parts = [...document.querySelectorAll("details[data-task]")];
