@@ -103,17 +103,17 @@ class CheetahSpeed(MujocoTask):
         return np.exp(-2 * np.abs(self._off(next_state, theta))) - 0.1 * np.square(action).mean(-1)
 
     def painter(self, theta: Array) -> Painter:
-        """A post, which runs ahead at the hidden speed from where the cheetah starts."""
+        """A post runs along at the hidden speed, from the start; it is the lamp: red is too fast, blue too slow."""
         spec = self.spec()
         self.decorate(spec)
         render.chequer(spec, "MatPlane")
-        post, look = mujoco.mjtGeom.mjGEOM_CYLINDER, [0.9, 0.3, 0.2, 1]
-        spec.worldbody.add_site(name="pace", type=post, size=[0.04, 0.5, 0], pos=[0, 1, 0.5], rgba=look)
+        post, colours = mujoco.mjtGeom.mjGEOM_CYLINDER, {1: (0.9, 0.3, 0.2), -1: (0.2, 0.4, 0.9), 0: (0.6, 0.6, 0.6)}
+        spec.worldbody.add_site(name="lamp", type=post, size=[0.04, 0.5, 0], pos=[0, 1, 0.5])
         model = spec.compile()
-        drawn = render.Painter(model)
+        lamp, drawn = model.site("lamp"), render.Painter(model)
 
         def paint(state: Array, action: Array) -> NDArray[np.uint8]:
-            model.site("pace").pos[0] = theta[0] * state[0]
+            lamp.pos[0], lamp.rgba[:3] = theta[0] * state[0], colours[int(state[-1])]
             return drawn(state, action)
 
         return paint
