@@ -9,8 +9,8 @@ Latents: goal_x and goal_y, m, uniform, from where the ant starts. Noise a step:
 unit vector, each number with normal noise of std 1; at the start all are 0.
 
 The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator. Action: torques, in units of the
-MJCF's. Reward: exp(-d^2 / (2 .75^2)), d m from the goal, less .1 times the mean square of the action. An episode is
-5 s, and nothing ends it.
+MJCF's. Reward: .6 / (1 + (d / .75)^4) + .4 exp(-d^2 / (2 1.5^2)), d m from the goal, less .05 times the mean square of
+the action. An episode is 6 s, and nothing ends it.
 
 The authors' (Vuorio et al., TMLR 2024) has goals in a disc of 10 m, episodes of 200 steps, each a trial of its own, and
 the reward -|dx| - |dy|, with the same optimum; distance and heading, an angle, come with noise of std .1: a single look
@@ -59,7 +59,7 @@ class AntGoal(MujocoTask):
     def spec(self) -> mujoco.MjSpec:
         """Gymnasium's ant, with names, and without what is there only to be looked at."""
         spec = mujoco.MjSpec.from_file(str(files("gymnasium") / "envs" / "mujoco" / "assets" / "ant.xml"))
-        spec.option.timestep, spec.option.integrator = 0.0125, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        spec.option.timestep, spec.option.integrator = 0.015, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for i, body in enumerate(body for body in spec.bodies if not body.name):
             body.name = f"foot_{i + 1}"
         for actuator in spec.actuators:
@@ -103,7 +103,8 @@ class AntGoal(MujocoTask):
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         distance = self._bearings(next_state, theta)[..., 0]
-        return np.exp(-0.5 * (distance / 0.75) ** 2) - 0.1 * np.square(action).mean(-1)
+        there, near = 1 / (1 + (distance / 0.75) ** 4), np.exp(-0.5 * (distance / 1.5) ** 2)
+        return 0.6 * there + 0.4 * near - 0.05 * np.square(action).mean(-1)
 
     def painter(self, theta: Array) -> Painter:
         """The goal is a red disc."""

@@ -1,9 +1,9 @@
-"""The paper's HalfCheetah: a planar cheetah is to run at a hidden speed, and a lamp says, often wrongly, "too fast".
+"""The paper's HalfCheetah: a planar cheetah is to run at a hidden speed; a lamp tells, often wrongly, "too fast".
 
 Tier 2. theta acts through the reward and the lamp alone. The expert, which sees theta, picks up that speed within a
 second and holds it: from then on its own speed tells theta, loudly. A clone that takes its own speed for evidence runs
-on at whatever speed it happened to pick up. In truth only the lamp tells, of one speed at a time, the one it runs at:
-"faster than theta" or "slower", and a fifth of the time the wrong one.
+on at whatever speed it happened to pick up. In truth only the lamp tells, and only of the speed run at: faster than
+theta or slower, and a fifth of the time the wrong one.
 
 Latent: speed, m/s, uniform. Noise a step: std .02 m/s and .05 rad/s of the torso, .2 rad/s of the joints, none of
 positions; the lamp is wrong with probability .2, each step anew. It reads 1 (too fast) or -1, and 0 at the start.
@@ -11,8 +11,8 @@ positions; the lamp is wrong with probability .2, each step anew. It reads 1 (to
 The MJCF is Gymnasium's own, from the installed package. Action: torques, in units of the MJCF's. Reward: exp(-2 |v -
 theta|) less .1 times the mean square of the action, v the torso's speed, m/s. An episode is 5 s, and nothing ends it.
 
-The authors' (Vuorio et al., TMLR 2024) has another engine, episodes of 1,000 steps, each a trial of its own, and the
-reward -|v - theta| - .05 |a|^2, with the same optimum; their lamp starts as -1 and is turned the other way.
+The authors' own (Vuorio et al., TMLR 2024) has another engine, episodes of 1,000 steps, each a trial by itself, and the
+reward -|v - theta| - .05 |a|^2, best at the same speed; their indicator starts as -1, and is turned the other way.
 """
 
 from __future__ import annotations
