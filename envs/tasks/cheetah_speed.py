@@ -17,8 +17,6 @@ reward -|v - theta| - .05 |a|^2, best at the same speed; their indicator starts 
 
 from __future__ import annotations
 
-from importlib.resources import files
-
 import mujoco
 import numpy as np
 from gymnasium import spaces
@@ -29,6 +27,7 @@ from deconfounded.envs import render
 from deconfounded.envs.physics import Edit, MujocoTask
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array, Latent, Painter
+from deconfounded.envs.tasks import gymnasium_body
 
 WRONG = 0.2  # probability
 MASS = 14.0  # of the cheetah, kg
@@ -58,19 +57,12 @@ class CheetahSpeed(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """Gymnasium's half cheetah, without what is there only to be looked at."""
-        spec = mujoco.MjSpec.from_file(str(files("gymnasium") / "envs" / "mujoco" / "assets" / "half_cheetah.xml"))
-        spec.option.timestep = 0.0125
+        """Gymnasium's half cheetah, which weighs what its MJCF says by an attribute that MuJoCo will drop."""
+        spec = gymnasium_body.load("half_cheetah", 0.0125)
         spec.compiler.settotalmass = -1
         mass = spec.compile().body_mass.sum()
         for geom in spec.geoms:
             geom.density *= MASS / mass
-        for material in spec.materials:
-            material.textures = [""] * len(material.textures)
-        for texture in spec.textures:
-            spec.delete(texture)
-        for light in spec.lights:
-            light.name = "sun"
         spec.camera("track").name = "view"
         return spec
 
