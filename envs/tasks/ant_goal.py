@@ -6,7 +6,7 @@ happened to set out to, and stays there. In truth only the bearings tell, a litt
 
 Latents: goal_x and goal_y, m, uniform, from where the ant starts. Noise a step: std .02 m/s and .05 rad/s of the torso,
 .1 rad/s of the joints, none of positions. Bearings, new each step: the distance of the goal, m, and its direction as a
-unit vector, each number with normal noise of std .7; at the start all are 0.
+unit vector, each number with normal noise of std 2; at the start all are 0.
 
 The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator, and springs for motors: an action is
 the angles that joints are pulled to, and PPO learns to walk much sooner than by torques. Reward: .6 / (1 + (d / .5)^4)
@@ -14,7 +14,8 @@ the angles that joints are pulled to, and PPO learns to walk much sooner than by
 
 The authors' own (Vuorio et al., TMLR 2024) has torques, goals in a disc of 10 m, episodes of 200 steps, each a trial by
 itself, and the reward -|dx| - |dy| less a small cost of contacts, with the same optimum; distance and heading, an
-angle, come with noise of std .1: of goals as near as ours, a single look would tell.
+angle, come with noise of std .1. Of goals as near as ours a single look would then tell: with std .7 already, a clone
+without memory scored .91.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from deconfounded.envs.tasks import gymnasium_body
 FAR = 1.0  # of goals, m
 STIFF, DAMPED = 150.0, 20.0  # of joints, N m/rad and N m s/rad
 CENTRES, SWINGS = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([0.5, 0.35] * 4)  # rad
-BLUR = 0.7  # of bearings
+BLUR = 2.0  # of bearings
 ANKLES = (1, -1, -1, 1)  # bent by, standing, rad
 LEGS = {f"{part}_{i + 1}": angle for i, bent in enumerate(ANKLES) for part, angle in (("hip", 0), ("ankle", bent))}
 ROOT = {"x": (-20, 20), "y": (-20, 20), "z": (-2, 5), **{f"rotation_{axis}": (-1, 1) for axis in "wxyz"}}
@@ -54,7 +55,7 @@ class AntGoal(MujocoTask):
     observation = {
         **{**ROOT, **{joint: (-3, 3) for joint in LEGS}, **MOVES},
         **{f"{joint}_velocity": (-60, 60) for joint in LEGS},
-        **{"goal_distance": (-10, 30), "goal_cos": (-8, 8), "goal_sin": (-8, 8)},
+        **{"goal_distance": (-15, 30), "goal_cos": (-15, 15), "goal_sin": (-15, 15)},
     }
 
     def spec(self) -> mujoco.MjSpec:
