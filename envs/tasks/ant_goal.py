@@ -65,7 +65,7 @@ class AntGoal(MujocoTask):
         for actuator in spec.actuators:
             actuator.set_to_position(kp=STIFF, kv=DAMPED)
             actuator.gear[0], actuator.ctrllimited = 1, False
-        spec.worldbody.add_camera(name="view", pos=[0, -4.4, 4.4], quat=[0.9239, 0.3827, 0, 0])
+        spec.worldbody.add_camera(name="view", pos=[0, -3, 3], quat=[0.9239, 0.3827, 0, 0])
         return spec
 
     def control(self, action: Array) -> Array:
