@@ -22,6 +22,8 @@ SUITE = (
     "icy_stop",
     "weak_thruster",
     "lopsided_block",
+    "cheetah_speed",
+    "ant_goal",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
