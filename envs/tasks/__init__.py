@@ -18,6 +18,8 @@ SUITE = (
     "slippery_walker",
     "hidden_goal",
     "forked_path",
+    "curling",
+    "swapped_lander",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
