@@ -20,6 +20,7 @@ SUITE = (
     "forked_path",
     "curling",
     "swapped_lander",
+    "windy_drone",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case

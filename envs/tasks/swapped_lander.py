@@ -1,9 +1,10 @@
 """A lander whose side engines may be wired the wrong way round: only the expert knows which way they push.
 
-Tier 2. After the LunarLander of Vuorio et al. (Deconfounding Imitation Learning with Variational Inference, TMLR 2024),
-whose two side engines are swapped with probability 1/2. Theirs is gym's, with discrete actions, deterministic dynamics
-and 500 steps, and ends once the lander is at rest. This one is a planar body in MuJoCo with continuous thrust, under
-process noise, and an episode is 150 steps of .05 s, the last of which it spends on the pad.
+Tier 2. After the LunarLander of the published paper (Deconfounding Imitation Learning with Variational Inference, TMLR
+2024), whose side engines are swapped with probability 1/2; read off its figure, the oracle and the deconfounded agent
+returned about 235 there, the naive one -20. Theirs is gym's, of discrete actions, dynamics without noise and 500
+steps; this one is a planar body in MuJoCo with continuous thrust, under process noise, and an episode is 150 steps of
+.05 s, the last of which it stands on the pad.
 
 Who mistakes the wiring turns every correction into a push the wrong way, and tumbles. The side engine is weak: a step
 shows its sign only through noise, a few seconds of steering tell. Who takes its own side thrust for evidence never
