@@ -24,6 +24,9 @@ SUITE = (
     "lopsided_block",
     "cheetah_speed",
     "ant_goal",
+    "curling",
+    "swapped_lander",
+    "windy_drone",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
