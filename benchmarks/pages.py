@@ -1,4 +1,7 @@
-"""Write the pages of docs/ and README's tables anew, from what is kept in docs/: `python benchmarks/pages.py`"""
+"""Write the pages of docs/ and README's tables anew, from what is kept in docs/: `python benchmarks/pages.py`
+
+With --still also docs/index.png, README's picture of docs/index.html; that takes Chromium.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,20 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.output import pages
+from deconfounded.benchmarks.output.browser import Browser
+from deconfounded.envs.files import write_atomically
 
 
 def main() -> None:
     """The command line."""
-    Parser(__doc__).parse_args()
+    parser = Parser(__doc__)
+    parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")
+    still = parser.parse_args().still
     pages.write()
+    if still:
+        with Browser(1280, 960) as browser:
+            browser.open(pages.DOCS / "index.html")
+            write_atomically(pages.DOCS / "index.png", browser.picture())
     print(pages.summary())
 
 

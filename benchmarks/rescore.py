@@ -62,9 +62,10 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
         found[name] = run_trials(env, one, task.episodes, seed)[1]
     best, worst = found["expert"].mean(), found["random"].mean()
     by_trial = score.normalise(found["agent"], worst, best)
+    interval = score.bootstrap(by_trial[:, -1])
     return {
         "score": by_trial.mean(0).round(4).tolist(),
-        "ci95_last": score.bootstrap(by_trial[:, -1]),
+        "ci95_last": None if interval is None else interval.tolist(),
         "return": {name: returns.mean(0).round(4).tolist() for name, returns in found.items()},
     }
 

@@ -52,6 +52,7 @@ def main() -> None:
     progress = Progress(args.steps, "training")
     weights = train(task, args.steps, args.seed, progress.update)
     progress.close()
+    file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
     write_atomically(file, to_bytes(weights))
     env = envs.BatchEnv(task, 256)
     _, returns = run_trials(env, ExpertAgent(env, policy.load(task, file)), 1, seed=args.seed)

@@ -1,5 +1,8 @@
 """Tier 3: expert queries, after DAgger (Ross et al., 2011). A recurrent policy learns from labels on its own roll-outs.
 
+It is on-policy distillation of a privileged expert: others call it SequIL, or counterfactual teaching (Ortega et al.,
+2021). Other than DAgger's, its roll-outs are never the expert's, nor a mixture with it: the first are random.
+
 The expert, which sees theta, is asked what it would do at each step that the imitator comes to. Actions in these
 histories are the imitator's, and so no evidence of theta: at its optimum this is the interventional policy (Ortega et
 al., 2021), whatever the dynamics tell. Expert roll-outs are not used: their actions would be evidence.

@@ -21,7 +21,7 @@ from deconfounded.envs.adapters import GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.probe import Skipped, actions, far_thetas, refused, require, same, streams
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, Task
 
 
 def no_leak(task: Task) -> None:
@@ -242,18 +242,22 @@ def log_prob_is_the_density_of_the_noise(task: Task) -> None:
 
 
 def log_sense_is_the_density_of_the_readings(task: Task) -> None:
-    """As above, of what sensors read in one state under one theta, and under another near by; 4,000 draws.
+    """As above, of what sensors read under one theta, and under another near by; 4,000 states of random episodes.
 
     A task whose theta moves no state must do so, and have readings that tell.
     """
-    batch, m = BatchEnv(task, 1), 4000
+    batch, m = BatchEnv(task, 50), 4000
     thetas = task.theta_grid(9)[[0, -1]]
     batch.reset(0)
     action = actions(task, 1, 1)[0]
-    outcomes = task.outcome(np.repeat(batch.state, 2, 0), np.repeat(action, 2, 0), thetas)
+    outcomes = task.outcome(np.repeat(batch.state[:1], 2, 0), np.repeat(action, 2, 0), thetas)
     if not task.moves_state:
         same(outcomes[1], outcomes[0], f"outcomes of thetas {thetas.tolist()}, which is said to move no state,")
-    state = np.repeat(outcomes[:1], m, 0)
+    seen: list[Array] = []
+    for action in actions(task, batch.n, m // batch.n):
+        batch.step(action)
+        seen.append(batch.state)
+    state = np.concatenate(seen)
     noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
     drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), noise)
     if (drawn == state).all():

@@ -20,6 +20,7 @@ from deconfounded.envs.physics import Edit, ModelEdit
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
+from deconfounded.experts import policy
 
 
 class MissingFile(SlipperyCartpole):
@@ -311,3 +312,15 @@ def test_commands_check_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         with pytest.raises(envs.InputError, match=r"^reward of slippery_cartpole gave"):
             main()
         assert not out.parent.exists()
+
+
+def test_an_expert_trained_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Weights in place of others of the same name are not held to the card of those."""
+    task, file = envs.get("slippery_cartpole"), tmp_path / "x.safetensors"
+    monkeypatch.setattr("sys.argv", ["command", "--task", task.name, "--out", str(file)])
+    for bias in (0.0, 0.1):
+        weights = {"0.weight": np.zeros((1, 7), np.float32), "0.bias": np.full(1, bias, np.float32)}
+        monkeypatch.setattr("deconfounded.experts.ppo.train", lambda *_, weights=weights: weights)
+        train.main()
+    kept = policy.load(task, file).mean(np.zeros((1, 6), np.float32), np.zeros((1, 1)))
+    np.testing.assert_allclose(kept, 0.1, rtol=1e-6)

@@ -454,6 +454,7 @@ def test_pages_are_up_to_date() -> None:
     for text, now in (
         ((docs / "tasks.md").read_text(), pages.tasks_page()),
         ((docs / "results.md").read_text(), pages.results_page()),
+        ((docs / "index.html").read_text(), pages.index_page()),
         ((docs / "speed.md").read_text(), pages.speed()),
         (readme, pages.readme()),
     ):

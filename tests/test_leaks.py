@@ -15,7 +15,18 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import dagger, deconfounded, models, naive_rnn, offline
+from deconfounded.deconf import (
+    dagger,
+    deconfounded,
+    deconfounded_mean,
+    gail,
+    models,
+    naive_obs,
+    naive_rnn,
+    naive_transformer,
+    offline,
+    palr,
+)
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, Signature
@@ -127,14 +138,25 @@ class TestData:
         assert len(list(tmp_path.iterdir())) == 2
 
     @pytest.mark.parametrize("name", ["bandit", CONTROL, "slippery_walker"])
-    @pytest.mark.parametrize("method", ["deconfounded", "deconfounded_offline", "naive_rnn", "dagger"])
+    @pytest.mark.parametrize(
+        "method",
+        [
+            *("deconfounded", "deconfounded_offline", "deconfounded_mean", "gail"),
+            *("naive_rnn", "naive_obs", "naive_transformer", "palr", "dagger"),
+        ],
+    )
     def test_methods_are_handed_no_theta(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """Demonstrations are the context's, explorations a plain environment's: again from their seeds, bit for bit."""
         task = envs.get(name)
         modules = {
             "deconfounded": deconfounded,
             "deconfounded_offline": offline,
+            "deconfounded_mean": deconfounded_mean,
+            "gail": gail,
             "naive_rnn": naive_rnn,
+            "naive_obs": naive_obs,
+            "naive_transformer": naive_transformer,
+            "palr": palr,
             "dagger": dagger,
         }
         handed: list[Any] = []
@@ -150,7 +172,7 @@ class TestData:
         if method != "dagger":
             np.testing.assert_array_equal(handed[0].obs, Context(task, tiny_preset(), [0]).demonstrations.obs)
             assert handed[0].obs.shape[-1] == len(task.observation)
-        if method not in ("deconfounded", "dagger"):
+        if method not in ("deconfounded", "deconfounded_mean", "dagger"):
             return
         roll_out = handed[0] if method == "dagger" else handed[1]
         given = roll_out(None, [np.random.default_rng(7)])

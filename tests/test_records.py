@@ -43,7 +43,7 @@ class TestIdentity:
             ("deconf/naive_rnn.py", {"naive_rnn"}),
             ("deconf/dagger.py", {"dagger"}),
             ("deconf/exact.py", {"conditional", "interventional"}),
-            ("deconf/recurrent.py", {"naive_rnn", "dagger"}),
+            ("deconf/recurrent.py", {"naive_rnn", "dagger", "naive_obs", "naive_dropout", "naive_transformer", "palr"}),
             ("envs/tasks/icy_road.py", set()),
             ("envs/tasks/slippery_cartpole.py", set(METHODS)),
             ("envs/render.py", set()),
@@ -348,6 +348,5 @@ def test_table_makes_what_is_missing(
     ]
     assert table() == table("--list") == ""
     (place / "expert-1.json").unlink()
-    other = json.loads((place / "random-0.json").read_text())
-    (place / "random-0.json").write_text(json.dumps({**other, "code": "0" * 64}))
+    records.write(tmp_path / "records", {**records.read(place / "random-0.json"), "code": "0" * 64})
     assert table("--list").splitlines() == [f"bandit, {m}: 1 of 2 seeds are missing" for m in ("expert", "random")]

@@ -6,8 +6,14 @@ from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.deconfounded_mean import MeanConfig
+from deconfounded.deconf.gail import GailConfig
+from deconfounded.deconf.naive_obs import DropoutConfig
+from deconfounded.deconf.naive_transformer import TransformerConfig
 from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.palr import PalrConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.deconf.rma import RmaConfig
 
 
 def tiny_preset() -> Preset:
@@ -29,4 +35,10 @@ def tiny_preset() -> Preset:
         naive=RecurrentConfig(updates=2, batch=4),
         dagger=DaggerConfig(updates=2, rounds=2, batch=4),
         cloning=CloningConfig(updates=3, batch=64),
+        mean=MeanConfig(**few, inference_steps=64),
+        gail=GailConfig(width=16, rounds=2, envs=2, steps=32, epochs=1, minibatch=32, discriminator_updates=2),
+        rma=RmaConfig(updates=2, rounds=2, batch=4, teacher_updates=3, teacher_batch=64),
+        transformer=TransformerConfig(updates=2, batch=4, width=16, heads=2),
+        dropout=DropoutConfig(updates=2, batch=4),
+        palr=PalrConfig(updates=2, batch=4, samples=32),
     )

@@ -2,14 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
-from deconfounded.benchmarks.engine.context import Allowed, Context
-from deconfounded.deconf import cloning, dagger, deconfounded, naive_rnn, offline
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded.benchmarks.engine.context import EXPLORATION, Allowed, Context, stream
+from deconfounded.deconf import (
+    cloning,
+    dagger,
+    deconfounded,
+    deconfounded_mean,
+    gail,
+    naive_obs,
+    naive_rnn,
+    naive_transformer,
+    offline,
+    palr,
+    rma,
+)
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.exact import ExactAgent
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent
+from deconfounded.envs.task import Array
+from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, thetas, trial_seeds
+
+if TYPE_CHECKING:
+    from deconfounded.deconf.practice import Practice
 
 
 def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent]:
@@ -35,6 +56,43 @@ def _naive_rnn(context: Context | Allowed) -> dict[str, Agent]:
 
 def _dagger(context: Context | Allowed) -> dict[str, Agent]:
     return {"dagger": dagger.fit(context.query, context.preset.dagger, context.rngs, context.monitor)}
+
+
+def _mean(context: Context | Allowed) -> dict[str, Agent]:
+    data, explore = context.demonstrations, context.explore
+    return {
+        "deconfounded_mean": deconfounded_mean.fit(data, explore, context.preset.mean, context.rngs, context.monitor)
+    }
+
+
+def _clone(context: Context | Allowed, name: str, fit: Callable[..., Agent], config: Any) -> dict[str, Agent]:
+    return {name: fit(context.source(context.preset.fresh > 0), config, context.rngs, context.monitor)}
+
+
+def _rma(context: Context | Allowed) -> dict[str, Agent]:
+    encode, task = context.task.encode_theta, context.task
+
+    def tell(agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, Array]:
+        """Explorations, and their thetas, drawn once more from the seeds that `explore` is about to draw."""
+        seeds = [stream(EXPLORATION, int(copy.deepcopy(rng).integers(2**31))) for rng in rngs]
+        trials = context.explore(agent, rngs)
+        context.monitor.spend("thetas", [len(trials) // len(rngs)] * len(rngs))
+        return trials, encode(thetas(task, len(trials), task.episodes, seeds))
+
+    context.monitor.spend("thetas", [context.preset.expert_trials] * len(context.seeds))
+    theta = encode(context.demonstrated_theta)
+    agent = rma.fit(context.demonstrations, theta, tell, context.preset.rma, context.rngs, context.monitor)
+    return {"rma": agent}
+
+
+def _gail(context: Context | Allowed) -> dict[str, Agent]:
+    def practise(n: int, seed: int, mean: NDArray[Any], std: NDArray[Any], reward: Any) -> Practice:
+        """Environments under thetas that nobody is told."""
+        from deconfounded.deconf.practice import Practice
+
+        return Practice(context.task, n, trial_seeds(n, stream(EXPLORATION, seed)), mean, std, reward)
+
+    return {"gail": gail.fit(context.demonstrations, practise, context.preset.gail, context.rngs, context.monitor)}
 
 
 def _oracle(context: Context | Allowed) -> dict[str, Agent]:
@@ -68,7 +126,16 @@ MAKERS: dict[str, Callable[[Context | Allowed], dict[str, Agent]]] = {
     ),
     "deconfounded_discrete": lambda context: _deconfounded(context, "deconfounded_discrete", context.preset.discrete),
     "deconfounded_offline": _offline,
+    "deconfounded_mean": _mean,
     "dagger": _dagger,
+    "gail": _gail,
+    "rma": _rma,
+    "naive_transformer": lambda context: _clone(
+        context, "naive_transformer", naive_transformer.fit, context.preset.transformer
+    ),
+    "naive_obs": lambda context: _clone(context, "naive_obs", naive_obs.fit, context.preset.naive),
+    "naive_dropout": lambda context: _clone(context, "naive_dropout", naive_obs.fit_dropout, context.preset.dropout),
+    "palr": lambda context: _clone(context, "palr", palr.fit, context.preset.palr),
     "naive_rnn": _naive_rnn,
     "oracle_bc": _oracle,
     "blind_bc": _blind,

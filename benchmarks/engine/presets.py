@@ -13,8 +13,14 @@ from deconfounded import envs
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.deconfounded_mean import MeanConfig
+from deconfounded.deconf.gail import GailConfig
+from deconfounded.deconf.naive_obs import DropoutConfig
+from deconfounded.deconf.naive_transformer import TransformerConfig
 from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.palr import PalrConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.deconf.rma import RmaConfig
 
 MOST = 1e9  # of any amount
 
@@ -36,9 +42,18 @@ class Preset:
     naive: RecurrentConfig
     dagger: DaggerConfig
     cloning: CloningConfig
+    mean: MeanConfig
+    gail: GailConfig
+    rma: RmaConfig
+    transformer: TransformerConfig
+    dropout: DropoutConfig
+    palr: PalrConfig
 
 
-CONFIGS = ("deconfounded", "discrete", "offline", "naive", "dagger", "cloning")  # of a preset's fields
+CONFIGS = (
+    *("deconfounded", "discrete", "offline", "naive", "dagger", "cloning"),
+    *("mean", "gail", "rma", "transformer", "dropout", "palr"),
+)  # of a preset's fields
 
 _ON_CONTROL = DeconfoundedConfig(
     inference_updates=500,
@@ -63,6 +78,12 @@ _CONTROL = Preset(
     naive=RecurrentConfig(),
     dagger=DaggerConfig(updates=4500, learning_rate=2e-3),
     cloning=CloningConfig(),
+    mean=MeanConfig(),
+    gail=GailConfig(),
+    rma=RmaConfig(updates=3000, learning_rate=2e-3),
+    transformer=TransformerConfig(),
+    dropout=DropoutConfig(),
+    palr=PalrConfig(),
 )
 _ON_BANDIT = DeconfoundedConfig(
     rounds=2,
@@ -102,6 +123,25 @@ _BANDIT = Preset(
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
     dagger=DaggerConfig(updates=500, batch=128, chunk=50, learning_rate=1e-2),
     cloning=CloningConfig(updates=500),
+    mean=MeanConfig(
+        latent=5,
+        beta=0.01,
+        ahead=1,
+        rounds=2,
+        inference_updates=600,
+        inference_batch=64,
+        shortest=1.0,
+        inference_steps=6400,
+        inference_rate=3e-3,
+        imitation_updates=800,
+        final_updates=3200,
+        imitation_rate=3e-3,
+    ),
+    gail=GailConfig(rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9),
+    rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=1e-2, teacher_updates=500),
+    transformer=TransformerConfig(width=32, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
+    dropout=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    palr=PalrConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
 )
 
 
@@ -154,6 +194,14 @@ def _smoke(full: Preset) -> Preset:
         naive=replace(full.naive, updates=500 if bandit else 60),
         dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
         cloning=replace(full.cloning, updates=400),
+        mean=replace(
+            full.mean, **amounts, **({"inference_updates": 400} if bandit else {**few, "inference_updates": 20})
+        ),
+        gail=replace(full.gail, rounds=20 if bandit else 2),
+        rma=replace(full.rma, updates=500 if bandit else 60, rounds=2, teacher_updates=400),
+        transformer=replace(full.transformer, updates=200 if bandit else 10),
+        dropout=replace(full.dropout, updates=500 if bandit else 60),
+        palr=replace(full.palr, updates=500 if bandit else 60),
     )
 
 

@@ -15,7 +15,7 @@ from matplotlib.colors import ListedColormap
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.pool import Finished, by_method
-from deconfounded.benchmarks.output.report import COLOURS
+from deconfounded.benchmarks.output.colours import colour
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.envs.files import save_figure
 from deconfounded.envs.task import Array
@@ -71,13 +71,13 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
             else:
                 curves = smoothed(curves)
             mean, error = curves.mean(0), curves.std(0, ddof=len(curves) > 1) / len(curves) ** 0.5
-            (line,) = panel.plot(x, mean, color=COLOURS.get(method), label=method)
+            (line,) = panel.plot(x, mean, color=colour(method), label=method)
             panel.fill_between(x, mean - error, mean + error, color=line.get_color(), alpha=0.3, lw=0)
     for name, entry in references.items():
         for panel, key in zip(panels[:2], ("on_expert", "online"), strict=True):
-            panel.plot(np.arange(1, 101), smoothed(entry[key][None])[0], "--", color=COLOURS[name], lw=1, label=name)
+            panel.plot(np.arange(1, 101), smoothed(entry[key][None])[0], "--", color=colour(name), lw=1, label=name)
         for panel, key in zip(panels[2:], ("loss", "pulls"), strict=True):
-            panel.axhline(entry[key], ls="--", color=COLOURS[name], lw=1)
+            panel.axhline(entry[key], ls="--", color=colour(name), lw=1)
     for panel in panels[:2]:
         panel.set(xlabel="step", ylabel="P(best arm)", ylim=(0.15, 0.65))
     for panel in panels[2:]:

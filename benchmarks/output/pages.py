@@ -1,7 +1,7 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
-Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md (of the records
-that `publish.py` kept) and the tables in README and docs/speed.md.
+Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
+docs/index.html (of the records that `publish.py` kept) and the tables in README and docs/speed.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import records, score
+from deconfounded.benchmarks.output import index, records, score
 from deconfounded.envs.files import write_atomically
 
 README = Path(__file__).resolve().parents[2] / "README.md"
@@ -59,13 +59,17 @@ def _published() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
             yield task, records.gather(found, list(METHODS))
 
 
-def command(task: envs.Task, results: dict[str, Any]) -> str:
-    """That makes the results."""
+def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
+    """That makes the results, or those of one method."""
     methods = [name for name in METHODS if name in results["methods"]]
     asked = " ".join(name for name in methods if name not in REFERENCES)
     named = "" if methods == list(DEFAULT) else f" --methods {asked}"
-    chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     seeds = len(results["seeds"])
+    if method and method not in REFERENCES:
+        seeds = len(results["methods"][method]["seeds"])
+        base = method.removesuffix("_episode")
+        named = f" --methods {base if base in METHODS else f'path/{base}.py:fit'}"
+    chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
     changed = f" --set {' '.join(results['set'])}" if "set" in results else ""
     return f"python benchmarks/run.py --task {task.name}{chosen}{changed}{counted}{named}"
@@ -265,8 +269,16 @@ def tasks_page() -> str:
     return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"
 
 
+def index_page() -> str:
+    """docs/index.html."""
+    certified = {task.name: found for task, found in _certified()}
+    tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
+    return index.page(DOCS, list(_published()), certified, command, tiers)
+
+
 def write() -> None:
     """Bring all of them up to date."""
+    write_atomically(DOCS / "index.html", index_page())
     write_atomically(DOCS / "tasks.md", tasks_page())
     write_atomically(DOCS / "results.md", results_page())
     write_atomically(DOCS / "speed.md", speed())

@@ -32,6 +32,7 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     found = []
     for name in meta["agents"]:
         returns = data[f"{name}/returns"]
+        curve = {"curve": thinned(meta["curve"])} if meta["curve"] else {}
         found.append(
             {
                 "schema": 1,
@@ -60,8 +61,18 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
                 "commit": meta["commit"],
                 "versions": made["versions"],
                 "machine": meta["machine"],
+                **curve,
             }
         )
+    return found
+
+
+def thinned(curve: dict[str, list[tuple[int, float]]]) -> dict[str, dict[str, list[Any]]]:
+    """Losses (update, loss) by kind as a record holds them: four digits, at least 50 points if there are as many."""
+    found: dict[str, dict[str, list[Any]]] = {}
+    for kind, points in curve.items():
+        kept = [(update, loss) for update, loss in points[:: max(len(points) // 50, 1)] if np.isfinite(loss)]
+        found[kind] = {"update": [at for at, _ in kept], "loss": [float(f"{loss:.4g}") for _, loss in kept]}
     return found
 
 
@@ -93,6 +104,8 @@ def check(record: Any, where: str) -> Record:
         raise InputError(f"{where} is no record: spans must end after they begin")
     if len({len(record[key]) for key in ("returns", "returns_sd", "objective")}) > 1:
         raise InputError(f"{where} is no record: returns, returns_sd and objective must be of as many episodes")
+    if any(len(curve["update"]) != len(curve["loss"]) for curve in record.get("curve", {}).values()):
+        raise InputError(f"{where} is no record: a curve must have as many losses as updates")
     return record
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import matplotlib
 
 matplotlib.use("Agg")
-import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -20,23 +19,10 @@ from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.jobs import CLIPPED
 from deconfounded.benchmarks.engine.pool import Finished
 from deconfounded.benchmarks.output import film, records, score
+from deconfounded.benchmarks.output.colours import colour
+from deconfounded.benchmarks.output.index import template
 from deconfounded.envs import outside
 from deconfounded.envs.files import save_figure, write_atomically, write_json
-
-COLOURS = {
-    "expert": "black",
-    "interventional": "tab:green",
-    "conditional": "tab:red",
-    "deconfounded": "tab:blue",
-    "deconfounded_gru": "tab:cyan",
-    "deconfounded_discrete": "tab:purple",
-    "deconfounded_offline": "tab:olive",
-    "dagger": "tab:pink",
-    "naive_rnn": "tab:orange",
-    "oracle_bc": "tab:gray",
-    "blind_bc": "tab:brown",
-    "random": "lightgray",
-}
 
 
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
@@ -62,12 +48,8 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
     """Curves, and a video where a GL works."""
     adaptation(results, folder / "adaptation.png")
-    curves: dict[str, list[dict[str, Any]]] = {}
     clips: dict[str, dict[str, Any]] = {}
-    for method, _, data in finished:
-        curve = data["meta"]["curve"]  # of all seeds of a group
-        if curve and curve not in curves.setdefault(method, []):
-            curves[method].append(curve)
+    for *_, data in finished:
         for name in CLIPPED:
             if f"{name}/state" in data:
                 clip = {key: data[f"{name}/{key}"] for key in ("state", "action", "episode")}
@@ -75,7 +57,8 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
                 if f"{name}/read" in data:
                     clip["belief"] = film.decoded(task, data[f"{name}/read"])
                 clips[name] = clip
-    learning(curves, task.name, folder / "learning.png")
+    learning(results, folder / "learning.png")
+    beliefs(task, {name: clip for name, clip in clips.items() if "belief" in clip}, folder / "beliefs.png")
     try:
         film.write(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except Exception as error:  # no GL, or no encoder: the run is good all the same
@@ -83,15 +66,19 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
-    """Score over the episodes of a trial, each method a line; later episodes than were trained on are shaded."""
+    """Score over the episodes of a trial, each method a line in its 95% band; later episodes than trained on shaded."""
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     trained = 0
     for name, entry in results["methods"].items():
         values = entry["score"] + entry.get("score_beyond", [])
-        trained = len(entry["score"])
+        trained, at = len(entry["score"]), range(1, len(values) + 1)
         base = name.removesuffix("_episode")  # dotted: another way to deploy the same agent
         style = ":" if base != name else "--" if name in (*EXACT, *REFERENCES) else "-"
-        axes.plot(range(1, len(values) + 1), values, style, marker="o", ms=4, color=COLOURS.get(base), label=name)
+        axes.plot(at, values, style, marker="o", ms=4, color=colour(name), label=name)
+        if entry["band"]:
+            axes.fill_between(at, *np.transpose(entry["band"]), color=colour(name), alpha=0.12, lw=0)
+            if len(values) == 1:
+                axes.vlines(at, *np.transpose(entry["band"]), color=colour(name))
     longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
     if longest > trained:
         axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
@@ -103,36 +90,77 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     plt.close(figure)
 
 
-def learning(curves: dict[str, list[dict[str, Any]]], title: str, file: Path) -> None:
-    """Training losses over updates, one panel a loss; a thin line a group of seeds that trained side by side."""
-    kinds = sorted({kind for seeds in curves.values() for curve in seeds for kind in curve})
-    figure, panels = plt.subplots(1, max(len(kinds), 1), figsize=(4.5 * max(len(kinds), 1), 3.4), layout="constrained")
-    for panel, kind in zip(np.atleast_1d(panels), kinds, strict=False):
-        for name, seeds in curves.items():
-            for i, curve in enumerate(curve for curve in seeds if kind in curve):
-                label = name if i == 0 else None
-                panel.plot(*np.array(curve[kind]).T, color=COLOURS.get(name), lw=0.9, alpha=0.8, label=label)
-        panel.set(xlabel="update", title=f"{title}: {kind} loss")
+def learning(results: dict[str, Any], file: Path) -> None:
+    """Training losses over updates, one panel a kind of loss, the mean over seeds; none where a round did another."""
+    curves = {
+        name: entry["curve"]
+        for name, entry in results["methods"].items()
+        if "curve" in entry and not (name.endswith("_episode") and name.removesuffix("_episode") in results["methods"])
+    }
+    kinds = list(dict.fromkeys(kind for curve in curves.values() for kind in curve))
+    if not kinds:
+        return
+    figure, panels = plt.subplots(1, len(kinds), figsize=(4.5 * len(kinds), 3.4), layout="constrained", squeeze=False)
+    for panel, kind in zip(panels[0], kinds, strict=True):
+        for name, curve in curves.items():
+            if kind in curve:
+                loss = np.array(curve[kind]["loss"], float)
+                panel.plot(curve[kind]["update"], loss, color=colour(name), lw=1.2, label=name)
+        panel.set(xlabel="update", title=f"{kind} loss")
         panel.legend(frameon=False, fontsize=8)
     save_figure(figure, file, 110)
     plt.close(figure)
 
 
-_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ results.task }}</title>
-<style>body{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}
-img,video{max-width:100%}table{border-collapse:collapse}td,th{padding:.2rem .8rem;text-align:right;
-border-bottom:1px solid #ddd}td:first-child,th:first-child{text-align:left}</style>
-<h1>{{ results.task }} (v{{ results.task_version }}), preset {{ results.preset }}</h1>
-<p>Scores: 0 = random actions, 1 = the expert that sees theta. {{ results.seeds|length }} seed(s),
-{{ results.eval_trials }} trials each, {{ "%.0f"|format(results.wall_s) }} s.</p>
-<table><tr>{% for name in columns %}<th>{{ name }}{% endfor %}</tr>
-{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}{% endfor %}</tr>
-{% endfor %}</table>
-{% for name, data in pictures %}<h2>{{ name }}</h2><img alt="{{ name }}" src="data:image/png;base64,{{ data }}">
-{% endfor %}{% if movie %}<h2>One hidden theta, first and last episode of a trial</h2>
-<video controls loop muted src="data:video/mp4;base64,{{ movie }}"></video>{% endif %}
-<h2>How it was made</h2><pre>{{ how }}</pre></html>
-"""
+def beliefs(task: envs.Task, clips: dict[str, dict[str, Any]], file: Path) -> None:
+    """What agents believed of theta in the trial that is filmed, step by step, and the truth; a panel a latent."""
+    if not clips:
+        return
+    count = len(task.latents)
+    figure, panels = plt.subplots(count, 1, figsize=(8, 2.6 * count), layout="constrained", squeeze=False, sharex=True)
+    theta = next(iter(clips.values()))["theta"]
+    for i, (panel, latent) in enumerate(zip(panels[:, 0], task.latents, strict=True)):
+        for episode, truth in enumerate(theta[:, i]):
+            label = "true" if episode == 0 else None
+            panel.plot([episode, episode + 1], [truth] * 2, color=colour("expert"), lw=1, ls="--", label=label)
+            panel.axvline(episode + 1, color="0.9", lw=0.8)
+        for name, clip in clips.items():
+            for episode in range(len(theta)):
+                seen = clip["belief"][clip["episode"] == episode, i]
+                at = episode + np.arange(len(seen)) / task.horizon
+                panel.plot(at, seen, color=colour(name), lw=1.4, label=None if episode else name)
+        panel.set(ylabel=f"{latent.name}{f', {latent.unit}' if latent.unit else ''}", xlim=(0, len(theta)))
+        panel.set_xticks(np.arange(len(theta)) + 0.5, range(1, len(theta) + 1))
+        panel.tick_params(axis="x", length=0)
+    panels[-1, 0].set(xlabel="episode")
+    panels[0, 0].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    figure.savefig(file, dpi=110)
+    plt.close(figure)
+
+
+PICTURES = {
+    "adaptation.png": ("Score by episode", "Bands: 95% intervals of the mean over seeds."),
+    "beliefs.png": (
+        "What the agents believed of theta",
+        "In the trial that is filmed, as a linear probe, fitted at the end of trials, reads it off belief or memory.",
+    ),
+    "learning.png": ("Learning", "Means over seeds. A line stops where a method trains something else for a while."),
+}
+
+
+def certificate(task: str, version: int, run: Path) -> Path | None:
+    """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/."""
+    for folder in (
+        run.absolute().parent / "certificates",
+        Path(__file__).resolve().parents[2] / "docs" / "certificates",
+    ):
+        try:
+            found = json.loads((folder / f"{task}.json").read_text())
+            if (found["task"], found["task_version"]) == (task, version) and (folder / f"{task}.png").is_file():
+                return folder / f"{task}.png"
+        except (OSError, ValueError, KeyError, TypeError):
+            pass
+    return None
 
 
 def page(results: dict[str, Any], folder: Path) -> str:
@@ -141,11 +169,25 @@ def page(results: dict[str, Any], folder: Path) -> str:
     def encoded(file: Path) -> str:
         return base64.b64encode(file.read_bytes()).decode()
 
-    pictures = [
-        (p.stem.capitalize(), encoded(p)) for p in (folder / "adaptation.png", folder / "learning.png") if p.exists()
-    ]
+    pictures = [(*told, encoded(folder / name)) for name, told in PICTURES.items() if (folder / name).exists()]
+    certified = certificate(results["task"], results["task_version"], folder)
+    if certified:
+        command = f"deconf certify --task {results['task']}"
+        pictures.append(("Is it confounded?", f"The task's certificate, of {command}.", encoded(certified)))
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
     how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
-    template = jinja2.Environment(autoescape=True).from_string(_PAGE)
-    cells = {"columns": score.COLUMNS, "rows": score.rows(results["methods"])}
-    return template.render(results=results, pictures=pictures, movie=movie, how=how, **cells)
+    methods = sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"])
+    filters = {
+        "two_decimals": score.two_decimals,
+        "height": lambda value: 23 - 20 * min(max(value, -0.1), 1.1),
+        "last_mean": lambda returns: np.mean(returns, 0)[-1],
+    }
+    return template("report.html.jinja", filters).render(
+        results=results,
+        outcome=score.outcome(results["methods"]),
+        methods=methods,
+        pictures=pictures,
+        certified=certified,
+        movie=movie,
+        how=how,
+    )

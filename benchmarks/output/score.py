@@ -20,17 +20,36 @@ def normalise(returns: Array, random: float, expert: float) -> Array:
     return (returns - random) / (expert - random)
 
 
-def bootstrap(values: Array) -> list[float] | None:
-    """95% percentile-bootstrap interval of the mean over seeds; None for a single seed.
+def bootstrap(values: Array) -> Array | None:
+    """95% percentile-bootstrap intervals [..., 2] of means over seeds, of values [S, ...]; None for a single seed.
 
-    Of few seeds it is too narrow: of three it is just their range, which holds the mean three times in four.
+    Of few seeds they are too narrow: of three they are just the range, which holds the mean three times in four.
     """
     if len(values) < 2:
         return None
-    if np.ptp(values) == 0:
-        return [float(values[0])] * 2
     interval = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=0).confidence_interval
-    return [float(interval.low), float(interval.high)]
+    return np.stack([interval.low, interval.high], -1)
+
+
+def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, dict[str, list[Any]]]:
+    """The mean over seeds of training curves, by kind of loss; of those that were noted at the same updates.
+
+    Where the method did something else for a while, the loss is None at one update in between: not to be bridged.
+    """
+    found = {}
+    for kind in dict.fromkeys(kind for curve in curves for kind in curve):
+        every = [curve[kind] for curve in curves if kind in curve]
+        update = every[0]["update"]
+        loss = np.mean([one["loss"] for one in every if one["update"] == update], 0)
+        steps = np.diff(update)
+        gaps = 1 + np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.zeros(0, int)
+        at = np.insert(np.array(update), gaps, [update[i - 1] + 1 for i in gaps])
+        between = np.insert(loss, gaps, np.nan)
+        found[kind] = {
+            "update": at.tolist(),
+            "loss": [None if np.isnan(value) else float(f"{value:.4g}") for value in between],
+        }
+    return found
 
 
 def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
@@ -53,12 +72,14 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
     for name, seeds in by_method.items():
         returns = means(name, "returns")
         scores = normalise(returns, random, expert)
+        band = bootstrap(scores)
         methods[name] = {
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
             "score_last": round(float(scores[:, episodes - 1].mean()), 4),
-            "ci95": bootstrap(scores[:, episodes - 1]),
+            "ci95": None if band is None else band[episodes - 1].tolist(),
+            "band": None if band is None else band.round(4).tolist(),
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": means(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
             "tier": seeds[0]["tier"],
@@ -67,7 +88,50 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
+        if curves := [record["curve"] for record in seeds if "curve" in record]:
+            methods[name]["curve"] = mean_curve(curves)
     return methods
+
+
+def outcome(methods: dict[str, Any]) -> str:
+    """In a sentence, what came out in the last episode: who learned, and who is deluded.
+
+    A method that does not see theta learned if its interval lies above the middle between the exact conditional and
+    the exact interventional policy; it fell in with the deluded one if it lies below and there is a memory at all.
+    Where the two are not .1 apart, nothing can be told. Other ways to deploy the same agent are left out.
+    """
+
+    def said(names: Sequence[str]) -> str:
+        told = [f"{name} ({two_decimals(methods[name]['score_last'])})" for name in names]
+        return " and ".join(filter(None, [", ".join(told[:-1]), told[-1]]))
+
+    seeds = max(len(entry["seeds"]) for entry in methods.values())
+    of = "of one seed" if seeds == 1 else f"means of {seeds} seeds"
+    judged = [name for name, entry in methods.items() if entry["tier"] in "123" and not name.endswith("_episode")]
+    judged.sort(key=lambda name: -methods[name]["score_last"])
+    if not judged or not {"conditional", "interventional"} <= set(methods):
+        scored = (
+            f"{said(judged)}, where the expert has 1; no" if judged else "No method that learns without theta, and no"
+        )
+        return f"{scored} pair of exact policies was run to compare with. Scores of the last episode, {of}."
+    low, high = (methods[name]["score_last"] for name in ("conditional", "interventional"))
+    if high - low < 0.1:
+        return (
+            f"Nothing can be told here: the exact policies, {said(['interventional'])} and {said(['conditional'])}, are"
+            f" alike. The others: {said(judged)}. Scores of the last episode, {of}."
+        )
+    middle, sides = (low + high) / 2, dict[str, list[str]]()
+    for name in judged:
+        entry = methods[name]
+        least, most = entry["ci95"] or (entry["score_last"],) * 2
+        fate = f"learned what can be known, like the exact policy {said(['interventional'])}"
+        if least <= middle:
+            fate = f"may be on either side of the middle between the exact policies, {two_decimals(middle)}"
+        if most < middle:
+            fate = f"fell in with the deluded exact policy, {said(['conditional'])}"
+            fate = fate if any(entry["theta_r2"]) else "has no memory to learn with"
+        sides.setdefault(fate, []).append(name)
+    return f"{'; '.join(f'{said(names)} {fate}' for fate, names in sides.items())}. Scores of the last episode, {of}."
 
 
 def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[str, int, dict[str, Any]]]) -> str:

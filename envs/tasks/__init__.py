@@ -19,6 +19,14 @@ SUITE = (
     "hidden_goal",
     "forked_path",
     "rolling_deck",
+    "icy_stop",
+    "weak_thruster",
+    "lopsided_block",
+    "cheetah_speed",
+    "ant_goal",
+    "curling",
+    "swapped_lander",
+    "windy_drone",
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case

@@ -1,4 +1,4 @@
-"""Kill a run at random moments and resume it: `python -m tests.faults.kills --out results/kills` (50 busy minutes)
+"""Kill a run at random moments and resume it: `python -m tests.faults.kills --out DIR` (50 minutes on two busy cores)
 
 Small runs on the bandit, first undisturbed and then with all their processes killed (SIGKILL) again and again. What a
 kill finds finished must stay as it is, and what comes out in the end must be what the undisturbed run made, bit for

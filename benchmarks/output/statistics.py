@@ -1,0 +1,76 @@
+"""What scores of several seeds and tasks come to.
+
+After Agarwal et al. 2021, Deep RL at the edge of the statistical precipice. `Runs` are scores by task, each an array of
+its seeds [S]. A run is a seed of a task; tasks may differ in S. Intervals are of 95%. Over tasks they are percentile
+intervals of the stratified bootstrap: seeds are drawn anew within each task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from deconfounded.envs.task import Array
+
+Runs = Mapping[str, Array]
+RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number, or one for each of some thresholds; its interval, None for a single run; how many stand behind it."""
+
+    value: Array
+    interval: tuple[Array, Array] | None
+    n: int
+
+
+def paired(one: Mapping[int, float], other: Mapping[int, float]) -> Figure | None:
+    """Mean of one less the other over the seeds that both have, with Student's interval; None if they share none."""
+    seeds = sorted(set(one) & set(other))
+    if not seeds:
+        return None
+    differences = np.array([one[seed] - other[seed] for seed in seeds])
+    mean, n = differences.mean(), len(seeds)
+    if n == 1:
+        return Figure(mean, None, 1)
+    half = stats.t.ppf(0.975, n - 1) * differences.std(ddof=1) / n**0.5
+    return Figure(mean, (mean - half, mean + half), n)
+
+
+def iqm(runs: list[Array]) -> Array:
+    """Interquartile mean, of all runs of all tasks as one: the lowest and the highest quarter are left out.
+
+    runs: of each task [..., S]; returns [...].
+    """
+    return stats.trim_mean(np.concatenate(runs, -1), 0.25, axis=-1)
+
+
+def profile(runs: list[Array], thresholds: Array) -> Array:
+    """Share of runs [..., S] above each threshold [K], the mean over tasks: [..., K]."""
+    return np.mean([(x[..., None, :] > thresholds[:, None]).mean(-1) for x in runs], 0)
+
+
+def improvement(one: list[Array], other: list[Array]) -> Array:
+    """Probability that a run of one is better than a run of the other [..., S], ties half; the mean over tasks."""
+    signs = (np.sign(x[..., :, None] - y[..., None, :]) for x, y in zip(one, other, strict=True))
+    return np.mean([(1 + sign).mean((-2, -1)) / 2 for sign in signs], 0)
+
+
+def over_tasks(figure: Callable[..., Array], *methods: Runs) -> Figure | None:
+    """A figure of the tasks where every method has a seed, e.g. over_tasks(iqm, runs); None where there are none.
+
+    figure: handed, for each method, its runs by task.
+    """
+    tasks = [task for task in methods[0] if all(len(runs.get(task, ())) for runs in methods)]
+    if not tasks:
+        return None
+    rng = np.random.default_rng(0)
+    given = [[np.asarray(runs[task]) for task in tasks] for runs in methods]
+    drawn = [[x[rng.integers(len(x), size=(RESAMPLES, len(x)))] for x in runs] for runs in given]
+    alone = all(len(x) == 1 for runs in given for x in runs)
+    low, high = np.percentile(figure(*drawn), [2.5, 97.5], 0)
+    return Figure(figure(*given), None if alone else (low, high), sum(map(len, given[0])))

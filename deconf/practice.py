@@ -1,0 +1,87 @@
+"""Environments to practise in, as Stable-Baselines3 has them: blind to theta, a whole trial as one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from deconfounded.envs import BatchEnv, Task
+
+Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
+"""Of observations [N, O], actions [N, A] and what followed [N, O]: [N]. The task's own reward is told to nobody."""
+
+
+class Practice(VecEnv):
+    """n environments; theta stays for `task.episodes` episodes, and `done` says that they are over.
+
+    What is observed [N, O + F + 1]: the observation, scaled; the action before it, one-hot if discrete; and whether an
+    episode has just begun, when there is no such action. `transitions` keeps what took place since the last reset.
+    """
+
+    def __init__(
+        self, task: Task, n: int, seed: Sequence[int], mean: NDArray[Any], std: NDArray[Any], reward: Reward
+    ) -> None:
+        """seed: of each environment. mean, std [O]: of the expert's observations."""
+        self._batch, self._mean, self._std, self._reward = BatchEnv(task, n), mean, std, reward
+        self._seed, self._actions = list(seed), int(getattr(task.action_space, "n", 0))
+        self._features = self._actions or int(np.prod(task.action_space.shape or 1))
+        width = len(task.observation) + self._features + 1
+        seen = spaces.Box(-np.inf, np.inf, (width,), np.float32)
+        super().__init__(n, seen, task.action_space)
+
+    def reset(self) -> Any:
+        """Trials start, under the thetas of these environments' seeds."""
+        self._obs = self._batch.reset(self._seed)
+        self._episode = np.ones(self.num_envs, int)
+        self.begun = self.num_envs  # trials
+        self.transitions: list[tuple[NDArray[np.float32], ...]] = []
+        return self._observation(np.zeros((self.num_envs, self._features)), np.ones(self.num_envs, bool))
+
+    def _observation(self, before: NDArray[Any], starts: NDArray[np.bool_]) -> NDArray[np.float32]:
+        columns = [(self._obs - self._mean) / self._std, np.where(starts[:, None], 0, before), starts[:, None]]
+        return np.concatenate(columns, -1).astype(np.float32)
+
+    def step_async(self, actions: Any) -> None:
+        self._chosen = np.asarray(actions, np.float32).reshape(self.num_envs, -1)
+
+    def step_wait(self) -> Any:
+        batch, action, obs = self._batch, self._chosen, self._obs
+        then, _, terminated, truncated = batch.step(action)
+        reward = self._reward(obs, action, then)
+        self.transitions.append((obs, action, then))
+        before = np.eye(self._actions)[action[:, 0].astype(int)] if self._actions else action
+        self._obs, over = then, terminated | truncated
+        done = over & (self._episode >= batch.task.episodes)
+        infos: list[dict[str, Any]] = [{} for _ in done]
+        ends = self._observation(before, np.zeros(len(done), bool))
+        for i in np.flatnonzero(done):
+            infos[i] = {"terminal_observation": ends[i], "TimeLimit.truncated": True}  # life would go on
+        if over.any():
+            self._obs = batch.reset(options={"keep_theta": ~done}, where=over)
+            self._episode = np.where(done, 1, self._episode + over)
+            self.begun += int(done.sum())
+        return self._observation(before, over), reward, done, infos
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Its seeds are given when it is made."""
+        return [None] * self.num_envs

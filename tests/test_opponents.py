@@ -1,0 +1,484 @@
+"""Each opponent does what it is there for: looks away from its actions, sees all the past, practises blindly."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch.distributions import Normal, kl_divergence
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import Allowed, Context
+from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.deconf import deconfounded_mean, gail, rma
+from deconfounded.deconf.agents import LearnedAgent, Monitor, Training
+from deconfounded.deconf.beliefs import GruMemory
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.deconfounded_mean import MeanAgent, MeanConfig
+from deconfounded.deconf.gail import Discriminator, GailAgent, GailConfig
+from deconfounded.deconf.naive_obs import DroppingAgent, ObsAgent, ObsMemory
+from deconfounded.deconf.naive_transformer import TransformerAgent
+from deconfounded.deconf.nets import Adam, Scaler, scalers
+from deconfounded.deconf.palr import PalrAgent, PalrConfig, hscic
+from deconfounded.envs.streams import Array
+from deconfounded.experts.demos import Agent, RandomAgent, Trials, run_trials, trial_seeds
+from tests.tools import tiny_preset
+
+CONTROL = "slippery_cartpole"
+NEW = ("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr")
+FLAT = Signature(obs=2, action=1, actions=0, binary=False)
+
+
+def streams(n: int = 1) -> Draws:
+    return Draws([np.random.default_rng(i) for i in range(n)], "cpu")
+
+
+def random_batch(draws: Draws, trials: int = 3, steps: int = 7) -> Batch:
+    """Trials as they could be: what follows a step is the next one's observation."""
+    obs = draws.normal(trials, steps + 1, 2)
+    action = 2 * draws.uniform(trials, steps, 1) - 1
+    return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(len(draws), trials, steps))
+
+
+def other_actions(batch: Batch) -> Batch:
+    return Batch(batch.obs, -batch.action, batch.next_obs, batch.mask)
+
+
+def scaler(batch: Batch) -> Scaler:
+    return Scaler(batch.obs, batch.mask)
+
+
+def test_tiers() -> None:
+    """What each may use is what it says: theta is seen by rma alone."""
+    tiers = {name: METHODS[name].tier for name in NEW}
+    assert tiers == {
+        **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr"), "1"),
+        **dict.fromkeys(("deconfounded_mean", "gail"), "2"),
+        "rma": "sees theta",
+    }
+    assert not any(METHODS[name].default for name in NEW)
+
+
+class TestActionsAside:
+    def test_naive_obs_does_not_hear_of_its_actions(self) -> None:
+        """Its memory is the same whatever was done; naive_rnn's is not."""
+        draws = streams(2)
+        batch = random_batch(draws)
+        for kind, same in ((ObsMemory, True), (GruMemory, False)):
+            memory = kind(8, FLAT, scaler(batch), draws)
+            one, other = (memory(b, memory.start(3))[:, :, -1] for b in (batch, other_actions(batch)))
+            assert torch.equal(one, other) == same
+
+    def test_naive_obs_acts_alike(self) -> None:
+        draws = streams()
+        batch = random_batch(draws)
+        chosen = []
+        for seen in (batch, other_actions(batch)):
+            agent = ObsAgent.new(8, FLAT, scaler(batch), streams())
+            agent.begin(3)
+            agent.reset([np.random.default_rng(5)])
+            for t in range(7):
+                agent.remember(seen[:, :, t])
+            chosen.append(agent.act(batch.obs[0, :, 0].numpy()))
+        np.testing.assert_array_equal(*chosen)
+
+    def test_dropout_is_for_training_alone(self) -> None:
+        """Two losses differ, and what is left of an action is 0 or twice as much; nothing is left out elsewhere."""
+        draws = streams()
+        batch = random_batch(draws, 50, 40)
+        agent = DroppingAgent.new(8, FLAT, scaler(batch), draws)
+        agent.dropout, state, seen = 0.5, agent.memory.start(50), []
+        embed = agent.memory._embed
+
+        def spy(given: Batch) -> torch.Tensor:
+            seen.append(agent.memory.kept)
+            return embed(given)
+
+        agent.memory._embed = spy  # type: ignore[method-assign]
+        one, other = (agent.loss(batch, batch.action, state)[0] for _ in range(2))
+        assert (one != other).all()
+        assert seen[0] is not None
+        assert seen[0].unique().tolist() == [0, 2]
+        assert seen[0].mean().item() == pytest.approx(1, abs=0.1)  # 2,000 draws; four standard errors
+        assert torch.equal(agent.held_out_loss(batch), agent.held_out_loss(batch))
+        agent.begin(50)
+        agent.remember(batch[:, :, 0])
+        assert seen[2:] == [None] * 3
+
+
+class TestPalr:
+    def test_what_leaks_is_penalised(self) -> None:
+        """x = y tells all of y; what both have from z alone is no leakage; with neither there is none."""
+        noise = streams().normal(3, 200, 2)[0]
+        z, y = noise[0], noise[0] + noise[1]
+        found = {
+            "leaks": hscic(y, y, z, 1e-2),
+            "by z alone": hscic(noise[0] + noise[2], y, z, 1e-2),
+            "nothing": hscic(noise[2], y, z, 1e-2),
+        }
+        assert found["leaks"] > 5 * found["by z alone"]
+        assert found["leaks"] > 5 * found["nothing"]
+        assert min(found.values()) > -1e-4  # a squared distance
+
+    def test_training_takes_it_away(self) -> None:
+        """A memory that may tell of its last action, and need not: with the penalty it does less."""
+        left = []
+        for penalty in (0.0, 30.0):
+            draws = streams()
+            batch = random_batch(draws, 8, 20)
+            agent = PalrAgent.new(8, FLAT, scaler(batch), draws)
+            agent.config = PalrConfig(penalty=penalty, samples=100)
+            optimizer = Adam([agent.memory, agent.policy], 1e-2)
+            for _ in range(30):
+                optimizer.step(agent.loss(batch, batch.action, agent.memory.start(8))[0])
+            with torch.no_grad():
+                states = agent.memory(batch, agent.memory.start(8))[:, :, :-1]
+                left.append(agent.leakage(states, batch, batch.action).item())
+        assert left[1] < 0.75 * left[0]  # of so few samples, some dependence is always seen
+
+    def test_no_penalty_in_what_is_reported(self) -> None:
+        draws = streams()
+        batch = random_batch(draws)
+        agent = PalrAgent.new(8, FLAT, scaler(batch), draws)
+        plain = agent.held_out_loss(batch)
+        agent.config = PalrConfig(penalty=1e3, samples=20)
+        assert torch.equal(agent.held_out_loss(batch), plain)
+        assert (agent.loss(batch, batch.action, agent.memory.start(3))[0] > plain).all()
+
+
+def transformer(batch: Batch, window: int, layers: int = 2) -> TransformerAgent:
+    shape = {"width": 16, "layers": layers, "heads": 2, "window": window}
+    return TransformerAgent.new(shape, FLAT, scaler(batch), streams(len(batch.mask)))
+
+
+class TestTransformer:
+    def test_is_causal(self) -> None:
+        """What comes later changes nothing of what was known before; the past does."""
+        batch = random_batch(streams(2))
+        agent = transformer(batch, 7)
+        changed = Batch(*(x.clone() for x in batch.tensors))
+        changed.obs[:, :, 4:] += 1
+        changed.action[:, :, 3:] *= -1
+        changed.next_obs[:, :, 3:] += 1
+        one, other = (agent.net(agent.tokens(b)) for b in (batch, changed))
+        torch.testing.assert_close(one[:, :, :4], other[:, :, :4], rtol=0, atol=1e-6)
+        assert (one[:, :, 4:] - other[:, :, 4:]).abs().amax(-1).min() > 1e-3
+
+    def test_cache_is_the_full_pass(self) -> None:
+        """Step by step, over resets and waiting, as all at once over the steps that took place; to 1e-5."""
+        draws = streams(2)
+        batch = random_batch(draws, 3, 12)
+        agent = transformer(batch, 12)
+        waits = draws.uniform(3, 30) < 0.4
+        waits[0, 0] = waits[0, 1, ::2] = False
+        agent.begin(6)
+        agent.reset([np.random.default_rng(i) for i in range(2)])
+        full, at = agent.net(agent.tokens(batch)), torch.zeros(2, 3, dtype=torch.int64)
+        seen = 0
+        for t in range(30):
+            now = Batch(*(torch.gather(x, 2, at.view(2, 3, 1, *[1] * (x.dim() - 3)).expand(
+                2, 3, 1, *x.shape[3:]))[:, :, 0] for x in batch.tensors))  # fmt: skip
+            with torch.no_grad():
+                agent.choose(now.obs)
+            expected = torch.stack([full[s, range(3), at[s]] for s in range(2)])
+            torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+            goes = ((~waits[:, :, t]) & (at < 11)).float()
+            agent.remember(Batch(now.obs, now.action, now.next_obs, goes))
+            at += goes.long()
+            seen += int(goes.sum())
+            if t == 10:
+                agent.reset([np.random.default_rng(i) for i in range(2)])
+        assert seen > 40
+
+    def test_window(self) -> None:
+        """With one layer, what is known after 20 steps is what the last 8 tokens say, wherever they are."""
+        batch = random_batch(streams(2), 3, 20)
+        agent = transformer(batch, 8, layers=1)
+        agent.begin(6)
+        agent.reset([np.random.default_rng(i) for i in range(2)])
+        for t in range(20):
+            with torch.no_grad():
+                agent.choose(batch.obs[:, :, t])
+            agent.remember(batch[:, :, t])
+        expected = agent.net(agent.tokens(batch)[:, :, -8:])[:, :, -1]
+        torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+
+    def test_held_out_loss_is_the_mean_over_steps(self) -> None:
+        batch = random_batch(streams(), 40)
+        batch.mask[0, 33:, 3:] = 0
+        agent = transformer(batch, 7)
+        with torch.no_grad():
+            torch.testing.assert_close(agent.held_out_loss(batch), agent.loss(batch, batch.action))
+
+
+class TestMean:
+    @staticmethod
+    def agent(draws: Draws, batch: Batch, kind: str = "gru") -> MeanAgent:
+        return MeanAgent.new(kind, 3, 16, FLAT, *scalers(batch), draws)
+
+    @pytest.mark.parametrize("kind", ["gru", "evidence"])
+    def test_acts_on_the_mean(self, kind: str) -> None:
+        """No draw: it is the belief's mean each time, and in training too, as the memory has it at that step."""
+        draws = streams(2)
+        batch = random_batch(draws)
+        agent = self.agent(draws, batch, kind)
+        agent.begin(6)
+        agent.reset([np.random.default_rng(i) for i in range(2)])
+        means = deconfounded_mean.running_mean(agent.model, batch)
+        for t in range(7):
+            with torch.no_grad():
+                assert torch.equal(agent.latent(), agent.latent())
+                torch.testing.assert_close(agent.latent(), means[:, :, t], rtol=0, atol=1e-5)
+                agent.remember(batch[:, :, t])
+
+    def test_kl_is_from_the_belief_a_step_before(self) -> None:
+        """What beta adds to the loss is torch's own KL, summed over time; the first is from N(0, 1)."""
+        draws = streams()
+        batch = random_batch(draws)
+        agent, state = self.agent(draws, batch), draws.state_dict()
+        losses = []
+        for beta in (0.0, 1.0):
+            draws.load_state_dict(state)
+            config = MeanConfig(beta=beta, inference_steps=50)
+            losses.append(deconfounded_mean.inference_loss(agent.model, batch, config, draws))
+        mean, std = agent.model.encoder.posterior(agent.model.encoder(batch)[:, :, :-1])
+        now = Normal(mean, std)
+        before = Normal(
+            torch.cat([torch.zeros_like(mean[:, :, :1]), mean[:, :, :-1]], 2),
+            torch.cat([torch.ones_like(std[:, :, :1]), std[:, :, :-1]], 2),
+        )
+        expected = kl_divergence(now, before).sum(-1).mean((1, 2))
+        torch.testing.assert_close(losses[1] - losses[0], expected, rtol=1e-3, atol=1e-5)
+
+    def test_a_latent_predicts_steps_ahead(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of the k-th step from now: with changes that grow by one a step and a model that says 0, errors are known."""
+        steps, ahead = 12, 4
+        obs = torch.arange(steps + 1.0).cumsum(0).reshape(1, 1, -1, 1).expand(1, 2, -1, 2)  # changes 1, 2, ...
+        batch = Batch(obs[:, :, :-1], torch.zeros(1, 2, steps, 1), obs[:, :, 1:], torch.ones(1, 2, steps))
+        draws = streams()
+        agent = self.agent(draws, batch)
+        model = agent.model
+        monkeypatch.setattr(model.dynamics, "forward", lambda obs, *rest: torch.zeros_like(obs)[..., None, :])
+        monkeypatch.setattr(model.dynamics, "change", torch.nn.Identity())
+        config = MeanConfig(beta=0.0, ahead=ahead, inference_steps=20_000)
+        found = deconfounded_mean.inference_loss(model, batch, config, draws).item()
+        pairs = [(t + k + 1) ** 2 for t in range(steps) for k in range(ahead) if t + k < steps]
+        assert found == pytest.approx(ahead * np.mean(pairs), rel=0.03)
+
+
+def made(method: str, task: str = CONTROL, seeds: tuple[int, ...] = (0,), monitor: Monitor | None = None) -> Agent:
+    """Trained on next to nothing, and handed what it declares that it uses."""
+    context = Context(envs.get(task), tiny_preset(), seeds, monitor)
+    return MAKERS[method](Allowed(context, METHODS[method].uses))[method]
+
+
+class TestRma:
+    def test_what_it_is_told_is_theta(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """On the bandit: in the trials it is told of, the arm called best pays out 3 times in 4, others 1 in 4."""
+        handed: list[Any] = []
+
+        def spy(*given: Any) -> Any:
+            handed.extend(given)
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(rma, "fit", spy)
+        context = Context(envs.get("bandit"), replace(tiny_preset(), explore_trials=100), [0, 1])
+        with pytest.raises(KeyboardInterrupt):
+            MAKERS["rma"](Allowed(context, METHODS["rma"].uses))
+        trials, theta = handed[2](None, [np.random.default_rng(i) for i in range(2)])
+        assert theta.shape == (200, 1, 5)
+        best = trials.action[:, 0, :, 0] == theta[:, 0].argmax(-1)[:, None]
+        paid = trials.obs[:, 0, 1:, 0]
+        assert paid[best].mean() == pytest.approx(0.75, abs=0.03)  # 4,000 pulls; four standard errors
+        assert paid[~best].mean() == pytest.approx(0.25, abs=0.02)
+        assert context.monitor.budget["exploration_trials"] == [100, 100]
+        assert context.monitor.budget["thetas"] == [104, 104]
+
+    def test_labels_lie_along_the_steps(self) -> None:
+        """Each step's theta is its episode's, though episodes end early."""
+        mask = np.array([[[1, 0, 0], [1, 1, 0]]], bool)
+        theta = np.array([[[0.1], [0.2]]])
+        trials = Trials(np.zeros((1, 2, 4, 1)), np.zeros((1, 2, 3, 1)), mask)
+        assert rma.along(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
+
+    def test_the_student_sees_no_theta(self) -> None:
+        """Deployed, it is told nothing: a history makes it act alike under every theta."""
+        agent = made("rma")
+        chosen = []
+        for theta in (-1, 1):
+            env = envs.BatchEnv(envs.get(CONTROL), 4)
+            low, high = env.task.latents[0].low, env.task.latents[0].high
+            obs = env.reset(0, {"theta": [low if theta < 0 else high]})
+            agent.begin(4)
+            agent.reset([np.random.default_rng(0)])
+            for _ in range(3):
+                action = agent.act(obs)
+                agent.observe(obs, action, obs, np.ones(4, bool))
+            chosen.append(agent.act(obs))
+        np.testing.assert_array_equal(*chosen)
+
+
+def practice(n: int = 3, task: str = CONTROL, reward: Any = None) -> Any:
+    from deconfounded.deconf.practice import Practice
+
+    about = envs.get(task)
+    width = len(about.observation)
+    none: Callable[..., NDArray[np.float32]] = lambda obs, action, then: np.zeros(len(obs), np.float32)  # noqa: E731
+    return Practice(about, n, trial_seeds(n, 3), np.zeros(width), np.ones(width), reward or none)
+
+
+class TestGail:
+    def test_the_agent_is_what_ppo_trained(self) -> None:
+        """Step by step the same distribution of actions as Stable-Baselines3's policy; to 1e-5."""
+        for task in (CONTROL, "bandit"):
+            env, config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
+            ppo = gail._ppo(env, config, 0)
+            trials, _ = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0)
+            signature = Signature.of(trials)
+            obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))
+            obs.std.fill_(1)
+            agent = GailAgent.blank({"width": 8}, signature, obs, streams())
+            agent.take(0, ppo.policy)
+            agent.begin(4)
+            agent.reset([np.random.default_rng(0)])
+            state = tuple(torch.zeros(1, 4, 8) for _ in range(2))
+            data, before = Batch.of(trials, 1), np.zeros((4, signature.action_features + 1))
+            before[:, -1] = 1
+            for t in range(5):
+                step = data[:, :, t]
+                inputs = torch.as_tensor(np.concatenate([step.obs[0].numpy(), before], -1)).float()
+                theirs, state = ppo.policy.get_distribution(inputs, state, torch.zeros(4))
+                with torch.no_grad():
+                    agent.choose(step.obs)
+                    features = agent._next[..., :8]
+                    one = agent.policy.log_prob(features, step.action)[0]
+                    action = step.action[0, :, 0] if signature.actions else step.action[0]
+                    torch.testing.assert_close(one, theirs.log_prob(action), rtol=0, atol=1e-5)
+                agent.remember(step)
+                encoded = signature.encode_action(step.action)[0].numpy()
+                before = np.concatenate([encoded, np.zeros((4, 1))], -1)
+
+    def test_discriminator_tells_them_apart(self) -> None:
+        """A constant against a random action: its logit, the reward, is above 0 for one, below for the other."""
+        draws = streams(2)
+        own = random_batch(draws, 64, 4)[:, :, 0]
+        expert = Batch(own.obs, torch.full_like(own.action, 0.5), own.next_obs, own.mask)
+        net = Discriminator(16, FLAT, *scalers(own), draws)
+        optimizer = Adam([net], 1e-2)
+        for _ in range(150):
+            optimizer.step(net.loss(expert, own))
+        for i in range(2):
+            rewards = [net.of_seed(i).reward(b.obs[i].numpy(), b.action[i].numpy(), b.next_obs[i].numpy())
+                       for b in (expert, own)]  # fmt: skip
+            assert (rewards[0] > 0).mean() > 0.9
+            assert (rewards[1] < 0).mean() > 0.9
+            np.testing.assert_allclose(rewards[0], net(expert)[i].detach(), atol=1e-5)
+
+    def test_practice_is_blind_to_theta(self) -> None:
+        """What is observed is the task's own observation, the action before, and whether an episode begins."""
+        vec = practice()
+        obs, width = vec.reset(), len(envs.get(CONTROL).observation)
+        plain = envs.BatchEnv(envs.get(CONTROL), 3)
+        np.testing.assert_array_equal(obs[:, :width], plain.reset(trial_seeds(3, 3)))
+        assert obs.shape == (3, width + 2)
+        assert obs[:, width:].tolist() == [[0, 1]] * 3
+        action = np.full((3, 1), 0.25)
+        obs, _, done, infos = vec.step(action)
+        np.testing.assert_array_equal(obs[:, :width], plain.step(action)[0])
+        assert obs[:, width:].tolist() == [[0.25, 0]] * 3
+        assert not done.any()
+        assert infos == [{}] * 3
+
+    def test_a_trial_is_an_episode_of_ppo(self) -> None:
+        """theta stays, and is another one as soon as `done` says so, after as many episodes as the task has."""
+        vec = practice()
+        vec.reset()
+        episodes, theta, ended = np.zeros(3, int), vec._batch.theta.copy(), 0
+        for action in 2 * np.random.default_rng(0).random((400, 3, 1)) - 1:
+            obs, _, done, infos = vec.step(action)
+            episodes += obs[:, -1] == 1
+            kept = (vec._batch.theta == theta).all(-1)
+            np.testing.assert_array_equal(kept, ~done)
+            assert (episodes[done] == envs.get(CONTROL).episodes).all()
+            for i in np.flatnonzero(done):
+                assert infos[i]["terminal_observation"].shape == obs[i].shape
+            episodes[done], ended = 0, ended + int(done.sum())
+            theta = vec._batch.theta.copy()
+        assert ended > 3
+        assert vec.begun == 3 + ended
+
+    def test_interactions_are_counted(self) -> None:
+        """Two rounds of 32 steps in 2 environments, for each seed; and none is left of the task's own reward."""
+        monitor = Monitor()
+        state, numbers = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
+        made("gail", seeds=(0, 1), monitor=monitor)
+        assert monitor.budget["interactions"] == [128, 128]
+        assert monitor.budget["expert_trials"] == [4, 4]
+        assert min(monitor.budget["exploration_trials"]) >= 4
+        assert torch.equal(torch.get_rng_state(), state)
+        np.testing.assert_array_equal(np.random.get_state()[1], numbers)  # noqa: NPY002
+
+
+def test_gail_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gail, "find_spec", lambda name: None)
+    with pytest.raises(envs.InputError, match=r"^gail needs sb3-contrib; install deconfounded-imitation\[train\]$"):
+        made("gail")
+
+
+@pytest.mark.parametrize("method", ["deconfounded_mean", "gail", "rma"])
+def test_no_rounds_is_one_line(method: str) -> None:
+    part = {"deconfounded_mean": "mean"}.get(method, method)
+    preset = tiny_preset()
+    settings = replace(preset, **{part: replace(getattr(preset, part), rounds=0)})
+    with pytest.raises(envs.InputError, match=r"^rounds was 0; it must be at least 1$"):
+        MAKERS[method](Context(envs.get("bandit"), settings, [0]))
+
+
+class Unplugged(Monitor):
+    """Keeps what training needs to go on; the first time, training ends when it has been saved `lasts` times."""
+
+    def __init__(self, lasts: int) -> None:
+        super().__init__()
+        self.lasts, self.kept, self.on = lasts, None, True
+        self.kept: Training | None
+
+    def save(self, state: Callable[[], Training]) -> None:
+        self.lasts -= 1
+        if self.lasts == 0:
+            self.kept = copy.deepcopy(state())
+            raise KeyboardInterrupt
+
+    def load(self) -> Training | None:
+        return self.kept
+
+
+@pytest.mark.parametrize("method", NEW)
+def test_interrupted_training_goes_on(method: str) -> None:
+    """What went on after its first checkpoint acts, bit for bit, as what was never interrupted; loaded, it does too."""
+    monitor, task = Unplugged(1), envs.get("bandit")
+    with pytest.raises(KeyboardInterrupt):
+        made(method, "bandit", monitor=monitor)
+    found: list[Array] = []
+    whole = made(method, "bandit")
+    assert isinstance(whole, LearnedAgent)
+    for agent in (whole, made(method, "bandit", monitor=monitor), type(whole).from_state(*whole.state())):
+        found.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1)[0].action)
+    np.testing.assert_array_equal(found[1], found[0])
+    np.testing.assert_array_equal(found[2], found[0])
+
+
+@pytest.mark.parametrize("method", NEW)
+def test_one_seed_of_two_is_kept(method: str) -> None:
+    agent = made(method, seeds=(0, 1))
+    assert isinstance(agent, LearnedAgent)
+    env = envs.BatchEnv(envs.get(CONTROL), 4)
+    both = run_trials(env, agent, 2, [5, 6])[0].action
+    alone = run_trials(envs.BatchEnv(env.task, 2), agent.of_seed(1), 2, [6])[0].action
+    np.testing.assert_array_equal(alone, both[2:])

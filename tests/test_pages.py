@@ -1,0 +1,363 @@
+"""Figures over seeds and tasks, and the pages that show them, in a real browser where there is one."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.output import browser, index, pages, records, report, score, statistics
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+class TestStatistics:
+    """Against numbers worked out by hand from the formulas of Agarwal et al. 2021."""
+
+    def test_paired(self) -> None:
+        """Differences .5, 1 and 0: mean .5, sd .5, and Student's t of two degrees is 4.302653."""
+        found = statistics.paired({0: 1.0, 1: 2.0, 2: 3.0, 7: 9.0}, {2: 3.0, 1: 1.0, 0: 0.5, 8: 0.0})
+        assert found is not None
+        assert (found.value, found.n) == (0.5, 3)
+        assert found.interval == pytest.approx((0.5 - 1.242069, 0.5 + 1.242069), abs=1e-6)
+        assert statistics.paired({0: 1.0}, {0: 0.25}) == statistics.Figure(np.float64(0.75), None, 1)
+        assert statistics.paired({0: 1.0}, {1: 1.0}) is None
+
+    def test_iqm(self) -> None:
+        """Of 0 to 7, all tasks as one, the lowest two and the highest two are left out."""
+        assert statistics.iqm([np.array([7.0, 0, 90]), np.array([3.0, 4, 2, 5, 1])]) == 3.5
+        assert statistics.iqm([np.array([0.0, 1]), np.array([2.0, 3])]) == 1.5
+
+    def test_profile(self) -> None:
+        """Tasks weigh alike, however many seeds they have; a run at the threshold is not above it."""
+        runs = [np.array([0.1, 0.5]), np.array([0.9])]
+        assert statistics.profile(runs, np.array([0.0, 0.3, 0.5, 0.9])).tolist() == [1, 0.75, 0.5, 0]
+
+    def test_improvement(self) -> None:
+        """Of the pairs (1, 1), (1, 3), (2, 1), (2, 3) one and a half are won; the other task is won whole."""
+        one, other = [np.array([1.0, 2]), np.array([5.0])], [np.array([1.0, 3]), np.array([4.0, 3, 2])]
+        assert statistics.improvement(one[:1], other[:1]) == 0.375
+        assert statistics.improvement(one, other) == (0.375 + 1) / 2
+
+    def test_over_tasks(self) -> None:
+        """Seeds are drawn anew within a task; tasks that a method lacks are left out, and so is one without seeds."""
+        apart = {"a": np.zeros(4), "b": np.ones(4)}
+        found = statistics.over_tasks(statistics.iqm, apart)
+        assert found is not None
+        assert (found.value, found.interval, found.n) == (0.5, (0.5, 0.5), 8)
+        spread = statistics.over_tasks(statistics.iqm, {"a": np.array([0.0, 1.0])})  # 0, .5 or 1, of odds 1 to 2 to 1
+        assert spread is not None
+        assert (spread.value, spread.interval) == (0.5, (0, 1))
+        lone = statistics.over_tasks(statistics.improvement, apart, {"b": np.array([2.0]), "a": np.array([])})
+        assert lone is not None
+        assert (lone.value, lone.n) == (0, 4)
+        single = statistics.over_tasks(statistics.iqm, {"a": np.array([0.3])})
+        assert single is not None
+        assert (single.value, single.interval, single.n) == (pytest.approx(0.3), None, 1)
+        assert statistics.over_tasks(statistics.improvement, {"a": np.zeros(1)}, {"b": np.zeros(1)}) is None
+
+    def test_against_evaluma(self) -> None:
+        """Another package's interquartile mean, and its stratified bootstrap but for the draws.
+
+        It brings pandas and statsmodels, 150 MB, so that it is none of our extras: `pip install evaluma==0.3.0` to run
+        this. For seed 0 below: .470968 and .658239 on both sides, intervals .4224 to .5247 and .5818 to .7299 of its,
+        .4192 to .5255 and .5829 to .7234 of ours.
+        """
+        evaluma = pytest.importorskip("evaluma", reason="evaluma is not installed")
+        import pandas as pd
+
+        rng = np.random.default_rng(0)
+        runs = {m: {f"t{i}": rng.normal(0.5 + 0.1 * k, 0.2, 6) for i in range(5)} for k, m in enumerate("ab")}
+        cells = [(m, t, s, x) for m, by in runs.items() for t, xs in by.items() for s, x in enumerate(xs)]
+        frame = pd.DataFrame(cells, columns=["model", "dataset", "seed", "score"]).assign(metric="score")
+        bounds = {f"norm_ref_{end}": {f"t{i}": value for i in range(5)} for end, value in (("low", 0.0), ("high", 1.0))}
+        theirs = evaluma.load_df(frame, seed="seed", **bounds).iqm_ranking(2000, 0).table.set_index("model")
+        for name, by_task in runs.items():
+            ours = statistics.over_tasks(statistics.iqm, by_task)
+            assert ours is not None
+            assert ours.value == pytest.approx(theirs.loc[name, "IQM"], abs=1e-12)
+            assert ours.interval == pytest.approx(tuple(theirs.loc[name, ["CI_low", "CI_high"]]), abs=0.02)
+
+
+class TestCurves:
+    def test_thinned(self) -> None:
+        """50 points at least where there are as many, and no NaN, which json does not have."""
+        made = records.thinned({"a": [(i, i / 3) for i in range(1, 401)], "b": [(1, float("nan")), (2, 1e9 / 3)]})
+        assert made["a"]["update"] == list(range(1, 401, 8))
+        assert made["a"]["loss"][:2] == [0.3333, 3.0]
+        assert made["b"] == {"update": [2], "loss": [3.333e8]}
+
+    def test_rounds_are_not_bridged(self) -> None:
+        """Where a curve goes without for longer than it is used to, there is a gap; seeds are averaged."""
+        one = {"a": {"update": [10, 20, 30, 90, 100], "loss": [1.0, 2.0, 3.0, 4.0, 5.0]}}
+        two = {"a": {"update": [10, 20, 30, 90, 100], "loss": [3.0, 2.0, 1.0, 4.0, 5.0]}}
+        mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5]}
+        assert score.mean_curve([one, two]) == {"a": mean}
+        assert score.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
+
+    def test_records(self) -> None:
+        """A record has a curve of its training, and needs none."""
+        record = records.read(DOCS / "records" / "bandit-v0" / "default" / "naive_rnn-0.json")
+        assert record["curve"]["imitation"]["update"]
+        records.check({key: value for key, value in record.items() if key != "curve"}, "it")
+        for curve in ({"a": {"update": [1], "loss": []}}, {"a": {"update": [1], "loss": ["<b>"]}}, [1]):
+            with pytest.raises(envs.InputError, match="it is no record: "):
+                records.check({**record, "curve": curve}, "it")
+
+
+def entry(last: float, interval: float | None = 0.01, tier: str = "1", known: bool = True) -> dict[str, Any]:
+    """What `outcome` reads of a method."""
+    seeds = [0] if interval is None else [0, 1, 2]
+    band = None if interval is None else [last - interval, last + interval]
+    return {"score_last": last, "ci95": band, "tier": tier, "theta_r2": [0.5] if known else [], "seeds": seeds}
+
+
+class TestOutcome:
+    EXACT = {"interventional": entry(1, tier="reference"), "conditional": entry(0.6, tier="reference")}
+
+    def test_sides(self) -> None:
+        found = score.outcome(
+            {
+                **self.EXACT,
+                **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5), "mute": entry(0.4, known=False)},
+                **{"good_episode": entry(0.1), "oracle": entry(1, tier="sees theta")},
+            }
+        )
+        assert found == (
+            "good (0.90) learned what can be known, like the exact policy interventional (1.00); unsure (0.81) may be"
+            " on either side of the middle between the exact policies, 0.80; bad (0.50) fell in with the deluded exact"
+            " policy, conditional (0.60); mute (0.40) has no memory to learn with. Scores of the last episode, means of"
+            " 3 seeds."
+        )
+
+    def test_what_cannot_be_told(self) -> None:
+        near = {**self.EXACT, "conditional": entry(0.95, tier="reference"), "one": entry(0.9), "two": entry(0.8)}
+        assert score.outcome(near).startswith("Nothing can be told here: the exact policies, interventional (1.00) and")
+        assert "no pair of exact policies was run" in score.outcome({"one": entry(0.9, None)})
+        assert score.outcome({"one": entry(0.9, None)}).endswith("of one seed.")
+        assert score.outcome({"expert": entry(1, tier="reference")}).startswith("No method that learns without theta")
+        lone = {name: entry(one["score_last"], None, one["tier"]) for name, one in self.EXACT.items()}
+        assert "one (0.90) learned" in score.outcome({**lone, "one": entry(0.9, None)})
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, Any]:
+    """What docs/index.html shows."""
+    text = (DOCS / "index.html").read_text()
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found
+    return json.loads(found[1])
+
+
+class TestIndex:
+    def test_rows_are_the_records(self, made: dict[str, Any]) -> None:
+        """Each cell has as many seeds as records, and the last episode's score; differences are of these scores."""
+        for row in made["rows"]:
+            (folder,) = (DOCS / "records").glob(f"{row['task']}-v{envs.get(row['task']).version}")
+            found = {
+                name: list(folder.glob(f"default/{name}-[0-9]*.json")) for name in (row["method"], "random", "expert")
+            }
+            assert row["n"] == len(found[row["method"]])
+            means = {
+                name: np.array([json.loads(file.read_text())["returns"][: row["trained"]] for file in files])
+                for name, files in found.items()
+            }
+            zero, one = means["random"].mean(), means["expert"].mean()
+            last = (means[row["method"]][:, -1].mean() - zero) / (one - zero)
+            assert row["value"] == pytest.approx(last, abs=1e-4)
+            assert f"--task {row['task']}" in row["command"]
+        values = {(row["task"], row["method"]): row for row in made["rows"]}
+        for (task, _), row in values.items():
+            for other, difference in row["minus"].items():
+                beside = values[task, other]
+                if row["n"] == beside["n"]:
+                    assert difference["value"] == pytest.approx(row["value"] - beside["value"], abs=2e-4)
+
+    def test_a_method_that_was_not_run(self) -> None:
+        """It has figures of the tasks that it has, which say how many these are; one without any is not there."""
+        scores = {"a": {"deconfounded": {0: 0.5, 1: 0.7}, "x": {0: 0.6}}, "b": {"deconfounded": {0: 0.9}}, "c": {}}
+        found = index.over_tasks(scores, ["a", "b", "c"])
+        assert {name: one["tasks"] for name, one in found["methods"].items()} == {"deconfounded": 2, "x": 1}
+        assert found["methods"]["x"]["iqm"] == {"value": 0.6, "interval": None, "n": 1}
+        won = found["methods"]["x"]["improvement"]
+        assert (won["value"], won["n"], won["tasks"]) == (0.5, 2, 1)
+
+    def test_links_and_size(self) -> None:
+        """All that the page names is there, nothing comes from a network, and all together is small."""
+        text = (DOCS / "index.html").read_text()
+        body = text.partition('<script type="application/json"')[0]
+        named = {name for name in re.findall(r'(?:href|src)="([^"#]+)"', body) if not name.startswith("data:")}
+        assert [name for name in named if not (DOCS / name).exists()] == []
+        assert "//" not in "".join(named)
+        shown = {name for name in re.findall(r'src="([^"]+)"', body)}
+        assert len(shown) >= len(list(DOCS.glob("*.webp")))
+        assert len(text) + sum((DOCS / name).stat().st_size for name in shown) < 8e6
+
+
+@pytest.fixture(scope="module", params=[(1280, False), (400, True)], ids=["desk", "phone, dark"])
+def seen(request: pytest.FixtureRequest) -> Iterator[browser.Browser]:
+    """A browser of two sizes."""
+    if browser.program() is None:
+        pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    width, dark = request.param
+    with browser.Browser(width, 850, dark) as found:
+        yield found
+
+
+CELLS = "[...document.querySelectorAll('#matrix td[data-task={}]')].map(c => c.dataset.method)"
+
+
+def choose(seen: browser.Browser, **what: str) -> None:
+    """Use the page's filter."""
+    for name, value in what.items():
+        seen.run(f"(form => {{ form.{name}.value = {json.dumps(value)}; form.dispatchEvent(new Event('change')) }})"
+                 "(document.getElementById('filter'))")  # fmt: skip
+
+
+class TestInABrowser:
+    @pytest.fixture(autouse=True)
+    def fresh(self, seen: browser.Browser) -> None:
+        seen.open(DOCS / "index.html")
+
+    def test_it_fits_and_does_not_complain(self, seen: browser.Browser) -> None:
+        """No error, no request that leaves the disk, nothing wider than the screen, with all tasks open."""
+        seen.run("document.querySelectorAll('details').forEach(one => { one.open = true })")
+        seen.run("new Promise(done => setTimeout(done, 100))")
+        assert seen.errors == []
+        assert seen.run("document.documentElement.scrollWidth") <= seen.size[0]
+        loaded = seen.run("performance.getEntriesByType('resource').map(one => one.name)")
+        assert [name for name in loaded if not name.startswith(("file:", "data:"))] == []
+        pale = seen.run("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
+        assert max(pale) < 60 if seen.dark else min(pale) > 200
+        assert seen.run(
+            "[...document.querySelectorAll('.adaptation, .learning > figure')].every(one => one.querySelector('svg'))"
+        )
+
+    def test_sorting(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+        task = made["tasks"][0]["name"]
+        of_task = [row for row in made["rows"] if row["task"] == task]
+        expected = [row["method"] for row in sorted(of_task, key=lambda row: -row["value"])]
+        click = f"document.querySelector('#matrix button[data-key={task}]').click()"
+        seen.run(click)
+        values = {row["method"]: row["value"] for row in of_task}
+        shown = seen.run(CELLS.format(task))
+        assert [values[name] for name in shown] == [values[name] for name in expected]
+        seen.run(click)
+        assert [values[name] for name in seen.run(CELLS.format(task))] == [values[name] for name in expected[::-1]]
+        seen.run("document.querySelector('#all button[data-key=cpu]').click()")
+        cpu = seen.run("[...document.querySelectorAll('#all tbody tr')].map(row => Number(row.cells[13].textContent))")
+        assert cpu == sorted(cpu, reverse=True)
+        assert len(cpu) == len(made["rows"])
+
+    def test_filters(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+        tiers = {task["name"]: task["tier"] for task in made["tasks"]}
+        counted = "document.getElementById('count').textContent"
+        total = len(made["rows"])
+        for tier in set(tiers.values()):
+            choose(seen, tier=tier)
+            kept = [row for row in made["rows"] if tiers[row["task"]] == tier]
+            assert seen.run(counted) == f"{len(kept)} of {total} results"
+            assert set(seen.run("[...document.querySelectorAll('#matrix td.open')].map(c => c.dataset.task)")) == {
+                row["task"] for row in kept
+            }
+        choose(seen, tier="", method="naive_rnn", task="hidden_goal")
+        assert seen.run(counted) == f"1 of {total} results"
+        assert seen.run(
+            "[...document.querySelectorAll('details:not([hidden])')].map(d => d.dataset.task + d.open)"
+        ) == ["hidden_goaltrue"]
+        choose(seen, kind="3")  # naive_rnn is of another: nothing is left, and nothing breaks
+        assert seen.run(counted) == f"0 of {total} results"
+        assert seen.errors == []
+
+    def test_the_card_of_a_number(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+        """On hover, or on a tap: seeds, interval, curves and the command; it lies on the screen."""
+        row = next(row for row in made["rows"] if row["method"] == "naive_rnn" and row["trained"] > 1)
+        cell = f"#matrix td[data-task={row['task']}][data-method=naive_rnn]"
+        if seen.size[0] > 600:
+            seen.point(cell)
+        else:
+            seen.run(f"document.querySelector({json.dumps(cell)}).click()")
+        assert seen.run("document.querySelectorAll('#card svg').length") == 1 + len(row["curve"])
+        told = seen.run("document.getElementById('card').innerText")
+        assert row["command"] in told
+        assert f"{row['n']} seeds" in told
+        box = seen.run(
+            "(b => [b.left, b.top, b.right, b.bottom])(document.getElementById('card').getBoundingClientRect())"
+        )
+        assert min(box) >= 0
+        assert box[2] <= seen.size[0]
+        assert box[3] <= seen.size[1]
+        seen.run("document.body.click()")
+        seen.run("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+        assert seen.run("document.getElementById('card').hidden")
+
+    def test_curves_tell_on_hover(self, seen: browser.Browser) -> None:
+        chart = "details[open] .adaptation"
+        seen.point(f"{chart} svg")
+        told = seen.run(f"document.querySelector('{chart} .readout').textContent")
+        assert re.fullmatch(r"\w+, episode \d+: \S+, \S+ to \S+, \d+ seeds", told)
+        assert seen.run(f"document.querySelectorAll('{chart} .mark.on').length") == 1
+
+
+def test_report_in_a_browser(seen: browser.Browser, tmp_path: Path) -> None:
+    """A run's report fits as well; its table scrolls, and each method has its curves."""
+    results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole", 1), list(METHODS))
+    report.adaptation(results, tmp_path / "adaptation.png")
+    report.learning(results, tmp_path / "learning.png")
+    (tmp_path / "report.html").write_text(report.page(results, tmp_path))
+    seen.open(tmp_path / "report.html")
+    assert seen.errors == []
+    assert seen.run("document.documentElement.scrollWidth") <= seen.size[0]
+    assert seen.run("document.querySelectorAll('td svg').length") >= len(results["methods"])
+    assert seen.run("document.querySelector('.outcome').textContent") == score.outcome(results["methods"])
+    wide = "box.scrollWidth > box.clientWidth && getComputedStyle(box).overflowX"
+    assert seen.run(f"(box => {wide})(document.querySelector('.scroll'))") == "auto"
+    assert seen.run("document.images.length") == 3  # adaptation, learning, certificate
+
+
+def test_certificate_of_a_report(tmp_path: Path) -> None:
+    """Beside the run before that of docs/; of this version of the task, or none."""
+    run, folder = tmp_path / "bandit-default", tmp_path / "certificates"
+    assert report.certificate("bandit", 0, run) == DOCS / "certificates" / "bandit.png"
+    assert report.certificate("bandit", 9, run) is None
+    folder.mkdir()
+    (folder / "bandit.json").write_text('{"task": "bandit", "task_version": 0}')
+    (folder / "bandit.png").write_bytes(b"")
+    assert report.certificate("bandit", 0, run) == folder / "bandit.png"
+
+
+def test_beliefs_are_drawn(tmp_path: Path) -> None:
+    """Of two latents; an agent without belief needs none, and no agents leave no picture."""
+    task = envs.get("slippery_walker")
+    theta, episode = task.theta_grid(2)[[0, 1, 2]], np.repeat([0, 1, 2], [4, 1, 3])
+    report.beliefs(task, {}, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+    report.beliefs(
+        task, {"naive_rnn": {"theta": theta, "episode": episode, "belief": theta[episode]}}, tmp_path / "some.png"
+    )
+    assert (tmp_path / "some.png").stat().st_size > 5000
+
+
+def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(browser, "NAMES", ("no-such-browser",))
+    with pytest.raises(envs.InputError, match=r"^no browser was found; install one of no-such-browser$"):
+        browser.Browser(400, 400)
+
+
+def test_commands_of_numbers() -> None:
+    """Another way to deploy an agent is of its method's job; a method from outside is named by its file."""
+    task = envs.get("bandit")
+    found = records.of_task(DOCS / "records", "bandit", 0)
+    outside = [{**one, "method": "mine", "job": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
+    results = records.gather([*found, *outside], list(METHODS))
+    start = "python benchmarks/run.py --task bandit"
+    assert pages.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"
+    assert pages.command(task, results, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
+    assert pages.command(task, results, "expert") == pages.command(task, results)
