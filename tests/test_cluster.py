@@ -52,7 +52,7 @@ MARK = "DECONFOUNDED_TESTED_BY"  # in the environment of all that a test starts
 
 TASK = """
 import beside
-from deconfounded.envs.slippery_cartpole import SlipperyCartpole
+from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 
 
 class OwnCartpole(SlipperyCartpole):

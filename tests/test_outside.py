@@ -475,7 +475,7 @@ def fit(given):
     context, agent = guest(tmp_path, text, CONTROL, "demonstrations", "exploration", "queries")
     evaluate(context, agent, True)
     agent.close()
-    assert len(seeds) == 4  # of demonstrations, exploration, queries and evaluation
+    assert len({tuple(one) for one in seeds}) == 4  # of demonstrations, exploration, queries and evaluation
     hidden = np.concatenate([*thetas, *seeds, [4242424242, stream(EVALUATION, 0), stream(DEMOS, 0)]])
     for name in ("fit", "act40", "act80"):
         with np.load(tmp_path / f"{name}.npz") as hunted:
