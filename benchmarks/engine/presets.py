@@ -137,7 +137,7 @@ _BANDIT = Preset(
         final_updates=3200,
         imitation_rate=3e-3,
     ),
-    gail=GailConfig(rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9),
+    gail=GailConfig(rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9, policy_rate=3e-3),
     rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=1e-2, teacher_updates=500),
     transformer=TransformerConfig(width=32, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
     dropout=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
