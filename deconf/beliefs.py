@@ -117,11 +117,9 @@ class EvidenceBelief(Belief):
 class GruMemory(nn.Module):
     """A GRU (Cho et al., 2014) over embedded transitions (s, a, s'): the history encoder of appendix D.
 
-    It starts out remembering, with inputs of unit size: He's initialisation for the observations' embedding, action
-    embeddings of about 1, a tanh's gain for what enters the GRU, and gates that keep memories for 1 to 100 steps
-    (Tallec and Ollivier, 2018). With torch's initialisation a memory lasts two steps and theta hardly shows in it: Eq.
-    (6) then stays for thousands of updates on the plateau where the latent is ignored, and one seed of five of `dagger`
-    never learns to tell theta.
+    It starts out remembering: its gates keep memories for 1 to 100 steps (Tallec and Ollivier, 2018). With torch's
+    initialisation a memory lasts two steps, theta hardly shows in it, and one seed of five of `dagger` never learns to
+    tell it.
     """
 
     def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
@@ -130,12 +128,6 @@ class GruMemory(nn.Module):
         self.inputs = Embedding(width, signature, obs, draws)
         self.input, self.recurrent = Linear(3 * 32, 3 * width, draws), Linear(width, 3 * width, draws)
         with torch.no_grad():
-            for layer in self.inputs.embed_obs:
-                if isinstance(layer, Linear):
-                    layer.weight.mul_(6**0.5)
-                    layer.bias.zero_()
-            self.inputs.embed_action.weight.mul_(3)
-            self.input.weight.mul_(3)
             keep = slice(width, 2 * width)
             self.input.bias[..., keep] = torch.log(1 + 98 * draws.uniform(1, width))
             self.recurrent.bias[..., keep] = 0
@@ -159,7 +151,12 @@ class GruMemory(nn.Module):
 
 
 class GruBelief(Belief):
-    """The paper's belief: GruMemory, then linear to a mean and a softplus variance."""
+    """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
+
+    Its inputs start out of unit size: He's initialisation for the observations' embedding, action embeddings of about
+    1, and a tanh's gain for what enters the GRU. Without that, Eq. (6) stays for thousands of updates on the plateau
+    where the latent is ignored. (The memories of policies go without: dagger then learns less well at the fork.)
+    """
 
     def __init__(
         self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
@@ -168,6 +165,13 @@ class GruBelief(Belief):
         self.memory = GruMemory(width, signature, obs, draws)
         self.inputs = self.memory.inputs
         self.out = Linear(width, 2 * latent, draws)
+        with torch.no_grad():
+            for layer in self.inputs.embed_obs:
+                if isinstance(layer, Linear):
+                    layer.weight.mul_(6**0.5)
+                    layer.bias.zero_()
+            self.inputs.embed_action.weight.mul_(3)
+            self.memory.input.weight.mul_(3)
 
     def forward(self, batch: Batch) -> Tensor:
         return self.memory(batch, self.start(len(batch)))
