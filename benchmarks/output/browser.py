@@ -8,6 +8,7 @@ import json
 import os
 import select
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -34,7 +35,7 @@ class Browser:
         if found is None:
             raise InputError(f"no browser was found; install one of {', '.join(NAMES)}")
         self.size, self.dark, self.errors, self._asked, self._rest = (width, height), dark, list[str](), 0, b""
-        self._home = tempfile.TemporaryDirectory()
+        self._home = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         hears, self._to = os.pipe()
         self._from, says = os.pipe()
         # Chromium reads from 3 and writes to 4, whatever numbers these pipes have here.
@@ -44,6 +45,7 @@ class Browser:
             [found, *options, f"--user-data-dir={self._home.name}", "about:blank"],
             stderr=subprocess.DEVNULL,
             close_fds=False,
+            start_new_session=True,
             preexec_fn=lambda: [os.dup2(end, i) for i, end in enumerate(theirs, start=3)],
         )
         for end in (*theirs, hears, says):
@@ -66,7 +68,7 @@ class Browser:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._process.kill()
+        os.killpg(self._process.pid, signal.SIGKILL)  # its helpers too, which write to its folder
         self._process.wait()
         os.close(self._to)
         os.close(self._from)
