@@ -231,7 +231,13 @@ def card(task: envs.Task) -> str:
     """Markdown: what the docstrings say, latents, observation, noise, tier, certificate."""
     physics = isinstance(task, envs.MujocoTask)
     latents: list[tuple[str, ...]] = [
-        (lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution) for lat in task.latents
+        (
+            lat.name,
+            lat.unit,
+            f"{lat.low:g} to {lat.high:g}",
+            lat.distribution + f", drifts by {lat.drift:g}" * bool(lat.drift),
+        )
+        for lat in task.latents
     ]
     if isinstance(task, envs.MujocoTask):
         latents = [(*row, _moved(task, i)) for i, row in enumerate(latents)]
@@ -265,7 +271,10 @@ def card(task: envs.Task) -> str:
 
 def tasks_page() -> str:
     """docs/tasks.md: all cards."""
-    head = "# Tasks\n\nMade by `python benchmarks/pages.py` from the tasks' own classes and docs/certificates."
+    head = """# Tasks
+
+Made by `python benchmarks/pages.py` from the tasks' own classes and docs/certificates. Ideas that failed their
+certificate are in [tried.md](tried.md)."""
     return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"
 
 
