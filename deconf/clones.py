@@ -1,4 +1,4 @@
-"""Cloning the expert's trials, whatever it is that learns: naive_rnn's training for its variants."""
+"""Cloning the expert's trials, whatever it is that learns: the training of naive_rnn and of its variants."""
 
 from __future__ import annotations
 

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
 from deconfounded.envs import BatchEnv, Task
+from deconfounded.experts.sb3 import Bare
 
 Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
 """Of observations [N, O], actions [N, A] and what followed [N, O]: [N]. The task's own reward is told to nobody."""
 
 
-class Practice(VecEnv):
+class Practice(Bare):
     """n environments; theta stays for `task.episodes` episodes, and `done` says that they are over.
 
     What is observed [N, O + F + 1]: the observation, scaled; the action before it, one-hot if discrete; and whether an
@@ -66,21 +66,6 @@ class Practice(VecEnv):
             self._episode = np.where(done, 1, self._episode + over)
             self.begun += int(done.sum())
         return self._observation(before, over), reward, done, infos
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [None for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Its seeds are given when it is made."""

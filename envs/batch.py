@@ -26,6 +26,11 @@ def _is_seed(given: object) -> bool:
     return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(given >= 0)
 
 
+def generators(seed: int | None) -> list[np.random.Generator]:
+    """The streams of one environment: for theta, start and noise. None: fresh entropy."""
+    return [np.random.Generator(np.random.PCG64(one)) for one in np.random.SeedSequence(seed).spawn(3)]
+
+
 class BatchEnv:
     """N environments of one task; each has its own theta and three random streams (theta, start, noise).
 
@@ -59,9 +64,7 @@ class BatchEnv:
         whole = isinstance(seed, list | tuple | np.ndarray) and np.shape(seed) == (self.n,)
         if isinstance(seed, int) or not whole or not all(one is None or _is_seed(one) for one in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
-        self._streams = [
-            [np.random.Generator(np.random.PCG64(s)) for s in np.random.SeedSequence(one).spawn(3)] for one in seed
-        ]
+        self._streams = [generators(one) for one in seed]
 
     def reset(
         self,

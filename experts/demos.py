@@ -15,6 +15,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs import BatchEnv, InputError, Task
+from deconfounded.envs.batch import generators
 from deconfounded.envs.files import write_atomically
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.policy import Expert
@@ -178,13 +179,10 @@ class RandomAgent(Agent):
 
 def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
     """theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
-    env = BatchEnv(task, n)
-    env.reset(trial_seeds(n, seed))
-    found = [env.theta.copy()]
+    rng = Streams([generators(one)[0] for one in trial_seeds(n, seed)])
+    found = [task.sample_theta(rng)]
     for _ in range(1, episodes):
-        if task.drifts:
-            env.reset(options={"keep_theta": True})
-        found.append(env.theta.copy())
+        found.append(task.drifted(found[-1], rng) if task.drifts else found[-1])
     return np.stack(found, 1)
 
 

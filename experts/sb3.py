@@ -11,7 +11,26 @@ from stable_baselines3.common.vec_env import VecEnv
 from deconfounded import envs
 
 
-class Sb3VecEnv(VecEnv):
+class Bare(VecEnv):
+    """What Stable-Baselines3 asks of vectors of separate environments, for one that is stepped as a whole."""
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        return [None for _ in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        raise NotImplementedError
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+class Sb3VecEnv(Bare):
     """n privileged environments; a finished one is reset in the same step, as SB3 expects."""
 
     def __init__(self, task: envs.Task, n: int, seed: int) -> None:
@@ -46,20 +65,8 @@ class Sb3VecEnv(VecEnv):
             obs = batch.reset(where=done)
         return obs, reward.astype(np.float32), done, infos
 
-    def close(self) -> None:
-        """Nothing to close."""
-
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         return [getattr(self.env, attr_name, None) for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise NotImplementedError
-
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError
-
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        return [False for _ in self._get_indices(indices)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         self.env.batch.seed(seed)
