@@ -71,11 +71,8 @@ class IcyRoad(MujocoTask):
         x = np.linspace(-4, 70, 297)
         y, direction, _ = road(x)
         middle, across = np.stack([x, y], -1), np.stack([-np.sin(direction), np.cos(direction)], -1)
-        for name, left, right, grey in (
-            ("lane", 1, -1, 0.38),
-            ("left_edge", 1.1, 1, 1.0),
-            ("right_edge", -1, -1.1, 1.0),
-        ):
+        ribbons = ("lane", 1, -1, 0.38), ("left_edge", 1.1, 1, 1.0), ("right_edge", -1, -1.1, 1.0)
+        for name, left, right, grey in ribbons:
             one, other = (middle + HALF_WIDTH * side * across for side in (left, right))
             render.ribbon(spec, name, one, other, grey)
 

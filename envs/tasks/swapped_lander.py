@@ -10,8 +10,8 @@ Who mistakes the wiring turns every correction into a push the wrong way, and tu
 shows its sign only through noise, a few seconds of steering tell. Who takes its own side thrust for evidence never
 finds out.
 
-Latent: swapped, 1 if the side engine pushes the other way. Noise a step: std .004 m and .05 m/s of the position, .004
-rad and .1 rad/s of the pitch.
+Latent: swapped, 1 if the side engine pushes the other way. Noise a step: std .004 m and .05 m/s of the position, .008
+rad and .16 rad/s of the pitch.
 
 Action: main engine, from off (-1) to 5 N (1), about twice the weight on this moon; side engine at the top, 1 is .7 N to
 the right. Reward: (1 + cos pitch) / 2 times .2 exp(-d / 2) + .8 exp(-(d / .5)^2 / 2), d m from standing on the pad,
@@ -41,7 +41,7 @@ class SwappedLander(MujocoTask):
     latents = (Latent("swapped", "", 0, 1, "categorical"),)
     horizon = 150
     expert_noise = 0.02
-    process_noise = {"x": (0.004, 0.05), "z": (0.004, 0.05), "pitch": (0.004, 0.1)}
+    process_noise = {"x": (0.004, 0.05), "z": (0.004, 0.05), "pitch": (0.008, 0.16)}
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
     observation = {
         **{"x": (-8, 8), "z": (-2, 20), "pitch": (-4, 4)},
