@@ -23,7 +23,7 @@ from deconfounded.benchmarks import certify, commands, cost, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.local import Local
-from deconfounded.benchmarks.output import pages, records, score
+from deconfounded.benchmarks.output import cards, pages, records, score
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.envs.task import Array
@@ -452,10 +452,11 @@ def test_pages_are_up_to_date() -> None:
     """What pages.py writes of tasks, certificates and results; README has a row for each of the latter two."""
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     for text, now in (
-        ((docs / "tasks.md").read_text(), pages.tasks_page()),
+        ((docs / "tasks.md").read_text(), cards.tasks_page()),
         ((docs / "results.md").read_text(), pages.results_page()),
         ((docs / "index.html").read_text(), pages.index_page()),
         ((docs / "speed.md").read_text(), pages.speed()),
+        ((docs / "paper.md").read_text(), pages.paper()),
         (readme, pages.readme()),
     ):
         assert text == now, "run `python benchmarks/pages.py`"

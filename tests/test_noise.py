@@ -8,7 +8,7 @@ import pytest
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.benchmarks.output import pages
+from deconfounded.benchmarks.output import cards
 from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.noise import ProcessNoise
 from deconfounded.envs.physics import Edit
@@ -215,7 +215,7 @@ def test_wrong_stds(joint: str, stds: tuple[float, ...], says: str) -> None:
 
 def test_card_of_a_free_joint() -> None:
     """Its two stds of each kind share a cell."""
-    card = pages.card(Loose())
+    card = cards.card(Loose())
     assert "| brick | 0.01, 0.05 | 0.05, 0.3 |" in card
     assert "| ball | 0.05 | 0.4 |" in card
 

@@ -1,14 +1,13 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
-docs/index.html (of the records that `publish.py` kept) and the tables in README and docs/speed.md.
+docs/index.html (of the records that `publish.py` kept) and the tables in README, docs/paper.md and docs/speed.md.
 """
 
 from __future__ import annotations
 
-import inspect
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,37 +16,26 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import index, records, score
+from deconfounded.benchmarks.output import cards, index, records, score
+from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
 
-README = Path(__file__).resolve().parents[2] / "README.md"
-DOCS = README.parent / "docs"
-TIERS = {
-    None: "none: nobody can win",
-    2: "2: exploration is enough",
-    3: "3: it takes queries of the expert",
-}
+README = DOCS.parent / "README.md"
 SUMMARY = (
     *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "naive_rnn"),
     *("oracle_bc", "blind_bc", "conditional", "interventional"),
 )  # methods in README's table
-
-
-def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Rows of cells under a head."""
-    return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))
-
-
-def _kept(folder: Path, name: str) -> dict[str, Any] | None:
-    """What the folder's file of a task holds, if there is one."""
-    file = folder / f"{name}.json"
-    return json.loads(file.read_text()) if file.is_file() else None
+AUTHORS = {
+    "swapped_lander": {"oracle_bc": 235, "dagger": 235, "deconfounded": 235, "gail": 130, "naive_rnn": -20},
+    "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
+    "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
+}  # returns in the published paper's control tasks, read off its figures, so approximate
 
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
     """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
     for name in envs.SUITE:
-        if found := _kept(DOCS / "certificates", name):
+        if found := kept(DOCS / "certificates", name):
             yield envs.get(name), found
 
 
@@ -125,12 +113,25 @@ def summary() -> str:
     return markdown_table(("task", "tier", *methods, "seconds"), rows)
 
 
+def controls() -> str:
+    """The table of docs/paper.md: the paper's control tasks, its returns beside ours."""
+    methods, rows = list(AUTHORS["ant_goal"]), []
+    ours = {task.name: results["methods"] for task, results in _published() if task.name in AUTHORS}
+    for task, theirs in AUTHORS.items():
+        found = ours.get(task, {})
+        rows.append((task, "the authors' return", *(f"{theirs[method]:,}" for method in methods)))
+        last = {method: (np.mean(found[method]["return"], 0)[-1], found[method]["score_last"]) for method in found}
+        for i, what in enumerate(("the return here", "the score here")):
+            rows.append(("", what, *(score.two_decimals(last[name][i]) if name in last else "" for name in methods)))
+    return markdown_table(("task", "in the last episode", *methods), rows)
+
+
 def certificates() -> str:
     """README's table of certificates."""
     rows, asked = [], list[str]()
     for task, found in _certified():
         measured = (f"{check['measured']:.2f}" for check in found["checks"].values())
-        rows.append((task.name, *measured, *_nats(found), found["verdict"]))
+        rows.append((task.name, *measured, *nats(found), found["verdict"]))
         asked = [f"{name} ({check['required']})" for name, check in found["checks"].items()]
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
@@ -157,6 +158,11 @@ def speed() -> str:
     return _filled((DOCS / "speed.md").read_text(), costs)
 
 
+def paper() -> str:
+    """docs/paper.md with its table of control tasks."""
+    return _filled((DOCS / "paper.md").read_text(), controls)
+
+
 def readme() -> str:
     """README with its tables, as docs/ has them."""
     return _filled(README.read_text(), summary, certificates)
@@ -173,12 +179,6 @@ def _filled(text: str, *tables: Callable[[], str]) -> str:
     return text
 
 
-def _nats(certificate: dict[str, Any]) -> list[str]:
-    """Evidence of theta a step, along expert trajectories: from dynamics, from actions."""
-    told = (certificate["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions"))
-    return [f"{value:,.2f}" if value < 10 else f"{value:,.0f}" for value in told]
-
-
 def check_certificate(file: Path, task: envs.Task) -> None:
     """Raises InputError for a file that is no certificate of the task, as pages show it."""
     try:
@@ -192,92 +192,6 @@ def check_certificate(file: Path, task: envs.Task) -> None:
         raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
 
 
-def _certificate(task: envs.Task) -> str:
-    found = _kept(DOCS / "certificates", task.name)
-    if found is None:
-        return "No certificate."
-    checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in found["checks"].items())
-    dynamics, actions = _nats(found)
-    return (
-        f"Certificate ({len(found['conditional']['score'])} episodes a trial) {found['verdict']}: {', '.join(checks)}."
-        f" Evidence of theta along expert trajectories: dynamics {dynamics}, actions {actions} nats a step."
-    )
-
-
-def _moved(task: envs.MujocoTask, latent: int) -> str:
-    """What of the model a latent moves, read off models that differ in it alone: arrays, and whose entries."""
-    middle = np.array([lat.grid(3)[-1 if lat.distribution == "categorical" else 1] for lat in task.latents])
-    thetas = np.repeat(middle[None], 2, 0)
-    thetas[:, latent] = task.latents[latent].grid(9)[[0, -1]]
-    simulator, found = task.simulator(2), []
-    for i, theta in enumerate(thetas):
-        simulator.set_theta(i, theta)
-    one, other = simulator.models
-    kinds = {"body": one.body, "geom": one.geom, "dof": one.joint, "jnt": one.joint, "tendon": one.tendon}
-    kinds |= {"actuator": one.actuator, "site": one.site}
-    for field in dir(one):
-        value = None if field.startswith(("cam_", "light_")) else getattr(one, field, None)
-        if isinstance(value, np.ndarray) and (differs := value != getattr(other, field)).any():
-            rows = np.flatnonzero(differs.reshape(len(differs), -1).any(1)).tolist()
-            kind = field.split("_")[0]
-            named = [kinds[kind](one.dof_jntid[i] if kind == "dof" else i).name for i in rows] if kind in kinds else []
-            found.append(f"`{field}`{' of ' + ', '.join(named) if named else ''}")
-    if (one.opt.gravity != other.opt.gravity).any():
-        found.append("gravity")
-    return "; ".join(found) or "nothing"
-
-
-def card(task: envs.Task) -> str:
-    """Markdown: what the docstrings say, latents, observation, noise, tier, certificate."""
-    physics = isinstance(task, envs.MujocoTask)
-    latents: list[tuple[str, ...]] = [
-        (
-            lat.name,
-            lat.unit,
-            f"{lat.low:g} to {lat.high:g}",
-            lat.distribution + f", drifts by {lat.drift:g}" * bool(lat.drift),
-        )
-        for lat in task.latents
-    ]
-    if isinstance(task, envs.MujocoTask):
-        latents = [(*row, _moved(task, i)) for i, row in enumerate(latents)]
-    parts = [f"## {task.name} (v{task.version})", inspect.getdoc(inspect.getmodule(type(task))) or ""]
-    for cls in type(task).__mro__:
-        if issubclass(cls, envs.Task) and cls.__module__ not in ("deconfounded.envs.task", "deconfounded.envs.physics"):
-            parts.append(inspect.cleandoc(cls.__doc__ or ""))
-    trial = "one episode" if task.episodes == 1 else f"{task.episodes} episodes"
-    more = f", {task.control_dt:g} s each; the expert's action noise is {task.expert_noise:g}" if physics else ""
-    parts.append(
-        f"Tier {TIERS[task.tier]}. Trials of {trial} of at most {task.horizon} steps{more}. {_certificate(task)}"
-    )
-    if kept := (_kept(DOCS, "data") or {}).get(f"{task.name}-v{task.version}"):
-        sets = ", ".join(f"`{sha[:16]}` ({kind})" for kind, sha in kept.items())
-        parts.append(
-            f"Standard sets, 256 trials of seed 0, by the sha256 of their contents: {sets}, whole in"
-            f" [data.json](data.json). `deconf data --task {task.name} --out DIR`, and `--explore`."
-        )
-    moves = ("what it moves in the model",) if physics else ()
-    parts.append(markdown_table(("latent", "unit", "range", "distribution", *moves), latents))
-    bounds = ((name, f"{low:g} to {high:g}") for name, (low, high) in task.observation.items())
-    parts.append(markdown_table(("observation", "bounds"), bounds))
-    if isinstance(task, envs.MujocoTask):
-        noise = []  # of a free joint, two of each: position and rotation, and their velocities
-        for joint, stds in task.process_noise.items():
-            halves = stds[: len(stds) // 2], stds[len(stds) // 2 :]
-            noise.append((joint, *(", ".join(f"{std:g}" for std in half) for half in halves)))
-        parts.append(markdown_table(("joint", "noise a step, m or rad", "m/s or rad/s"), noise))
-    return "\n\n".join(parts)
-
-
-def tasks_page() -> str:
-    """docs/tasks.md: all cards."""
-    head = """# Tasks
-
-Made by `python benchmarks/pages.py` from the tasks' own classes and docs/certificates. Ideas that failed their
-certificate are in [tried.md](tried.md)."""
-    return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"
-
-
 def index_page() -> str:
     """docs/index.html."""
     certified = {task.name: found for task, found in _certified()}
@@ -288,7 +202,8 @@ def index_page() -> str:
 def write() -> None:
     """Bring all of them up to date."""
     write_atomically(DOCS / "index.html", index_page())
-    write_atomically(DOCS / "tasks.md", tasks_page())
+    write_atomically(DOCS / "tasks.md", cards.tasks_page())
     write_atomically(DOCS / "results.md", results_page())
     write_atomically(DOCS / "speed.md", speed())
+    write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())
