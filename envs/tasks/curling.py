@@ -8,7 +8,7 @@ Latent: friction, the coefficient of stone on ice, log-uniform, set as the Coulo
 Noise a step: std .01 m and .04 m/s.
 
 Action: how hard the arm pushes, from not at all (-1) to its full strength (1), which is 300 N at the start, 3 m before
-the hog line, and falls to 0 there. Reward: exp(-(d / 1.3)^2 / 2) for a stone that comes to rest d m from the tee, 7 m
+the hog line, and falls to 0 there. Reward: exp(-(d / 1.7)^2 / 2) for a stone that comes to rest d m from the tee, 7 m
 past the hog line, which ends the episode; 0 for one that is not there after 100 steps of .1 s. Every step costs up to
 .001, by the square of the push.
 """
@@ -23,7 +23,7 @@ from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array, Latent
 
 START, TEE = -3.0, 7.0  # m from the hog line
-HOUSE = 1.3  # m
+HOUSE = 1.7  # m
 WEIGHT = 20 * 9.81  # of the stone, N
 EFFORT = 0.001
 
