@@ -23,6 +23,7 @@ from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.deconf.rma import RmaConfig
 
 MOST = 1e9  # of any amount
+MANY, WIDE = 16, 128  # from so many observed numbers on, all methods' networks on control are so wide
 
 
 @dataclass(frozen=True)
@@ -213,6 +214,8 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
     if name == "paper":
         amounts = _PAPER if amounts is _BANDIT else replace(amounts, seeds=10)
     told: dict[str, dict[str, Any]] = {part: {"device": device} for part in CONFIGS}
+    if len(task.observation) >= MANY:
+        told = {part: values | {"width": WIDE} for part, values in told.items()}
     for part in ("deconfounded", "discrete", "offline"):
         told[part] |= {"drifts": task.drifts}
     return replace(amounts, **{part: replace(getattr(amounts, part), **values) for part, values in told.items()})

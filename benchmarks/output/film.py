@@ -57,7 +57,8 @@ class Pane:
         pane.paste(seen.resize((WIDTH, HEIGHT)), (0, HEAD))
         draw = ImageDraw.Draw(pane)
         draw.text((8, 6), NAMES.get(self.name, self.name), fill=INK, font_size=17)
-        said = f"earned {self.earned[row]:.0f}" + (" - over" if over else "")
+        digits = 0 if np.abs(self.earned).max() >= 10 else 2
+        said = f"earned {round(self.earned[row], digits) + 0.0:.{digits}f}" + (" - over" if over else "")
         draw.text((WIDTH - 8, 8), said, fill=INK, font_size=14, anchor="ra")
         for i in range(len(latents)):
             self._strip(draw, i, HEAD + HEIGHT + STRIP * i, episode, t)

@@ -4,10 +4,10 @@ Tier 2. How fast it may fall is settled before there is anything to see: who exp
 time and is smashed on the ground below the mark, which ends the episode; who expects a weaker one creeps down and comes
 late. One control step shows the strength only through process noise.
 
-Latent: strength, of the thruster, in units of its nominal 16 N, log-uniform. Noise a step: std .008 m and .15 m/s.
+Latent: strength, of the thruster, in units of its nominal 16 N, log-uniform. Noise a step: std .008 m and .2 m/s.
 
 Action: throttle, from -1 for none to 1 for all; the lander weighs 9.81 N. Reward: at d m from the mark, .9 exp(-8 d^2)
-+ .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m below the mark.
++ .1 exp(-|d| / 3). An episode is 3.5 s, and ends .5 m below the mark.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class WeakThruster(MujocoTask):
     """Joint `height` (m, 0 is the mark)."""
 
     name = "weak_thruster"
-    latents = (Latent("strength", "", 0.85, 1.8, "loguniform"),)
-    horizon = 100
+    latents = (Latent("strength", "", 0.8, 2.0, "loguniform"),)
+    horizon = 70
     expert_noise = 0.02
-    process_noise = {"height": (0.008, 0.15)}
+    process_noise = {"height": (0.008, 0.2)}
     observation = {"radar": (-2, RADAR + 0.1), "velocity": (-30, 30)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
