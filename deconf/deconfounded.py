@@ -180,8 +180,10 @@ def fit(
     obs, change = scalers(seen.joined(expert))
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
     model, policy = agent.model, agent.policy  # the model is in its eval mode but for its updates
+    drawn_at_once = config.inference_batch
     if config.drifts:
         model.kept.fill_(0.5)  # while it explores
+        drawn_at_once = drawn_at_once and drawn_at_once * episodes  # as much evidence as of trials that are whole
 
     inferences = config.rounds * config.inference_updates
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
@@ -212,7 +214,7 @@ def fit(
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
             beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
-            batch = beginnings.draw_trials(config.inference_batch, draws)
+            batch = beginnings.draw_trials(drawn_at_once, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)

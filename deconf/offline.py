@@ -50,7 +50,7 @@ class OfflineConfig:
 def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
     rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
-    trials = apart(trials) if config.drifts else trials
+    trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
@@ -61,7 +61,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
 
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
-        batch = data.draw_trials(config.offline_batch, draws)
+        batch = data.draw_trials(config.offline_batch * times, draws)
         belief = offline.belief(offline.last(batch))
         mean, std = belief.chunk(2, -1)
         index, steps = draws.below(batch.mask.shape[2], config.offline_steps), batch.mask.shape[2]
@@ -86,7 +86,7 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     for update in range(config.online_updates):
         if update % config.refresh == 0:
             synthetic = synthesise(online, policy, latents, data, starts, horizon, config, draws)
-        batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch, draws)
+        batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch * times, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
