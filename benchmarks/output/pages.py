@@ -16,7 +16,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import cards, index, records, score
+from deconfounded.benchmarks.output import cards, gap, index, records, score
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
 
@@ -99,7 +99,13 @@ expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's ow
 theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
 Intervals are 95% bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times
 in four. *After as many again*: the last score in a trial twice as long as those of training."""
-    return "\n\n".join([head, *(section(*found) for found in _published())]) + "\n"
+    parts = [head, *(section(*found) for found in _published()), gap.section(_gaps())]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _gaps() -> list[gap.Gap]:
+    """Of all tasks that have the records for it."""
+    return [one for task, results in _published() if (one := gap.gap(task, results["methods"]))]
 
 
 def summary() -> str:
@@ -204,6 +210,7 @@ def write() -> None:
     write_atomically(DOCS / "index.html", index_page())
     write_atomically(DOCS / "tasks.md", cards.tasks_page())
     write_atomically(DOCS / "results.md", results_page())
+    gap.picture(_gaps(), DOCS / "gap.png")
     write_atomically(DOCS / "speed.md", speed())
     write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())

@@ -1,0 +1,71 @@
+"""Over all tasks: the gap that the exact policies predict, against the one measured between learned agents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks.output.cards import markdown_table
+from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.envs.files import save_figure
+
+
+class Gap(NamedTuple):
+    """Of a task, in scores of the last episode: exact interventional less conditional, deconfounded less naive_rnn."""
+
+    task: envs.Task
+    predicted: float
+    measured: float
+
+
+def gap(task: envs.Task, methods: dict[str, Any]) -> Gap | None:
+    """From the `methods` of results.json; None if one of the four is not there."""
+    if not {"interventional", "conditional", "deconfounded", "naive_rnn"} <= set(methods):
+        return None
+    last = {name: float(methods[name]["score_last"]) for name in methods}
+    return Gap(task, last["interventional"] - last["conditional"], last["deconfounded"] - last["naive_rnn"])
+
+
+def _correlation(gaps: Sequence[Gap]) -> str:
+    """Pearson's, and over how many tasks."""
+    r = np.corrcoef([one.predicted for one in gaps], [one.measured for one in gaps])[0, 1]
+    return f"{two_decimals(r)} over {len(gaps)} tasks"
+
+
+def section(gaps: Sequence[Gap]) -> str:
+    """Its part of docs/results.md."""
+    explored = [one for one in gaps if one.task.tier != 3]  # in expert trials of Tier 3 the world is silent about theta
+    if len(explored) < 3:
+        return ""
+    text = f"""## Predicted and measured
+
+What cloning loses, in the last episode: as the exact policies foretell it (interventional less conditional), and as it
+was measured (`deconfounded` less `naive_rnn`). Pearson's correlation is {_correlation(explored)} of Tier 2 and none.
+With those of Tier 3, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
+    rows = [(one.task.name, two_decimals(one.predicted), two_decimals(one.measured)) for one in gaps]
+    table = markdown_table(("task", "predicted", "measured"), rows)
+    return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
+
+
+def picture(gaps: Sequence[Gap], file: Path) -> None:
+    """A dot for each task."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+    axes.axline((0, 0), slope=1, color="0.8", lw=1)
+    axes.plot([one.predicted for one in gaps], [one.measured for one in gaps], "o", color="tab:blue")
+    for one in gaps:
+        axes.annotate(
+            one.task.name, (one.predicted, one.measured), xytext=(4, 4), textcoords="offset points", fontsize=8
+        )
+    axes.set(xlabel="predicted: exact interventional less conditional", ylabel="measured: deconfounded less naive_rnn")
+    axes.set_title("what cloning loses, score in the last episode", fontsize=11)
+    save_figure(figure, file, 100)
+    plt.close(figure)
