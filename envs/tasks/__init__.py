@@ -21,7 +21,7 @@ SUITE = (
     "rolling_deck",
     "icy_stop",
     "weak_thruster",
-    "lopsided_block",
+    "dragged_sled",
     "cheetah_speed",
     "ant_goal",
     "curling",
