@@ -58,7 +58,10 @@ def test_spectrum_is_drawn(tmp_path: Path) -> None:
 
 
 def test_predicted_and_measured_gap(tmp_path: Path) -> None:
-    """Exact less exact, learned less learned; Tier 3 is left out of the first correlation, which by hand is 1, and -.1825 / (.0875 * .6275) ** .5 with it."""
+    """Exact less exact, learned less learned. The first correlation leaves Tier 3 out: by hand it is 1, and with it
+
+    -.1825 / sqrt(.0875 * .6275).
+    """
 
     def methods(*scores: float) -> dict[str, Any]:
         names = ("interventional", "conditional", "deconfounded", "naive_rnn")
