@@ -4,9 +4,9 @@ Tier 2. theta acts through the reward and the bearings alone. The expert, which 
 the first step on its own way tells theta, loudly. A clone that takes its own way for evidence walks on wherever it
 happened to set out to, and stays there. In truth only the bearings tell, a little each step.
 
-Latents: goal_x and goal_y, m, uniform, from where the ant starts. Noise a step: std .02 m/s and .05 rad/s of the torso,
-.1 rad/s of the joints, none of positions. Bearings, new each step: the distance of the goal, m, and its direction as a
-unit vector, each number with normal noise of std 2; at the start all are 0.
+Latents: goal_x and goal_y, m, uniform, from where the ant starts. Noise a step: std .05 m/s and .15 rad/s of the torso,
+.5 rad/s of the joints, none of positions. Bearings, new each step: the distance of the goal, m, and its direction as a
+unit vector, each number with normal noise of std 1.6; at the start all are 0.
 
 The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator, and springs for motors: an action is
 the angles that joints are pulled to, and PPO learns to walk much sooner than by torques. Reward: .6 / (1 + (d / .5)^4)
@@ -33,7 +33,7 @@ from deconfounded.envs.tasks import gymnasium_body
 FAR = 1.0  # of goals, m
 STIFF, DAMPED = 150.0, 20.0  # of joints, N m/rad and N m s/rad
 CENTRES, SWINGS = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([0.5, 0.35] * 4)  # rad
-BLUR = 2.0  # of bearings
+BLUR = 1.6  # of bearings
 ANKLES = (1, -1, -1, 1)  # bent by, standing, rad
 LEGS = {f"{part}_{i + 1}": angle for i, bent in enumerate(ANKLES) for part, angle in (("hip", 0), ("ankle", bent))}
 ROOT = {"x": (-20, 20), "y": (-20, 20), "z": (-2, 5), **{f"rotation_{axis}": (-1, 1) for axis in "wxyz"}}
@@ -50,7 +50,7 @@ class AntGoal(MujocoTask):
     readings = 3
     moves_state = False
     expert_noise = 0.05
-    process_noise = {"root": (0, 0, 0.02, 0.05), **{joint: (0, 0.1) for joint in LEGS}}
+    process_noise = {"root": (0, 0, 0.05, 0.15), **{joint: (0, 0.5) for joint in LEGS}}
     action_space = spaces.Box(-1.0, 1.0, (8,), np.float32)
     observation = {
         **{**ROOT, **{joint: (-3, 3) for joint in LEGS}, **MOVES},
