@@ -5,8 +5,8 @@ expects runners that are smoother lags behind, whoever expects rougher ones over
 sled only through the cord, and the sled bounces on it, so that feedback is slow and the stretch must be known in
 advance. One control step shows the friction only through process noise.
 
-Latent: friction of the runners, N, log-uniform: Coulomb's, of a tendon along the ground. Noise a step: std .004 m and .4
-m/s of the sled, .004 m and .05 m/s of the hand; none of the target, which theta does not touch.
+Latent: friction of the runners, N, log-uniform: Coulomb's, of a tendon along the ground. Noise a step: std .004 m and
+.4 m/s of the sled, .004 m and .05 m/s of the hand; none of the target, which theta does not touch.
 
 Action: the hand's speed, in units of 3 m/s around 2 m/s. Reward: .8 exp(-12.5 d^2) + .2 exp(-d), d m off the target,
 which goes at 1.5 to 2.5 m/s. An episode is 5 s, and ends with the sled 1.2 m off the target.
