@@ -47,18 +47,19 @@ class OfflineConfig:
     device: str = "cpu"
 
 
-def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
-    """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
-    rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
-    trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
-    data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
+def explain(
+    data: Batch, signature: Signature, config: OfflineConfig, draws: Draws, monitor: Monitor, times: int = 1
+) -> tuple[VariationalModel, VariationalModel, ActionHead]:
+    """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an online model to train.
+
+    The online one's dynamics are the offline one's, and its prior that of the latents. Batches are `times` as large.
+    """
     obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
     offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
     online.dynamics = offline.dynamics
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, signature, draws)
     total = config.offline_updates + config.online_updates
-
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
         batch = data.draw_trials(config.offline_batch * times, draws)
@@ -74,14 +75,40 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
-    offline.eval()
+    return offline.eval(), online, policy
+
+
+def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
+    """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
+    rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
+    trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
+    data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
+    offline, online, policy = explain(data, signature, config, draws, monitor, times)
+    agent = imagine(trials, data, offline, online, policy, config, draws, monitor, times)
+    if config.drifts:
+        choose_kept(online, data[:, : 64 * each], each, draws)
+    return agent
+
+
+def imagine(
+    trials: Trials,
+    data: Batch,
+    offline: VariationalModel,
+    online: VariationalModel,
+    policy: ActionHead,
+    config: OfflineConfig,
+    draws: Draws,
+    monitor: Monitor,
+    times: int = 1,
+) -> DeconfoundedAgent:
+    """Eq. (6) on synthetic trials: train the online model that `explain` made; the agent of it and the policy."""
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
-
-    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
+    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(draws), -1, data.obs.shape[-1])
     horizon = trials.mask.shape[2]
     online.eval()
     agent = DeconfoundedAgent(online, policy)
+    total = config.offline_updates + config.online_updates
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
         if update % config.refresh == 0:
@@ -90,8 +117,6 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
-    if config.drifts:
-        choose_kept(online, data[:, : 64 * each], each, draws)
     return agent
 
 
