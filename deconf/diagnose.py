@@ -9,7 +9,6 @@ data, and are judged by the expert who knows the latent, as in Eq. (1).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -20,12 +19,10 @@ from torch import Tensor
 from deconfounded.deconf import cloning, naive_rnn, offline
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Batch, Draws, Signature, listed, take
+from deconfounded.deconf.data import Batch, Draws, Signature, take
 from deconfounded.deconf.deconfounded import final_belief
-from deconfounded.deconf.dream import dream
-from deconfounded.deconf.equations import masked_mean
-from deconfounded.deconf.models import VariationalModel
-from deconfounded.deconf.nets import ActionHead
+from deconfounded.deconf.dream import Clone, Expert, Filter, World
+from deconfounded.deconf.equations import belief_update, masked_mean
 from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.envs.task import Array, InputError
@@ -107,29 +104,46 @@ def diagnose(
     """Judge expert trials. Raises InputError for data that cannot be judged at all."""
     check(trials, config)
     shown, hidden = split(trials, config, rng)
-    rngs = listed([np.random.default_rng(rng.integers(2**63)) for _ in range(config.refits)])
+    rngs = [np.random.default_rng(rng.integers(2**63)) for _ in range(config.refits)]
     signature, monitor = Signature.of(trials), monitor or Monitor()
     held = Batch.of(hidden, config.refits)
 
     blind = cloning.fit(shown, config.cloning, rngs, monitor=monitor)
     recurrent = naive_rnn.fit(shown, config.naive, rngs, monitor)
     data, draws = Batch.of(shown, config.refits), Draws(rngs, "cpu")
-    explained = offline.explain(data, signature, config.offline, draws, monitor)
-    agent = offline.imagine(shown, data, *explained, config.offline, draws, monitor)
-    hindsight = explained[0]
-    for one in (recurrent, agent):
-        one.begin(config.refits)
-        one.reset(rngs)
-
+    model, _, policy = offline.explain(data, signature, config.offline, draws, monitor)
     with torch.no_grad():
-        present = -masked_mean(
-            blind.policy.log_prob(blind.scaler(held.obs), held.action).flatten(1), held.mask.flatten(1)
-        )
+        latents = model.sample(final_belief(model, data), draws)
+        particles, own = take(latents, draws.below(latents.shape[1], config.rivals)), final_belief(model, held)
+        knowing = Expert(model, policy, model.sample(own, draws))
+        world = Filter(model, policy, particles)
+        world.begin(len(held), rngs)
+
+        present = -_mean(blind.policy.log_prob(blind.scaler(held.obs), held.action), held)
+        naive = Clone(recurrent)
+        naive.begin(1, rngs)
         memory = present - recurrent.held_out_loss(held)
-        inferred = present - agent.held_out_loss(held)
-        dynamics, actions = evidence(hindsight, agent.policy, held, config.rivals, draws)
-        scores = dream(trials, held, hindsight, agent, recurrent, config.dreams, rngs)
-    return judge(Findings(*(_figure(x) for x in (memory, inferred, dynamics, actions, *scores))))
+        log_next, log_policy = world.log_next(held), world.log_policy(held)
+        final = belief_update(world.log_belief, (log_next * held.mask[..., None]).sum(2))
+        explained = present + _mean(torch.logsumexp(final[:, :, None] + log_policy, -1), held)
+        told = knowing.theta_hat[:, :, None].expand(-1, -1, held.mask.shape[2], -1)
+        true_next = model.dynamics.log_prob(held.obs, held.action, held.next_obs, told)[..., 0]
+        true_policy = policy.log_prob(knowing.features(held.obs, told), held.action)
+        dynamics, actions = _mean(true_next - log_next.mean(-1), held), _mean(true_policy - log_policy.mean(-1), held)
+
+    starts = torch.tensor(shown.obs[:, :, 0]).reshape(config.refits, -1, signature.obs)
+    theta_hat, other = (take(knowing.theta_hat, draws.below(len(held), config.dreams)) for _ in range(2))
+    knower = Expert(model, policy, theta_hat)
+    dreamt = World(knower, held, starts, *trials.mask.shape[1:])
+    actors = (knower, Expert(model, policy, other), naive, world)
+    one, zero, *lost = (dreamt.lost(actor, rngs) for actor in actors)
+    scores = (1 - (x - one) / (zero - one).clamp(min=1e-3) for x in lost)
+    return judge(Findings(*(_figure(x) for x in (memory, explained, dynamics, actions, *scores))))
+
+
+def _mean(x: Tensor, held: Batch) -> Tensor:
+    """Over all steps [S, B, T] that took place: [S]."""
+    return masked_mean(x.flatten(1), held.mask.flatten(1))
 
 
 def check(trials: Trials, config: DiagnoseConfig) -> None:
@@ -154,32 +168,6 @@ def split(trials: Trials, config: DiagnoseConfig, rng: np.random.Generator) -> t
         for part, index in zip(parts, (order[count:], order[:count]), strict=True):
             part.append(Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions))
     return joined(parts[0]), joined(parts[1])
-
-
-def evidence(
-    model: VariationalModel, policy: ActionHead, held: Batch, rivals: int, draws: Draws
-) -> tuple[Tensor, Tensor]:
-    """Nats a step [S] for a trial's own latent over other trials': of dynamics, and of actions."""
-    own = model.sample(final_belief(model, held), draws)
-    totals = [torch.zeros(len(draws)) for _ in range(2)]
-    for _ in range(rivals):
-        other = take(own, torch.stack([torch.randperm(own.shape[1]) for _ in range(len(own))]))
-        for i, log_likely in enumerate(_likely(model, policy, held)):
-            gain = log_likely(own) - log_likely(other)
-            totals[i] += masked_mean(gain.flatten(1), held.mask.flatten(1)) / rivals
-    return totals[0], totals[1]
-
-
-def _likely(model: VariationalModel, policy: ActionHead, held: Batch) -> list[Callable[[Tensor], Tensor]]:
-    """log p(s' | s, a, theta_hat) and log pi(a | s, theta_hat) [S, B, T] of latents [S, B, D]."""
-
-    def along(latent: Tensor) -> Tensor:
-        return latent[:, :, None].expand(-1, -1, held.mask.shape[2], -1)
-
-    return [
-        lambda latent: model.dynamics.log_prob(held.obs, held.action, held.next_obs, along(latent))[..., 0],
-        lambda latent: policy.log_prob(torch.cat([model.inputs.obs(held.obs), along(latent)], -1), held.action),
-    ]
 
 
 def _figure(x: Tensor | Array) -> Figure:

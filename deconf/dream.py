@@ -1,8 +1,10 @@
-"""What cloning will cost, seen in learned dynamics: agents act there under latents drawn from the data."""
+"""What cloning will cost, seen in learned dynamics: actors go about there under latents drawn from the data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -10,113 +12,144 @@ from torch import Tensor
 
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.data import Batch, Draws, take
-from deconfounded.deconf.deconfounded import DeconfoundedAgent, final_belief
+from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.models import VariationalModel
-from deconfounded.deconf.nets import ActionHead
-from deconfounded.experts.demos import Trials
+from deconfounded.deconf.nets import ActionHead, sample_index
 
 
-def dream(
-    trials: Trials,
-    held: Batch,
-    hindsight: VariationalModel,
-    agent: DeconfoundedAgent,
-    recurrent: LearnedAgent,
-    n: int,
-    rngs: list[np.random.Generator],
-) -> tuple[Tensor, Tensor]:
-    """Predicted scores [S] of the naive clone and of the latent-conditional agent, in the learned dynamics.
+class Actor(Protocol):
+    """Acts in n trials of each seed, side by side."""
 
-    A step counts by how far its action is from the knowing expert's, in units of how far another latent's expert's is;
-    where it leaves the range that experts keep to, the episode is lost. 1 is the expert who knows the latent, 0 the one
-    who holds another one for true.
-    """
-    draws = Draws(rngs, "cpu")
-    latents = hindsight.sample(final_belief(hindsight, held), draws)
-    chosen = draws.below(latents.shape[1], n)
-    theta_hat, told = take(latents, chosen), take(latents, draws.below(latents.shape[1], n))
-    starts = torch.tensor(trials.obs[:, :, 0]).reshape(1, -1, held.obs.shape[-1]).expand(len(draws), -1, -1)
-    world = World(trials, held, hindsight, agent.policy, theta_hat, starts)
+    def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None: ...
+    def choose(self, obs: Tensor) -> Tensor: ...  # [S, N, O] -> [S, N, A]
+    def remember(self, step: Batch) -> None: ...
 
-    def knows(latent: Tensor) -> Callable[[Tensor], Tensor]:
-        return lambda obs: agent.policy.sample(torch.cat([agent.model.inputs.obs(obs), latent], -1), world.draws)
 
-    lost = [world.lost(knows(latent), None, rngs) for latent in (theta_hat, told)]
-    lost += [world.lost(one.choose, one, rngs) for one in (recurrent, agent)]
-    one, zero, naive, deconfounded = lost
-    spread = (zero - one).clamp(min=1e-3)
-    return 1 - (naive - one) / spread, 1 - (deconfounded - one) / spread
+class Expert:
+    """A latent-conditional policy: of latents [S, N, D], one a trial, that it holds for true."""
+
+    def __init__(self, model: VariationalModel, policy: ActionHead, theta_hat: Tensor) -> None:
+        self.model, self.policy, self.theta_hat = model, policy, theta_hat
+
+    def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
+        """It remembers nothing."""
+        self._draws = Draws(rngs, "cpu")
+
+    def features(self, obs: Tensor, latent: Tensor) -> Tensor:
+        """What the policy reads."""
+        return torch.cat([self.model.inputs.obs(obs), latent], -1)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(self.features(obs, self.theta_hat), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        pass
+
+    def point(self, obs: Tensor, latent: Tensor) -> Tensor:
+        """The mean action [..., A], or log-probabilities of discrete ones."""
+        out = self.policy.net(self.features(obs, latent))
+        return torch.log_softmax(out, -1) if self.policy.signature.actions else out.chunk(2, -1)[0].clamp(-1, 1)
+
+
+class Filter(Expert):
+    """Eq. (5) over K latents of the data [S, K, D]: posterior sampling under a belief that reads dynamics alone."""
+
+    def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
+        super().begin(n, rngs)
+        k = self.theta_hat.shape[1]
+        self.log_belief = self.theta_hat.new_full((len(self.theta_hat), n, k), -math.log(k))
+
+    def log_next(self, step: Batch) -> Tensor:
+        """log p(s' | s, a, theta_hat_k) [..., K] of steps [S, ...]."""
+        each = (self._spread(k, step) for k in range(self.theta_hat.shape[1]))
+        found = [self.model.dynamics.log_prob(step.obs, step.action, step.next_obs, latent)[..., 0] for latent in each]
+        return torch.stack(found, -1)
+
+    def log_policy(self, step: Batch) -> Tensor:
+        """log pi(a | s, theta_hat_k) [..., K] of steps [S, ...]."""
+        each = (self._spread(k, step) for k in range(self.theta_hat.shape[1]))
+        return torch.stack([self.policy.log_prob(self.features(step.obs, latent), step.action) for latent in each], -1)
+
+    def _spread(self, k: int, step: Batch) -> Tensor:
+        latent = self.theta_hat[:, k]
+        return latent.reshape(len(latent), *[1] * (step.mask.dim() - 1), -1).expand(*step.mask.shape, -1)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        drawn = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))
+        return self.policy.sample(self.features(obs, drawn), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        self.log_belief = belief_update(self.log_belief, self.log_next(step) * step.mask[..., None])
+
+
+class Clone:
+    """A learned agent, as an actor; its memory goes on over episodes."""
+
+    def __init__(self, agent: LearnedAgent) -> None:
+        self.agent = agent
+
+    def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
+        self.agent.begin(len(rngs) * n)
+        self.agent.reset(rngs)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.agent.choose(obs)
+
+    def remember(self, step: Batch) -> None:
+        self.agent.remember(step)
 
 
 class World:
-    """The learned dynamics under latents [S, N, D], and the expert who knows them, as a judge."""
+    """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
 
-    def __init__(
-        self,
-        trials: Trials,
-        held: Batch,
-        model: VariationalModel,
-        policy: ActionHead,
-        theta_hat: Tensor,
-        starts: Tensor,
-    ) -> None:
-        self.episodes, self.horizon = trials.mask.shape[1:]
-        self.model, self.policy, self.theta_hat, self.starts = model, policy, theta_hat, starts
+    held: expert trials [S, B, T], in whose range of observations the dynamics hold; starts [S, K, O].
+    """
+
+    def __init__(self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int) -> None:
+        self.judge, self.starts, self.episodes, self.horizon = judge, starts, episodes, horizon
         padding = held.mask[..., None] == 0
-        self.low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
-        self.high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
-        margin = 0.1 * (self.high - self.low)
-        self.low, self.high = self.low - margin, self.high + margin
+        low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
+        high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
+        margin = 0.1 * (high - low)
+        self.low, self.high = low - margin, high + margin
         self.scale = self._scale(held)
-        self.draws = Draws([], "cpu")
-
-    def _point(self, obs: Tensor, latent: Tensor) -> Tensor:
-        """The expert's mean action, or its log-probabilities."""
-        out = self.policy.net(torch.cat([self.model.inputs.obs(obs), latent], -1))
-        return torch.log_softmax(out, -1) if self.policy.signature.actions else out.chunk(2, -1)[0].clamp(-1, 1)
 
     def _scale(self, held: Batch) -> Tensor:
         """How far the actions of two latents' experts are apart where experts go: [S, 1]."""
-        if self.policy.signature.actions:
-            return torch.ones(len(self.theta_hat), 1)
-        n = self.theta_hat.shape[1]
-        obs = held.obs[:, :, :: max(1, held.obs.shape[2] // 16)].flatten(1, 2)[:, : 16 * n]
-        k = obs.shape[1]
-        one = self.theta_hat[:, torch.arange(k) % n]
-        other = self.theta_hat[:, (torch.arange(k) * 7 + 3) % n]
-        apart = (self._point(obs, one) - self._point(obs, other)).abs().sum(-1)
+        theta_hat = self.judge.theta_hat
+        if self.judge.policy.signature.actions:
+            return torch.ones(len(theta_hat), 1)
+        n = theta_hat.shape[1]
+        draws = Draws([np.random.default_rng(i) for i in range(len(theta_hat))], "cpu")
+        obs = held.steps(held.draw_steps(16 * n, draws)).obs
+        one, other = (take(theta_hat, draws.below(n, 16 * n)) for _ in range(2))
+        apart = (self.judge.point(obs, one) - self.judge.point(obs, other)).abs().sum(-1)
         return apart.mean(1, keepdim=True).clamp(min=1e-3)
 
     def _off(self, obs: Tensor, action: Tensor) -> Tensor:
         """How far an action [S, N, A] is from the knowing expert's, 0 to 1."""
-        point = self._point(obs, self.theta_hat)
-        if self.policy.signature.actions:
+        point = self.judge.point(obs, self.judge.theta_hat)
+        if self.judge.policy.signature.actions:
             likely = point.gather(-1, action[..., :1].long())[..., 0]
             return 1 - (likely - point.amax(-1)).exp()
         return ((action - point).abs().sum(-1) / self.scale).clamp(max=1)
 
-    def lost(
-        self, choose: Callable[[Tensor], Tensor], agent: LearnedAgent | None, rngs: list[np.random.Generator]
-    ) -> Tensor:
-        """Mean distance [S] in the last of the trial's episodes, of an actor [S, N, O] -> [S, N, A] and its memory."""
-        seeds, n, _ = self.theta_hat.shape
-        rngs = [np.random.default_rng(one.integers(2**63)) for one in rngs]
-        self.draws = Draws(rngs, "cpu")
-        if agent is not None:
-            agent.begin(seeds * n)
+    @torch.no_grad()
+    def lost(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> Tensor:
+        """Mean distance from the judge [S] in the last episode; where the expert's range is left, the rest is lost."""
+        seeds, n, _ = self.judge.theta_hat.shape
+        rngs = [np.random.default_rng(rng.integers(2**63)) for rng in rngs]
+        draws = Draws(rngs, "cpu")
+        actor.begin(n, rngs)
         total = torch.zeros(seeds, n)
         for _ in range(self.episodes):
-            if agent is not None:
-                agent.reset(rngs)
-            obs = take(self.starts, self.draws.below(self.starts.shape[1], n))
+            obs = take(self.starts, draws.below(self.starts.shape[1], n))
             there, total = torch.ones(seeds, n), torch.zeros(seeds, n)
             for _ in range(self.horizon):
-                action = choose(obs)
-                total += torch.where(there > 0, self._off(obs, action), 1.0) / self.horizon
-                next_obs = self.model.dynamics.sample(obs, action, self.theta_hat, self.draws)
-                if agent is not None:
-                    agent.remember(Batch(obs, action, next_obs, there))
-                inside = ((next_obs >= self.low) & (next_obs <= self.high)).all(-1)
-                there = there * inside
+                action = actor.choose(obs)
+                total += torch.where(there > 0, self._off(obs, action), 1.0)
+                next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
+                actor.remember(Batch(obs, action, next_obs, there))
+                there = there * ((next_obs >= self.low) & (next_obs <= self.high)).all(-1)
                 obs = torch.where(there[..., None] > 0, next_obs, obs)
-        return total.mean(1)
+        return total.mean(1) / self.horizon
