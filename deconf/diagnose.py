@@ -31,6 +31,7 @@ from deconfounded.experts.demos import Trials, joined
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.03, 0.01  # nats a step: of memory, of the world
 FINE, GAP = 0.8, 0.15  # scores
+STAKES = 1.3  # times chance
 CLONE = "clone it: deconf.naive_rnn, or deconf.cloning, which has no memory to be deluded"
 OFFLINE = "deconf.offline, Algorithm 3: it needs these trials alone"
 EXPLORE = "deconf.deconfounded, Algorithm 1: it needs exploration that is blind to what the expert knows"
@@ -69,14 +70,16 @@ class Findings(NamedTuple):
 
     memory: what memory adds to predicting the expert's action. explained: what a latent inferred from dynamics alone
     adds. dynamics, actions: how much more likely a trial's own latent makes the world's answer, and the expert's
-    action, than another trial's does. naive, latent: predicted scores in the last episode: 0 is an expert who holds
-    another latent for true, 1 the one who knows it. explored: as dynamics, of exploration, if there is some.
+    action, than another trial's does. stakes: how many times as far off the way an expert goes who holds another latent
+    for true, as one who knows it goes by chance. naive, latent: predicted scores in the last episode: 0 is an expert
+    who holds another latent for true, 1 the one who knows it. explored: as dynamics, of exploration, if there is some.
     """
 
     memory: Figure
     explained: Figure
     dynamics: Figure
     actions: Figure
+    stakes: Figure
     naive: Figure
     latent: Figure
     explored: Figure | None = None
@@ -136,9 +139,11 @@ def diagnose(
     knower = Expert(model, policy, theta_hat)
     dreamt = World(knower, held, starts, *trials.mask.shape[1:])
     actors = (knower, Expert(model, policy, other), naive, world)
-    one, zero, *lost = (dreamt.lost(actor, rngs) for actor in actors)
-    scores = (1 - (x - one) / (zero - one).clamp(min=1e-3) for x in lost)
-    return judge(Findings(*(_figure(x) for x in (memory, explained, dynamics, actions, *scores))))
+    (one, home), (zero, away), *others = (dreamt.visit(actor, rngs) for actor in actors)
+    again = dreamt.visit(knower, rngs)[1]
+    stakes = (away - home).abs().mean((1, 2)) / (again - home).abs().mean((1, 2)).clamp(min=1e-6)
+    scores = (1 - (off - one) / (zero - one).clamp(min=1e-3) for off, _ in others)
+    return judge(Findings(*(_figure(x) for x in (memory, explained, dynamics, actions, stakes, *scores))))
 
 
 def _mean(x: Tensor, held: Batch) -> Tensor:
@@ -198,6 +203,9 @@ def judge(found: Findings) -> Diagnosis:
         if found.explored.low > SILENT:
             return told("confounded", 3, f"In exploration it does, by {found.explored} nats a step.", ASK)
         return told("confounded", None, "Nor does it in exploration: nobody who does not see it can act on it.", LOST)
+    said.append(f"Who acts on another latent goes {found.stakes} times as far off the way as chance does.")
+    if found.stakes.high < STAKES:
+        return told("not confounded", 1, "That is little: what the expert knows hardly matters.", CLONE)
     said.append(
         f"In the learned dynamics a naive clone scores {found.naive}, one that infers the latent from the world"
         f" {found.latent}: 1 knows the latent, 0 acts on another one."

@@ -135,21 +135,26 @@ class World:
         return ((action - point).abs().sum(-1) / self.scale).clamp(max=1)
 
     @torch.no_grad()
-    def lost(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> Tensor:
-        """Mean distance from the judge [S] in the last episode; where the expert's range is left, the rest is lost."""
+    def visit(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
+        """The last episode of an actor: how far its actions are from the judge's [S], and where it went [S, N, 2 O].
+
+        The first is a mean over steps, 0 to 1; where the expert's range is left, the rest of the episode counts as 1.
+        The second are means of the observation and of its square, in units of the expert's range.
+        """
         seeds, n, _ = self.judge.theta_hat.shape
         rngs = [np.random.default_rng(rng.integers(2**63)) for rng in rngs]
         draws = Draws(rngs, "cpu")
         actor.begin(n, rngs)
-        total = torch.zeros(seeds, n)
         for _ in range(self.episodes):
             obs = take(self.starts, draws.below(self.starts.shape[1], n))
-            there, total = torch.ones(seeds, n), torch.zeros(seeds, n)
+            there, total, went = torch.ones(seeds, n), torch.zeros(seeds, n), torch.zeros(seeds, n, 2 * obs.shape[-1])
             for _ in range(self.horizon):
+                scaled = (obs - self.low) / (self.high - self.low).clamp(min=1e-6)
+                went += torch.cat([scaled, scaled**2], -1) / self.horizon
                 action = actor.choose(obs)
                 total += torch.where(there > 0, self._off(obs, action), 1.0)
                 next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
                 actor.remember(Batch(obs, action, next_obs, there))
                 there = there * ((next_obs >= self.low) & (next_obs <= self.high)).all(-1)
                 obs = torch.where(there[..., None] > 0, next_obs, obs)
-        return total.mean(1) / self.horizon
+        return total.mean(1) / self.horizon, went
