@@ -66,6 +66,7 @@ def picture(gaps: Sequence[Gap], file: Path) -> None:
             one.task.name, (one.predicted, one.measured), xytext=(4, 4), textcoords="offset points", fontsize=8
         )
     axes.set(xlabel="predicted: exact interventional less conditional", ylabel="measured: deconfounded less naive_rnn")
+    axes.margins(0.14, 0.08)
     axes.set_title("what cloning loses, score in the last episode", fontsize=11)
     save_figure(figure, file, 100)
     plt.close(figure)
