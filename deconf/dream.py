@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -61,18 +61,20 @@ class Filter(Expert):
 
     def log_next(self, step: Batch) -> Tensor:
         """log p(s' | s, a, theta_hat_k) [..., K] of steps [S, ...]."""
-        each = (self._spread(k, step) for k in range(self.theta_hat.shape[1]))
-        found = [self.model.dynamics.log_prob(step.obs, step.action, step.next_obs, latent)[..., 0] for latent in each]
-        return torch.stack(found, -1)
+        found = (
+            self.model.dynamics.log_prob(step.obs, step.action, step.next_obs, latent) for latent in self._each(step)
+        )
+        return torch.cat(list(found), -1)
 
     def log_policy(self, step: Batch) -> Tensor:
         """log pi(a | s, theta_hat_k) [..., K] of steps [S, ...]."""
-        each = (self._spread(k, step) for k in range(self.theta_hat.shape[1]))
-        return torch.stack([self.policy.log_prob(self.features(step.obs, latent), step.action) for latent in each], -1)
+        found = (self.policy.log_prob(self.features(step.obs, latent), step.action) for latent in self._each(step))
+        return torch.stack(list(found), -1)
 
-    def _spread(self, k: int, step: Batch) -> Tensor:
-        latent = self.theta_hat[:, k]
-        return latent.reshape(len(latent), *[1] * (step.mask.dim() - 1), -1).expand(*step.mask.shape, -1)
+    def _each(self, step: Batch) -> Iterator[Tensor]:
+        """Each of the K latents, shaped to go with steps."""
+        for latent in self.theta_hat.unbind(1):
+            yield latent.reshape(len(latent), *[1] * (step.mask.dim() - 1), -1).expand(*step.mask.shape, -1)
 
     def choose(self, obs: Tensor) -> Tensor:
         drawn = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))

@@ -84,27 +84,9 @@ def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | Non
     trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     offline, online, policy = explain(data, signature, config, draws, monitor, times)
-    agent = imagine(trials, data, offline, online, policy, config, draws, monitor, times)
-    if config.drifts:
-        choose_kept(online, data[:, : 64 * each], each, draws)
-    return agent
-
-
-def imagine(
-    trials: Trials,
-    data: Batch,
-    offline: VariationalModel,
-    online: VariationalModel,
-    policy: ActionHead,
-    config: OfflineConfig,
-    draws: Draws,
-    monitor: Monitor,
-    times: int = 1,
-) -> DeconfoundedAgent:
-    """Eq. (6) on synthetic trials: train the online model that `explain` made; the agent of it and the policy."""
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
-    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(draws), -1, data.obs.shape[-1])
+    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
     horizon = trials.mask.shape[2]
     online.eval()
     agent = DeconfoundedAgent(online, policy)
@@ -117,6 +99,8 @@ def imagine(
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
+    if config.drifts:
+        choose_kept(online, data[:, : 64 * each], each, draws)
     return agent
 
 

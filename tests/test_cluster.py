@@ -21,7 +21,7 @@ from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.engine.pool import DemonstrationJob, Job
 from deconfounded.deconf.agents import Training
 from deconfounded.envs import outside
-from tests.tools import tiny_preset
+from tests.tools import processes, tiny_preset
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install deconfounded-imitation[cluster]")
 
@@ -107,15 +107,7 @@ def two() -> Iterator[Any]:
 
 def workers() -> list[str]:
     """Processes of this test's Ray that run jobs."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
-        except OSError:
-            continue
-        ours = f"{MARK}={os.getpid()}".encode() in environ.split(b"\0")
-        found += [words.decode()] * (ours and words.startswith((b"ray::work", b"ray::Mailbox")))
-    return found
+    return [line for _, line in processes(f"{MARK}={os.getpid()}", "ray::work", "ray::Mailbox")]
 
 
 def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureRequest) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.dagger import DaggerConfig
@@ -42,3 +44,17 @@ def tiny_preset() -> Preset:
         dropout=DropoutConfig(updates=2, batch=4),
         palr=PalrConfig(updates=2, batch=4, samples=32),
     )
+
+
+def processes(mark: str, *starts: str) -> list[tuple[int, str]]:
+    """Number and command line of those with `mark` (NAME=value) in their environment, whose command line starts so."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
+        except OSError:
+            continue
+        line = words.decode(errors="replace")
+        if mark.encode() in environ.split(b"\0") and line.startswith(starts):
+            found.append((int(folder.name), line))
+    return sorted(found)

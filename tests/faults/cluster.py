@@ -22,6 +22,8 @@ from typing import Any
 
 from ray.cluster_utils import Cluster
 
+from tests import tools
+
 ROOT = Path(__file__).parents[2]
 RUN = ("--task", "bandit", "--preset", "smoke", "--methods", "naive_rnn", "blind_bc", "--seeds", "2")
 MARK = "DECONFOUNDED_KILLS"  # in the environment of all that this script starts
@@ -43,15 +45,7 @@ def finished(out: Path) -> dict[str, str]:
 
 def processes(*starts: str) -> list[int]:
     """Those of this script's Ray whose command line starts so."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
-        except OSError:
-            continue
-        ours = f"{MARK}={os.environ[MARK]}".encode() in environ.split(b"\0")
-        found += [int(folder.name)] * (ours and words.decode(errors="replace").startswith(starts))
-    return sorted(found)
+    return [number for number, _ in tools.processes(f"{MARK}={os.environ[MARK]}", *starts)]
 
 
 def hit(kind: str, run: subprocess.Popen[bytes], cluster: Any, second: list[Any]) -> bool:
