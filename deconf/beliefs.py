@@ -17,6 +17,9 @@ from deconfounded.deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener
 from deconfounded.deconf.scan import GruScan
 
 
+FEW = 16  # products of actions and changes, that evidence may read beside both
+
+
 class Belief(nn.Module, ABC):
     """q_phi and the prior p(theta_hat), a Gaussian in each of D dimensions: N(0, 1) until `set_prior`."""
 
@@ -69,7 +72,8 @@ class EvidenceBelief(Belief):
 
     The evidence starts out whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its
     common part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the
-    latent is ignored.
+    latent is ignored. So it does where theta shows in what an action changes, and in nothing else (a motor that turns
+    the other way): a network must first find that product. Where these products are few, it is handed them.
     """
 
     longest: Tensor
@@ -79,7 +83,10 @@ class EvidenceBelief(Belief):
     ) -> None:
         super().__init__(latent, draws)
         self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
-        self.evidence = mlp(2 * signature.obs + signature.action_features, width, self.width, draws)
+        products = signature.obs * signature.action_features
+        self.products = products if products <= FEW else 0
+        inputs = 2 * signature.obs + signature.action_features + self.products
+        self.evidence = mlp(inputs, width, self.width, draws)
         self.whiten = Whitener(self.width, draws)
         self.out = mlp(2 * self.width + 1, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
@@ -87,7 +94,10 @@ class EvidenceBelief(Belief):
     def _terms(self, batch: Batch) -> Tensor:
         """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
         change = self.change(batch.next_obs - batch.obs)
-        inputs = [self.inputs.obs(batch.obs), self.inputs.action(batch.action), change]
+        action = self.inputs.action(batch.action)
+        inputs = [self.inputs.obs(batch.obs), action, change]
+        if self.products:
+            inputs.append((action[..., None] * change[..., None, :]).flatten(-2))
         evidence = self.whiten(self.evidence(torch.cat(inputs, -1)), batch.mask)
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)

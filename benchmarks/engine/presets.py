@@ -58,7 +58,7 @@ CONFIGS = (
 
 _ON_CONTROL = DeconfoundedConfig(
     inference_updates=500,
-    inference_rate=2e-3,
+    inference_rate=3e-3,
     imitation_updates=250,
     final_updates=2000,
     imitation_rate=2e-3,
