@@ -16,7 +16,6 @@ from deconfounded.deconf.data import Batch, Draws, Signature
 from deconfounded.deconf.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
 from deconfounded.deconf.scan import GruScan
 
-
 FEW = 16  # products of actions and changes, that evidence may read beside both
 
 
