@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -61,20 +61,20 @@ class Filter(Expert):
 
     def log_next(self, step: Batch) -> Tensor:
         """log p(s' | s, a, theta_hat_k) [..., K] of steps [S, ...]."""
-        found = (
-            self.model.dynamics.log_prob(step.obs, step.action, step.next_obs, latent) for latent in self._each(step)
-        )
-        return torch.cat(list(found), -1)
+        every, latent = self._every(step)
+        return self.model.dynamics.log_prob(every.obs, every.action, every.next_obs, latent)[..., 0]
 
     def log_policy(self, step: Batch) -> Tensor:
         """log pi(a | s, theta_hat_k) [..., K] of steps [S, ...]."""
-        found = (self.policy.log_prob(self.features(step.obs, latent), step.action) for latent in self._each(step))
-        return torch.stack(list(found), -1)
+        every, latent = self._every(step)
+        return self.policy.log_prob(self.features(every.obs, latent), every.action)
 
-    def _each(self, step: Batch) -> Iterator[Tensor]:
-        """Each of the K latents, shaped to go with steps."""
-        for latent in self.theta_hat.unbind(1):
-            yield latent.reshape(len(latent), *[1] * (step.mask.dim() - 1), -1).expand(*step.mask.shape, -1)
+    def _every(self, step: Batch) -> tuple[Batch, Tensor]:
+        """Each step under each latent."""
+        shape = (*step.mask.shape, self.theta_hat.shape[1])
+        latent = self.theta_hat.reshape(len(self.theta_hat), *[1] * (step.mask.dim() - 1), *self.theta_hat.shape[1:])
+        obs, action, next_obs = (x[..., None, :].expand(*shape, -1) for x in step.tensors[:3])
+        return Batch(obs, action, next_obs, step.mask), latent.expand(*shape, -1)
 
     def choose(self, obs: Tensor) -> Tensor:
         drawn = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))
@@ -108,7 +108,10 @@ class World:
     """
 
     def __init__(self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int) -> None:
-        self.judge, self.starts, self.episodes, self.horizon = judge, starts, episodes, horizon
+        self.judge, self.horizon = judge, horizon
+        draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
+        n = judge.theta_hat.shape[1]
+        self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
         padding = held.mask[..., None] == 0
         low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
         high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
@@ -138,25 +141,23 @@ class World:
 
     @torch.no_grad()
     def visit(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
-        """The last episode of an actor: how far its actions are from the judge's [S], and where it went [S, N, 2 O].
+        """An actor's last episode: how far its actions are from the judge's [S], and its observations [S, N, T, O].
 
-        The first is a mean over steps, 0 to 1; where the expert's range is left, the rest of the episode counts as 1.
-        The second are means of the observation and of its square, in units of the expert's range.
+        The first is a mean over steps, 0 to 1; where the expert's range is left, the rest of the episode counts as 1,
+        and observations stay as they are.
         """
         seeds, n, _ = self.judge.theta_hat.shape
         rngs = [np.random.default_rng(rng.integers(2**63)) for rng in rngs]
         draws = Draws(rngs, "cpu")
         actor.begin(n, rngs)
-        for _ in range(self.episodes):
-            obs = take(self.starts, draws.below(self.starts.shape[1], n))
-            there, total, went = torch.ones(seeds, n), torch.zeros(seeds, n), torch.zeros(seeds, n, 2 * obs.shape[-1])
+        for obs in self.starts:
+            there, total, went = torch.ones(seeds, n), torch.zeros(seeds, n), list[Tensor]()
             for _ in range(self.horizon):
-                scaled = (obs - self.low) / (self.high - self.low).clamp(min=1e-6)
-                went += torch.cat([scaled, scaled**2], -1) / self.horizon
                 action = actor.choose(obs)
                 total += torch.where(there > 0, self._off(obs, action), 1.0)
                 next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
                 actor.remember(Batch(obs, action, next_obs, there))
-                there = there * ((next_obs >= self.low) & (next_obs <= self.high)).all(-1)
                 obs = torch.where(there[..., None] > 0, next_obs, obs)
-        return total.mean(1) / self.horizon, went
+                there = there * ((obs >= self.low) & (obs <= self.high)).all(-1)
+                went.append(obs)
+        return total.mean(1) / self.horizon, torch.stack(went, 2)

@@ -15,6 +15,7 @@ COMMANDS = {
     "train": ("benchmarks.train", "train a task's expert (PPO)"),
     "check": ("benchmarks.check", "does a task hold together? the contract tests"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
+    "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),

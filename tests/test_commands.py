@@ -26,9 +26,7 @@ from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import cards, pages, records, score
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
-from deconfounded.envs.task import Array
-from deconfounded.envs.tasks.cartpole import Cartpole
-from deconfounded.experts.policy import Expert
+from tests.fixtures import Feedback, NoStakes
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -206,7 +204,7 @@ class Deadly(pool.Job):
 def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
     with pytest.raises(SystemExit) as ended:
-        run_command(lambda: pool.run_jobs([job], "deadly", Local()), "kept")
+        run_command(lambda: pool.run_jobs([job], "deadly", Local().run), "kept")
     assert (ended.value.code, capsys.readouterr().err) == (143, "interrupted; kept\n")
     assert not multiprocessing.active_children()
 
@@ -336,47 +334,6 @@ class TestScore:
         held = [low <= 0 <= high for low, high in (score.bootstrap(rng.standard_normal(30)) for _ in range(200))]
         assert 0.85 < np.mean(held) < 0.99
         assert score.bootstrap(np.array([1.0])) is None
-
-
-class NoStakes(Cartpole):
-    """Hold a point against Coulomb friction of the rail: feedback alone is enough, so nothing is confounded."""
-
-    name = "no_stakes"
-    latents = (envs.Latent("friction", "N", 0.0, 3.0),)
-
-    def spec(self):
-        spec = envs.get("slippery_cartpole").spec()
-        for tendon in spec.tendons:
-            spec.delete(tendon)
-        tendon = spec.add_tendon(name="rail")
-        tendon.wrap_joint("slider", 1.0)
-        spec.actuator("spin").ctrlrange = [0, 0]
-        return spec
-
-    process_noise = envs.get("slippery_cartpole").process_noise
-    observation = envs.get("tilted_cartpole").observation
-
-    def control(self, action: Array) -> Array:
-        return np.concatenate([action, np.zeros_like(action)], -1)
-
-    def apply_latent(self, edit, theta: Array) -> None:
-        edit.tendon_friction("rail", float(theta[0]))
-
-
-class Feedback(Expert):
-    """A linear controller that adds what friction it is told of, in the direction of motion."""
-
-    def mean(self, obs: Array, theta: Array) -> Array:
-        x, _, sin, velocity, pole_velocity = obs.T
-        force = 1.0 * x + 12 * sin + 1.5 * velocity + 3.0 * pole_velocity
-        return np.clip(force[:, None] / 3 + 0.1 * theta * np.tanh(20 * velocity)[:, None], -1, 1)
-
-    def act(self, obs: Array, theta: Array, rng: np.random.Generator) -> Array:
-        mean = self.mean(obs, theta)
-        return np.clip(mean + 0.02 * rng.standard_normal(mean.shape), -1, 1)
-
-    def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
-        return -0.5 * (((action - self.mean(obs, theta)) / 0.02) ** 2).sum(-1)
 
 
 def test_certificate_fails_what_deserves_it() -> None:

@@ -115,13 +115,23 @@ def code(task: envs.Task, module: str, reference: str = "") -> str:
     if reference and (file := outside.file(reference)):
         own.append(file)
     bases = [file for cls in type(task).__mro__ if (file := outside.source(cls)) and _counts(file)]
-    files = {*FRAMEWORK, *closure([*own, *bases]), *(GUESTS if reference else ())}
-    digest = hashlib.sha256()
-    for file in sorted(files, key=_wherever):
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    digest = _digest({*FRAMEWORK, *closure([*own, *bases]), *(GUESTS if reference else ())})
     mjcf = task.home / f"{task.name}.xml"
     digest.update(mjcf.read_bytes() if mjcf.is_file() else b"")
     return digest.hexdigest()
+
+
+def module(path: str) -> str:
+    """SHA-256 of a module, given as path under the root, and of what it imports."""
+    return _digest(closure([ROOT / f"{path}.py"])).hexdigest()
+
+
+def _digest(files: Iterable[Path]) -> hashlib._Hash:
+    """Of their names and contents, wherever they lie."""
+    digest = hashlib.sha256()
+    for file in sorted(files, key=_wherever):
+        digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest
 
 
 def _wherever(file: Path) -> tuple[str, bytes]:

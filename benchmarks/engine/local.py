@@ -15,7 +15,7 @@ from multiprocessing.queues import Queue
 from deconfounded import envs
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.guest import die_with_parent
-from deconfounded.benchmarks.engine.pool import Engine, Job
+from deconfounded.benchmarks.engine.pool import Engine, Some
 from deconfounded.envs.physics import cores
 
 
@@ -31,7 +31,7 @@ class Local(Engine):
     def slots(self, device: str) -> int:
         return cores() if device == "cpu" else 1
 
-    def run(self, jobs: list[Job], tick: Callable[[int], None], say: Callable[[Job, str | Exception], None]) -> None:
+    def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
         context = multiprocessing.get_context("spawn")
         workers = min(cores(), len(jobs))
         ticks = context.Queue()

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -161,7 +161,7 @@ class DemonstrationJob(Job):
     def run(self) -> str:
         start = time.time()
         trials = self.context().demonstrations
-        _ticks.put(self.ticks)
+        tick(self.ticks)
         return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
 
@@ -178,6 +178,11 @@ def tell(ticks: Ticks) -> None:
     """Let the jobs of this process tell their progress there."""
     global _ticks
     _ticks = ticks
+
+
+def tick(ticks: int) -> None:
+    """Work in this process has come so much further."""
+    _ticks.put(ticks)
 
 
 class JobMonitor(Monitor):
@@ -210,7 +215,7 @@ class JobMonitor(Monitor):
 
     def _tell(self, share: float) -> None:
         if (now := int(self.ticks * share)) > self.told:
-            _ticks.put(now - self.told)
+            tick(now - self.told)
             self.told = now
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
@@ -257,6 +262,23 @@ def know_guests(folder: Path) -> None:
                 print(f"{file.name} is left out: {error}")
 
 
+class Work(Protocol):
+    """A job, or anything that does its own work and says how it went."""
+
+    @property
+    def method(self) -> str: ...
+    @property
+    def seeds(self) -> tuple[int, ...]: ...
+    @property
+    def ticks(self) -> int: ...
+    def run(self) -> str: ...
+
+
+Some = TypeVar("Some", bound=Work)
+Run = Callable[[list[Some], Callable[[int], None], Callable[[Some, str | Exception], None]], None]
+"""An engine's `run`."""
+
+
 class Engine(ABC):
     """Where jobs run, one core or one GPU each. Use it in a `with`: after that nothing of it is left running."""
 
@@ -301,8 +323,8 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
         for seed, job in sorted(shown.items())
     ]
-    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine)
-    run_jobs(parts, label, engine)
+    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine.run)
+    run_jobs(parts, label, engine.run)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()
     done = written(every[0], folder)
@@ -372,19 +394,19 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             raise envs.InputError(f"{folder} holds a run with another {differ[0]}; give another --out, or remove it")
 
 
-def run_jobs(jobs: list[Job], label: str, engine: Engine) -> None:
+def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:
     """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say."""
     if not jobs:
         return
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
-    def say(job: Job, told: str | Exception) -> None:
+    def say(job: Some, told: str | Exception) -> None:
         if isinstance(told, Exception):
             failed.append(told)
             told = f"failed: {told}"
         progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
 
-    engine.run(jobs, progress.update, say)
+    run(jobs, progress.update, say)
     progress.close()
     if failed:
         raise failed[0]

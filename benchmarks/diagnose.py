@@ -1,0 +1,143 @@
+"""Is your data confounded? `python benchmarks/diagnose.py --trials expert.npz`
+
+From an expert's trials alone, and exploration if you have some: no theta, no simulator. Both are a Minari data set's
+folder, or an .npz as `Trials.save` writes it; each trial is under a hidden theta of its own. It writes index.html and
+diagnosis.json. Interrupted, it goes on where it was.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+import json
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.envs.files import write_json
+
+if TYPE_CHECKING:
+    from deconfounded.deconf.findings import Amounts, Findings
+    from deconfounded.experts.demos import Trials
+
+
+def trials_of(source: Path) -> Trials:
+    """What a file or a data set's folder holds. Raises InputError if that is no trials."""
+    from deconfounded.experts.demos import Trials
+
+    if not source.exists():
+        raise envs.InputError(f"there is no {source}; give a Minari data set's folder, or an .npz of Trials.save")
+    return Trials.from_minari(source) if source.is_dir() else Trials.load(source)
+
+
+@dataclass(frozen=True)
+class Refit:
+    """One split of the data, measured in a worker process, and kept in a file."""
+
+    trials: Path
+    explore: Path | None
+    amounts: Amounts
+    seed: int
+    index: int
+    refits: int
+    made_of: str
+    folder: Path
+
+    method = "refit"
+    ticks = 1000
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Which one it is."""
+        return (self.index,)
+
+    @property
+    def file(self) -> Path:
+        """Where its findings are."""
+        return self.folder / f"refit-{self.index}.json"
+
+    def found(self) -> Findings | None:
+        """What was measured, if it was of the same."""
+        from deconfounded.deconf.findings import Findings
+
+        try:
+            kept = json.loads(self.file.read_text())
+            return Findings(**kept["found"]) if kept["made_of"] == self.made_of else None
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+
+    def run(self) -> str:
+        """Measure, and keep it; returns a line that says how it went."""
+        import numpy as np
+
+        from deconfounded.benchmarks.engine import pool
+        from deconfounded.deconf.findings import measure
+
+        start, told = time.time(), 0
+
+        def tell(share: float) -> None:
+            nonlocal told
+            pool.tick(int(share * self.ticks) - told)
+            told = int(share * self.ticks)
+
+        rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
+        explore = None if self.explore is None else trials_of(self.explore)
+        found = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
+        write_json(self.file, {"made_of": self.made_of, "found": found._asdict()})
+        return f"measured in {time.time() - start:.0f} s"
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="of the expert")
+    parser.add_argument("--explore", type=place, metavar="FILE", help="theta-blind exploration of the same world")
+    parser.add_argument("--seed", type=int, default=0, help="of the splits and of training")
+    parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
+    args = parser.parse_args()
+    if args.seed < 0:
+        raise envs.InputError(f"--seed was {args.seed}; it must be from 0 up")
+    trials = trials_of(args.trials)
+    explore = None if args.explore is None else trials_of(args.explore)
+    from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.pool import run_jobs
+    from deconfounded.benchmarks.output import diagnosis as page
+    from deconfounded.deconf.diagnose import DiagnoseConfig, check, judge
+
+    config, start = DiagnoseConfig(), time.time()
+    check(trials, explore, config)
+    about: dict[str, Any] = {
+        "trials": {"from": str(args.trials), "sha256": trials.sha256, "shape": trials.mask.shape},
+        "explore": explore and {"from": str(args.explore), "sha256": explore.sha256, "shape": explore.mask.shape},
+        "config": asdict(config),
+        "seed": args.seed,
+        "versions": identity.versions(),
+        "code": identity.module("deconf/findings"),
+    }
+    own = (json.dumps(about), args.out)
+    refits = [
+        Refit(args.trials, args.explore, config.amounts, args.seed, i, config.refits, *own)
+        for i in range(config.refits)
+    ]
+    with commands.locked(args.out):
+        run_jobs([one for one in refits if one.found() is None], "diagnosis", Local().run)
+    found = judge([each for one in refits if (each := one.found()) is not None])
+    about |= {
+        "command": " ".join(["deconf diagnose", *sys.argv[1:]]),
+        "machine": identity.machine("cpu"),
+        "wall_s": round(time.time() - start),
+    }
+    print(page.write(found, about, args.out))
+
+
+if __name__ == "__main__":
+    run_command(main, "what was finished is kept, and the same command goes on")

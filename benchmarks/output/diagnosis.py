@@ -1,0 +1,134 @@
+"""A diagnosis for people: index.html, which needs no other file, and diagnosis.json for programs."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+
+from deconfounded.benchmarks.output.colours import colour
+from deconfounded.benchmarks.output.index import template
+from deconfounded.deconf.diagnose import FINE, LITTLE, SILENT, STAKES, Diagnosis, Figure
+from deconfounded.envs.files import write_atomically, write_json
+
+Rows = dict[str, tuple[Figure, str]]
+"""Bars by what stands beside them, each with its colour."""
+
+
+def write(found: Diagnosis, about: dict[str, Any], folder: Path) -> str:
+    """Both files; returns what to print."""
+    code = _code(found, about)
+    made = {
+        "verdict": found.verdict,
+        "tier": found.tier,
+        "reasons": list(found.reasons),
+        "next": {"advice": found.next.advice, "code": code},
+        "predicted_gap": found.gap,
+        "found": {key: figure._asdict() for key, figure in found.found.items()},
+    }
+    write_json(folder / "diagnosis.json", {**made, **about})
+    findings = [(title, text, _encoded(draw)) for title, text, draw in _findings(found)]
+    page = template("diagnosis.html.jinja").render(diagnosis=found, findings=findings, code=code, about=about)
+    write_atomically(folder / "index.html", page + "\n")
+    reasons = "\n".join(found.reasons)
+    how = f"\n\n{code}" if code else ""
+    return f"{found.verdict.upper()}\n{reasons}\nNext: {found.next.advice}{how}\n-> {folder / 'index.html'}"
+
+
+def _code(found: Diagnosis, about: dict[str, Any]) -> str:
+    """Lines of Python that do what is to be done next, if a method does it."""
+    if not found.next.fit:
+        return ""
+    source = about["trials"]["from"]
+    read = f"Trials.{'load' if source.endswith('.npz') else 'from_minari'}(Path({source!r}))"
+    method = found.next.fit.partition(".")[0]
+    return f"""from pathlib import Path
+import numpy as np
+from deconfounded.deconf import {method}
+from deconfounded.experts.demos import Trials
+
+trials = {read}
+agent = {found.next.fit}
+agent.save("agent")
+"""
+
+
+def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
+    """Title, two sentences, and what to draw."""
+    figure = found.found
+    memory, naive, latent, stakes = (figure[key] for key in ("memory", "naive", "latent", "stakes"))
+    predictors: Rows = {
+        "memory": (memory, colour("naive_rnn")),
+        "one latent a trial": (figure["actions"], colour("conditional")),
+    }
+    whence = "Exploration would show how much of that the world's answers tell, and how much past actions alone."
+    if "explained" in figure:
+        world = figure["explained"]
+        predictors["the world's answers"] = (world, colour("interventional"))
+        whence = (
+            f"What the world answered tells {world} of it, as far as exploration taught to read it; the rest is read"
+            " off the expert's own past actions, and those tell a clone that acts by itself nothing new."
+        )
+    sections: list[tuple[str, str, Callable[[Axes], None]]] = [
+        (
+            "Is there a hidden context, and where does it show?",
+            f"Memory of a trial predicts the expert's action {memory} nats a step better than the present observation"
+            f" alone; {LITTLE} is nothing. {whence}",
+            lambda axes: _bars(axes, predictors, "nats a step over the present observation", LITTLE),
+        ),
+    ]
+    if "explored" in figure:
+        told = figure["explored"]
+        sections.append(
+            (
+                "Does the world tell it?",
+                f"In exploration, whose actions are blind to it, a trial's own latent makes the world's answers {told}"
+                f" nats a step more likely than another trial's. Below {SILENT} the world is silent there.",
+                lambda axes: _bars(axes, {"exploration": (told, colour("interventional"))}, "nats a step", SILENT),
+            )
+        )
+    actors: Rows = {
+        "naive clone": (naive, colour("naive_rnn")),
+        "infers the latent": (latent, colour("deconfounded")),
+    }
+    sections.append(
+        (
+            "What will it cost?",
+            f"Whoever acts on another latent goes {stakes} times as far off the way as chance does; below {STAKES} that"
+            f" hardly matters. In learned dynamics a naive clone scores {naive}, and one that infers the latent from"
+            f" the world {latent}, as the expert would judge it: 1 knows the latent, 0 acts on another one.",
+            lambda axes: _bars(axes, actors, "predicted score, last episode", FINE),
+        )
+    )
+    return sections
+
+
+def _bars(axes: Axes, rows: Rows, label: str, threshold: float) -> None:
+    """A bar a row, its range over refits, and the threshold that decides."""
+    for i, (value, hue) in enumerate(rows.values()):
+        axes.barh(i, value.value, color=hue, height=0.55, alpha=0.85)
+        axes.plot([value.low, value.high], [i, i], color="0.15", lw=1.5)
+    axes.axvline(0, color="0.4", lw=0.8)
+    axes.axvline(threshold, color="0.4", lw=1, ls=":")
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.invert_yaxis()
+    axes.set(xlabel=label)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _encoded(draw: Callable[[Axes], None]) -> str:
+    """A picture, for a page."""
+    figure, axes = plt.subplots(figsize=(7, 1.9), layout="constrained")
+    draw(axes)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=110)
+    plt.close(figure)
+    return base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,200 @@
+"""What one split of an expert's trials tells of what the expert sees and its clone does not: figures, no judgement.
+
+An expert that sees more than its clone will leaves three traces. Memory tells its actions better than the present
+observation does; one latent explains whole trials, Eq. (7); and what the *world* says of that latent, against what the
+expert's own actions say of it, decides whether a recurrent clone finds out or deludes itself. What that would cost is
+seen in the learned dynamics, where the naive clone and one that infers the latent from the world act under latents
+drawn from the data, and are judged by the expert who knows the latent, as in Eq. (1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from deconfounded.deconf import cloning, naive_rnn, offline
+from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.data import Batch, Draws, Signature, take, take_steps
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.dream import Clone, Expert, Filter, World
+from deconfounded.deconf.equations import imitation_loss, masked_mean
+from deconfounded.deconf.models import VariationalModel
+from deconfounded.deconf.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.experts.demos import Agent, Trials
+
+
+@dataclass(frozen=True)
+class Amounts:
+    """Of training, for one split; offline: of Eq. (7) alone; exploring: of Eq. (6).
+
+    rivals: latents that each trial's own is weighed against. dreams: trials of each actor in the learned dynamics.
+    """
+
+    held_out: float = 0.25  # share of the trials
+    rivals: int = 24
+    dreams: int = 96
+    cloning: CloningConfig = field(default_factory=lambda: CloningConfig(updates=1500))
+    naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
+    offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
+    exploring: DeconfoundedConfig = field(default_factory=lambda: DeconfoundedConfig(inference_updates=1000))
+
+
+class Findings(NamedTuple):
+    """What was measured. Nats are a step, of held-out trials.
+
+    memory: what memory adds to predicting the expert's action over the present observation. actions: what a latent adds
+    that explains the trial, its actions too. explained: what a latent adds that is inferred from the world's answers
+    alone. explored: how much more likely such a latent makes the world's answers in exploration than another trial's
+    does. stakes: how many times as far off the way an expert goes who holds another latent for true, as one who knows
+    it goes by chance, in what it shows most. naive, latent: predicted scores in the last episode, of a naive clone and
+    of one that infers the latent from the world: 0 is an expert who holds another latent for true, 1 the one who knows
+    it. NaN: without exploration.
+    """
+
+    memory: float
+    actions: float
+    explored: float
+    explained: float
+    stakes: float
+    naive: float
+    latent: float
+
+
+class Part(Monitor):
+    """Tells how far a whole has come, of which this training is a part."""
+
+    def __init__(self, tell: Callable[[float], None], begin: float, end: float) -> None:
+        super().__init__()
+        self.tell, self.begin, self.end = tell, begin, end
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        self.tell(self.begin + (self.end - self.begin) * done / total)
+
+
+def measure(
+    trials: Trials,
+    explore: Trials | None,
+    amounts: Amounts,
+    rng: np.random.Generator,
+    tell: Callable[[float], None] = lambda share: None,
+) -> Findings:
+    """Of one split, drawn at random, of expert trials, and of theta-blind exploration of the same kind.
+
+    tell: is told the share that is done.
+    """
+    (shown, held), signature, rngs = split(trials, amounts.held_out, rng), Signature.of(trials), [rng]
+    blind = cloning.fit(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
+    recurrent = naive_rnn.fit(shown, amounts.naive, rng, Part(tell, 0.1, 0.3))
+    data, other = Batch.of(shown, 1), Batch.of(held, 1)
+    tried, rest = (None, None) if explore is None else (Batch.of(x, 1) for x in split(explore, amounts.held_out, rng))
+    draws, part = Draws(rngs, "cpu"), Part(tell, 0.3, 0.7)
+    model, _, policy = offline.explain(data, signature, amounts.offline, draws, part, explored=tried)
+    with torch.no_grad():
+        present = blind.policy.log_prob(blind.scaler(other.obs), other.action)
+        memory = -float(recurrent.held_out_loss(other)) - _mean(present, other)
+        actions = _mean(policy.log_prob(_features(model, other, draws), other.action) - present, other)
+    explored = explained = float("nan")
+    if tried is not None and rest is not None:
+        world = _explore(tried, signature, amounts, draws, Part(tell, 0.7, 0.85))
+        explored = _apart(world, rest, draws)
+        explained = _mean(_conditional(world, data, other, amounts, draws) - present, other)
+    with torch.no_grad():
+        latents = _inferred(model, data, draws)
+        known, mistaken, rivals = (
+            take(latents, draws.below(latents.shape[1], n)) for n in (amounts.dreams, amounts.dreams, amounts.rivals)
+        )
+        knower, starts = Expert(model, policy, known), torch.tensor(shown.obs[None, :, :, 0]).flatten(1, 2)
+        dreamt = World(knower, data, starts, *trials.mask.shape[1:])
+        actors = (knower, Expert(model, policy, mistaken), Clone(recurrent), Filter(model, policy, rivals))
+        (one, home), (zero, away), *others = (dreamt.visit(actor, rngs) for actor in actors)
+        again = dreamt.visit(knower, rngs)[1]
+        naive, latent = (float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others)
+        stakes = float((_astray(away, home, again) / _astray(again, home, again)).max())
+    tell(1)
+    return Findings(memory, actions, explored, explained, stakes, naive, latent)
+
+
+def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
+    """Trials to learn from, and that share of them that is held out."""
+    order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
+    shown, held = (
+        Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions)
+        for index in (order[count:], order[:count])
+    )
+    return shown, held
+
+
+def _mean(x: Tensor, batch: Batch) -> float:
+    """Over all steps [1, B, T] that took place."""
+    return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
+
+
+def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
+    """A latent [1, B, D] for each trial."""
+    return model.sample(model.belief(model.last(batch)), draws)
+
+
+def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
+    """What a latent-conditional policy reads at each step: the observation and the trial's latent, [1, B, T, O + D]."""
+    theta_hat = _inferred(model, batch, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
+    return torch.cat([model.inputs.obs(batch.obs), theta_hat], -1)
+
+
+def _explore(tried: Batch, signature: Signature, amounts: Amounts, draws: Draws, monitor: Monitor) -> VariationalModel:
+    """A belief that reads dynamics alone: Eq. (6) on exploration."""
+    how = amounts.exploring
+    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(tried), draws)
+    optimizer = Adam([model], how.inference_rate, how.inference_updates)
+    for update in range(how.inference_updates):
+        batch = tried.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
+        loss = model.learn(optimizer, batch, how.inference_steps, how.beta, draws)
+        monitor.update(update + 1, how.inference_updates, {"inference": loss})
+    return model
+
+
+@torch.no_grad()
+def _apart(model: VariationalModel, rest: Batch, draws: Draws) -> float:
+    """How much more likely a trial's own latent, inferred from its even steps, makes its odd ones than another's."""
+    even = torch.arange(rest.mask.shape[2]) % 2 == 0
+    own, odd = _inferred(model, replace(rest, mask=rest.mask * even), draws), replace(rest, mask=rest.mask * ~even)
+    true, other = (
+        model.dynamics.log_prob(
+            rest.obs, rest.action, rest.next_obs, latent[:, :, None].expand(-1, -1, rest.mask.shape[2], -1)
+        )[..., 0]
+        for latent in (own, own.roll(1, 1))
+    )
+    return _mean(true - other, odd)
+
+
+def _conditional(model: VariationalModel, data: Batch, other: Batch, amounts: Amounts, draws: Draws) -> Tensor:
+    """log pi(a | s, theta_hat) [1, B, T] of held-out trials, of a policy cloned given what a belief says of trials."""
+    how = amounts.cloning
+    with torch.no_grad():
+        features, held = _features(model, data, draws), _features(model, other, draws)
+    policy = ActionHead(features.shape[-1], how.width, model.inputs.signature, draws)
+    optimizer = Adam([policy], how.learning_rate, how.updates)
+    for _ in range(how.updates):
+        index = data.draw_steps(how.batch, draws)
+        log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
+        optimizer.step(imitation_loss(log_policy, torch.ones_like(log_policy)))
+    with torch.no_grad():
+        return policy.log_prob(held, other.action)
+
+
+def _astray(path: Tensor, home: Tensor, again: Tensor) -> Tensor:
+    """How far a path [1, N, T, O] is from that of one who knows the latent, home, in units of chance: [O].
+
+    Squares, at each time, of which more than 9 is 9; chance is how far that one is from itself when it goes again, or a
+    hundredth of all that it comes to.
+    """
+    chance = (again - home).square().mean(1, keepdim=True)
+    floor = (0.01 * (home.amax((1, 2), keepdim=True) - home.amin((1, 2), keepdim=True))).square().clamp(min=1e-12)
+    return ((path - home).square() / (chance + floor)).clamp(max=9).mean((0, 1, 2))

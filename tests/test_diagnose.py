@@ -1,0 +1,210 @@
+"""Diagnosis: what cannot be judged is told in a line, figures lead to the verdict they deserve, and all of it runs."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import diagnose as command
+from deconfounded.benchmarks.console import run_command
+from deconfounded.deconf import diagnose, findings
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.diagnose import DiagnoseConfig
+from deconfounded.deconf.findings import Amounts, Findings
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.envs.task import InputError
+from deconfounded.experts import policy
+from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
+
+ROOT = Path(__file__).parents[1]
+NAN = float("nan")
+TINY = Amounts(
+    rivals=2,
+    dreams=4,
+    cloning=CloningConfig(updates=5, batch=64),
+    naive=RecurrentConfig(updates=6, batch=4),
+    offline=OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4, offline_steps=16),
+    exploring=DeconfoundedConfig(inference_updates=5, inference_batch=4, inference_steps=32),
+)
+
+
+def trials(n: int = 24, episodes: int = 2, steps: int = 3, seed: int = 0) -> Trials:
+    rng = np.random.default_rng(seed)
+    shape = (n, episodes, steps)
+    return Trials(rng.normal(size=(n, episodes, steps + 1, 2)), rng.uniform(-1, 1, (*shape, 1)), np.ones(shape, bool))
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("given", "told"),
+        [
+            (lambda: trials(1, 1), "1 trial given; at least 24 are needed"),
+            (lambda: trials(5), "5 trials given; at least 24 are needed"),
+            (lambda: trials(steps=1), "every episode is of one step"),
+        ],
+    )
+    def test_too_little(self, given, told: str) -> None:
+        with pytest.raises(InputError, match=told):
+            diagnose.check(given(), None, DiagnoseConfig())
+
+    def test_constant_actions(self) -> None:
+        some = trials()
+        with pytest.raises(InputError, match="every action is the same"):
+            diagnose.check(Trials(some.obs, 0 * some.action + 0.5, some.mask), None, DiagnoseConfig())
+
+    def test_nan(self) -> None:
+        some = trials()
+        with pytest.raises(InputError, match="NaN"):
+            Trials(some.obs * NAN, some.action, some.mask)
+
+    def test_another_world(self) -> None:
+        some, other = trials(), trials(seed=1)
+        wider = Trials(np.concatenate([other.obs] * 2, -1), other.action, other.mask)
+        with pytest.raises(InputError, match="exploration has other observations"):
+            diagnose.check(some, wider, DiagnoseConfig())
+
+    def test_exploration_is_checked_too(self) -> None:
+        with pytest.raises(InputError, match="5 trials of exploration given"):
+            diagnose.check(trials(), trials(5), DiagnoseConfig())
+
+    def test_command(self, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
+        """One line and exit code 2: no file, no trials in it, too few."""
+        trials(5).save(tmp_path / "few.npz")
+        (tmp_path / "junk.npz").write_bytes(b"junk")
+        for name, told in (("none.npz", "there is no"), ("junk.npz", "no trials could"), ("few.npz", "5 trials given")):
+            monkeypatch.setattr("sys.argv", ["diagnose", "--trials", str(tmp_path / name), "--out", str(tmp_path)])
+            with pytest.raises(SystemExit) as stopped:
+                run_command(command.main)
+            assert stopped.value.code == 2
+            said = capsys.readouterr().err
+            assert told in said
+            assert said.count("\n") == 1
+
+
+CLEAR = Findings(memory=1.0, actions=1.0, explored=0.2, explained=0.5, stakes=3.0, naive=0.2, latent=0.9)
+
+
+class TestJudge:
+    """Each way through `judge`, by figures that lead there."""
+
+    @pytest.mark.parametrize(
+        ("changes", "verdict", "tier", "then"),
+        [
+            ({}, "confounded", 2, diagnose.EXPLORE),
+            ({"explored": NAN, "explained": NAN}, "confounded", None, diagnose.TRY),
+            ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
+            ({"stakes": 1.1}, "not confounded", 1, diagnose.CLONE),
+            ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
+            ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
+            ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
+            ({"memory": 0.001, "explored": NAN}, "cannot tell", None, diagnose.VARY),
+            ({"latent": 0.1}, "cannot tell", None, diagnose.MORE),
+        ],
+    )
+    def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: diagnose.Next) -> None:
+        found = diagnose.judge([CLEAR._replace(**changes)] * 3)
+        assert (found.verdict, found.tier, found.next) == (verdict, tier, then)
+
+    def test_refits_that_disagree(self) -> None:
+        """No confident verdict where refits lie on both sides of what decides."""
+        assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1)]).verdict == "cannot tell"
+
+    def test_figures(self) -> None:
+        found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
+        assert found == pytest.approx((0.3, 0.2, 0.4))
+        assert "explored" not in diagnose.judge([CLEAR._replace(explored=NAN, explained=NAN)]).found
+
+
+def _bandit(n: int = 24) -> tuple[Trials, Trials]:
+    task = envs.get("bandit")
+    env = envs.BatchEnv(task, n)
+    shown, _ = run_trials(env, ExpertAgent(env, policy.load(task)), task.episodes, 0)
+    return shown, run_trials(env, RandomAgent(task.action_space), task.episodes, 1)[0]
+
+
+@pytest.mark.parametrize("make", [_bandit, lambda: (trials(), trials(seed=1))], ids=["discrete", "continuous"])
+def test_measures(make) -> None:
+    """Figures come out finite, for both kinds of actions, and the same again from the same seed."""
+    shown, explored = make()
+    once, again = (findings.measure(shown, explored, TINY, np.random.default_rng(0)) for _ in range(2))
+    assert once == again
+    assert np.isfinite(once).all()
+    alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
+    assert np.isnan([alone.explored, alone.explained]).all()
+    assert np.isfinite([alone.memory, alone.actions, alone.stakes, alone.naive, alone.latent]).all()
+
+
+def test_memory_is_found() -> None:
+    """Actions that a hidden sign decides: memory tells them, by log 2 a step but for the first."""
+    rng = np.random.default_rng(0)
+    shape = (64, 1, 20)
+    sign = rng.integers(2, size=(64, 1, 1, 1)) * np.ones((*shape, 1))
+    obs, amounts = (
+        rng.normal(size=(64, 1, 21, 1)),
+        Amounts(
+            **{**vars(TINY), "cloning": CloningConfig(updates=200), "naive": RecurrentConfig(updates=150, chunk=20)}
+        ),
+    )
+    hidden = Trials(obs, sign, np.ones(shape, bool), 2)
+    found = findings.measure(hidden, None, amounts, np.random.default_rng(0))
+    assert found.memory == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
+    chance = Trials(obs, rng.integers(2, size=(*shape, 1)), np.ones(shape, bool), 2)
+    assert findings.measure(chance, None, amounts, np.random.default_rng(0)).memory < 0.02
+
+
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """A page that needs no other file, a json that says the same; a second time nothing is measured again."""
+    monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
+    for name, some in zip(("expert", "explored"), _bandit(), strict=True):
+        some.save(tmp_path / f"{name}.npz")
+    asked = ["--trials", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
+    monkeypatch.setattr("sys.argv", ["diagnose", *asked, "--out", str(tmp_path / "out")])
+    command.main()
+    first = capsys.readouterr().out
+    told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert told["verdict"].upper() in first
+    assert set(told["found"]) == set(Findings._fields)
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert told["reasons"][0] in html.unescape(page)
+    assert not re.search(r"(src|href)=\"(?!data:)", page)
+    assert first.count("measured in") == 2
+    command.main()
+    assert "measured in" not in capsys.readouterr().out
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["found"] == told["found"]
+
+
+FEWER = {
+    "range(192)": "range(24)",
+    "range(96)": "range(24)",
+    "range(32)": "range(4)",
+    "trials=40": "trials=2",
+    "RecurrentConfig()": "RecurrentConfig(updates=6)",
+    "rounds=4, inference_rate=3e-3": "rounds=2, inference_updates=5, imitation_updates=5, final_updates=5",
+}
+
+
+def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    """Every line of docs/diagnose.md, on less data and with less training."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
+    text = (ROOT / "docs" / "diagnose.md").read_text()
+    for much, few in FEWER.items():
+        assert much in text
+        text = text.replace(much, few)
+    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.S)), {})
+    assert "naive clone" in capsys.readouterr().out
+    assert (tmp_path / "agent" / "agent.json").is_file()
+
+
+def _tiny_init(self: DiagnoseConfig) -> None:
+    for key, value in {"refits": 2, "least": 24, "amounts": TINY}.items():
+        object.__setattr__(self, key, value)
