@@ -26,7 +26,8 @@ from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import cards, pages, records, score
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
-from tests.fixtures import Feedback, NoStakes
+from deconfounded.experts.policy import OwnExpert
+from tests.fixtures import NoStakes, feedback
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -338,7 +339,8 @@ class TestScore:
 
 def test_certificate_fails_what_deserves_it() -> None:
     """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
-    result = certify.certify(NoStakes(), Feedback(), trials=12, grid=7)
+    task = NoStakes()
+    result = certify.certify(task, OwnExpert(task, feedback, "feedback"), trials=12, grid=7)
     assert result["return_expert"] > 4 * result["return_random"]
     assert result["verdict"] == "failed"
     assert not result["checks"]["told_wrong_theta"]["passed"]
