@@ -25,6 +25,7 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
+    from deconfounded.deconf.diagnose import Diagnosis
     from deconfounded.deconf.findings import Amounts, Findings
     from deconfounded.experts.demos import Trials
 
@@ -45,8 +46,8 @@ class Refit:
     trials: Path
     explore: Path | None
     amounts: Amounts
-    seed: int
     index: int
+    seed: int
     refits: int
     made_of: str
     folder: Path
@@ -95,6 +96,38 @@ class Refit:
         return f"measured in {time.time() - start:.0f} s"
 
 
+def run(source: Path, exploration: Path | None, seed: int, folder: Path, command: str) -> tuple[Diagnosis, str]:
+    """Diagnose, and write the page and the json; returns what to print too. What the folder has of the same, stays.
+
+    Raises InputError for data that cannot be judged.
+    """
+    trials = trials_of(source)
+    explore = None if exploration is None else trials_of(exploration)
+    from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.pool import run_jobs
+    from deconfounded.benchmarks.output import diagnosis as page
+    from deconfounded.deconf.diagnose import DiagnoseConfig, check, judge
+
+    config, start = DiagnoseConfig(), time.time()
+    check(trials, explore, config)
+    about: dict[str, Any] = {
+        "trials": {"from": str(source), "sha256": trials.sha256, "shape": trials.mask.shape},
+        "explore": explore and {"from": str(exploration), "sha256": explore.sha256, "shape": explore.mask.shape},
+        "config": asdict(config),
+        "seed": seed,
+        "versions": identity.versions(),
+        "code": identity.module("deconf/findings"),
+    }
+    known = (seed, config.refits, json.dumps(about), folder)
+    refits = [Refit(source, exploration, config.amounts, i, *known) for i in range(config.refits)]
+    with commands.locked(folder):
+        run_jobs([one for one in refits if one.found() is None], "diagnosis", Local().run)
+    found = judge([each for one in refits if (each := one.found()) is not None])
+    about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
+    return found, page.write(found, about, folder)
+
+
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -105,38 +138,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.seed < 0:
         raise envs.InputError(f"--seed was {args.seed}; it must be from 0 up")
-    trials = trials_of(args.trials)
-    explore = None if args.explore is None else trials_of(args.explore)
-    from deconfounded.benchmarks.engine import identity
-    from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import run_jobs
-    from deconfounded.benchmarks.output import diagnosis as page
-    from deconfounded.deconf.diagnose import DiagnoseConfig, check, judge
-
-    config, start = DiagnoseConfig(), time.time()
-    check(trials, explore, config)
-    about: dict[str, Any] = {
-        "trials": {"from": str(args.trials), "sha256": trials.sha256, "shape": trials.mask.shape},
-        "explore": explore and {"from": str(args.explore), "sha256": explore.sha256, "shape": explore.mask.shape},
-        "config": asdict(config),
-        "seed": args.seed,
-        "versions": identity.versions(),
-        "code": identity.module("deconf/findings"),
-    }
-    own = (json.dumps(about), args.out)
-    refits = [
-        Refit(args.trials, args.explore, config.amounts, args.seed, i, config.refits, *own)
-        for i in range(config.refits)
-    ]
-    with commands.locked(args.out):
-        run_jobs([one for one in refits if one.found() is None], "diagnosis", Local().run)
-    found = judge([each for one in refits if (each := one.found()) is not None])
-    about |= {
-        "command": " ".join(["deconf diagnose", *sys.argv[1:]]),
-        "machine": identity.machine("cpu"),
-        "wall_s": round(time.time() - start),
-    }
-    print(page.write(found, about, args.out))
+    asked = " ".join(["deconf diagnose", *sys.argv[1:]])
+    print(run(args.trials, args.explore, args.seed, args.out, asked)[1])
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ COMMANDS = {
     "check": ("benchmarks.check", "does a task hold together? the contract tests"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone"),
+    "validate": ("benchmarks.validate", "is a diagnosis right, where the truth is known?"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
