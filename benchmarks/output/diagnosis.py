@@ -119,7 +119,7 @@ def _bars(axes: Axes, rows: Rows, label: str, threshold: float) -> None:
     axes.axvline(0, color="0.4", lw=0.8)
     axes.axvline(threshold, color="0.4", lw=1, ls=":")
     axes.set_yticks(range(len(rows)), list(rows))
-    axes.invert_yaxis()
+    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
     axes.set(xlabel=label)
     axes.spines[["top", "right"]].set_visible(False)
 
