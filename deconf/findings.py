@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf import cloning, naive_rnn, offline
-from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.agents import Monitor, ramp
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, Signature, take, take_steps
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
@@ -33,7 +33,7 @@ from deconfounded.experts.demos import Agent, Trials
 
 @dataclass(frozen=True)
 class Amounts:
-    """Of training, for one split; offline: of Eq. (7) alone; exploring: of Eq. (6).
+    """Of training, for one split; offline: of Eq. (7); exploring: of Eq. (6).
 
     rivals: latents that each trial's own is weighed against. dreams: trials of each actor in the learned dynamics.
     """
@@ -44,23 +44,24 @@ class Amounts:
     cloning: CloningConfig = field(default_factory=lambda: CloningConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
-    exploring: DeconfoundedConfig = field(default_factory=lambda: DeconfoundedConfig(inference_updates=1000))
+    exploring: DeconfoundedConfig = field(
+        default_factory=lambda: DeconfoundedConfig(inference_updates=2000, inference_rate=3e-3)
+    )
 
 
 class Findings(NamedTuple):
     """What was measured. Nats are a step, of held-out trials.
 
-    memory: what memory adds to predicting the expert's action over the present observation. actions: what a latent adds
-    that explains the trial, its actions too. explained: what a latent adds that is inferred from the world's answers
-    alone. explored: how much more likely such a latent makes the world's answers in exploration than another trial's
-    does. stakes: how many times as far off the way an expert goes who holds another latent for true, as one who knows
-    it goes by chance, in what it shows most. naive, latent: predicted scores in the last episode, of a naive clone and
-    of one that infers the latent from the world: 0 is an expert who holds another latent for true, 1 the one who knows
-    it. NaN: without exploration.
+    memory: what memory adds to predicting the expert's action over the present observation. explained: what a latent
+    adds that explains the world's answers, and nothing else. explored: how much more likely a trial's own latent makes
+    the world's answers in exploration than another trial's does. stakes: how many times as far off the way an expert
+    goes who holds another latent for true, as one who knows it goes by chance, in what it shows most. naive, latent:
+    predicted scores in the last episode, of a naive clone and of one that infers the latent from the world: 0 is an
+    expert who holds another latent for true, 1 the one who knows it. Without exploration, explained and explored are
+    NaN, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
-    actions: float
     explored: float
     explained: float
     stakes: float
@@ -94,19 +95,20 @@ def measure(
     blind = cloning.fit(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
     recurrent = naive_rnn.fit(shown, amounts.naive, rng, Part(tell, 0.1, 0.3))
     data, other = Batch.of(shown, 1), Batch.of(held, 1)
-    tried, rest = (None, None) if explore is None else (Batch.of(x, 1) for x in split(explore, amounts.held_out, rng))
-    draws, part = Draws(rngs, "cpu"), Part(tell, 0.3, 0.7)
-    model, _, policy = offline.explain(data, signature, amounts.offline, draws, part, explored=tried)
+    draws, part, how = Draws(rngs, "cpu"), Part(tell, 0.3, 0.8), amounts.offline
+    explored = explained = float("nan")
+    if explore is None:
+        model, _, policy = offline.explain(data, signature, how, draws, part)
+    else:
+        tried, rest = (Batch.of(some, 1) for some in split(explore, amounts.held_out, rng))
+        model = _dynamics(tried.joined(data), signature, amounts.exploring, draws, part)
+        policy = _conditional(model, data, amounts.cloning, draws)
+        explored = _apart(model, rest, draws)
     with torch.no_grad():
         present = blind.policy.log_prob(blind.scaler(other.obs), other.action)
         memory = -float(recurrent.held_out_loss(other)) - _mean(present, other)
-        actions = _mean(policy.log_prob(_features(model, other, draws), other.action) - present, other)
-    explored = explained = float("nan")
-    if tried is not None and rest is not None:
-        world = _explore(tried, signature, amounts, draws, Part(tell, 0.7, 0.85))
-        explored = _apart(world, rest, draws)
-        explained = _mean(_conditional(world, data, other, amounts, draws) - present, other)
-    with torch.no_grad():
+        if explore is not None:
+            explained = _mean(policy.log_prob(_features(model, other, draws), other.action) - present, other)
         latents = _inferred(model, data, draws)
         known, mistaken, rivals = (
             take(latents, draws.below(latents.shape[1], n)) for n in (amounts.dreams, amounts.dreams, amounts.rivals)
@@ -119,7 +121,7 @@ def measure(
         naive, latent = (float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others)
         stakes = float((_astray(away, home, again) / _astray(again, home, again)).max())
     tell(1)
-    return Findings(memory, actions, explored, explained, stakes, naive, latent)
+    return Findings(memory, explored, explained, stakes, naive, latent)
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
@@ -148,14 +150,16 @@ def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
     return torch.cat([model.inputs.obs(batch.obs), theta_hat], -1)
 
 
-def _explore(tried: Batch, signature: Signature, amounts: Amounts, draws: Draws, monitor: Monitor) -> VariationalModel:
-    """A belief that reads dynamics alone: Eq. (6) on exploration."""
-    how = amounts.exploring
-    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(tried), draws)
+def _dynamics(
+    seen: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
+) -> VariationalModel:
+    """A latent that explains the world's answers and nothing else: Eq. (6), on exploration and expert trials alike."""
+    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(seen), draws)
     optimizer = Adam([model], how.inference_rate, how.inference_updates)
     for update in range(how.inference_updates):
-        batch = tried.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
-        loss = model.learn(optimizer, batch, how.inference_steps, how.beta, draws)
+        batch = seen.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
+        beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
+        loss = model.learn(optimizer, batch, how.inference_steps, beta, draws)
         monitor.update(update + 1, how.inference_updates, {"inference": loss})
     return model
 
@@ -174,19 +178,17 @@ def _apart(model: VariationalModel, rest: Batch, draws: Draws) -> float:
     return _mean(true - other, odd)
 
 
-def _conditional(model: VariationalModel, data: Batch, other: Batch, amounts: Amounts, draws: Draws) -> Tensor:
-    """log pi(a | s, theta_hat) [1, B, T] of held-out trials, of a policy cloned given what a belief says of trials."""
-    how = amounts.cloning
+def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
+    """A policy, cloned given the latents that a model infers from the trials."""
     with torch.no_grad():
-        features, held = _features(model, data, draws), _features(model, other, draws)
+        features = _features(model, data, draws)
     policy = ActionHead(features.shape[-1], how.width, model.inputs.signature, draws)
     optimizer = Adam([policy], how.learning_rate, how.updates)
     for _ in range(how.updates):
         index = data.draw_steps(how.batch, draws)
         log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
         optimizer.step(imitation_loss(log_policy, torch.ones_like(log_policy)))
-    with torch.no_grad():
-        return policy.log_prob(held, other.action)
+    return policy
 
 
 def _astray(path: Tensor, home: Tensor, again: Tensor) -> Tensor:

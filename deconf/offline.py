@@ -48,18 +48,11 @@ class OfflineConfig:
 
 
 def explain(
-    data: Batch,
-    signature: Signature,
-    config: OfflineConfig,
-    draws: Draws,
-    monitor: Monitor,
-    times: int = 1,
-    explored: Batch | None = None,
+    data: Batch, signature: Signature, config: OfflineConfig, draws: Draws, monitor: Monitor, times: int = 1
 ) -> tuple[VariationalModel, VariationalModel, ActionHead]:
     """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an online model to train.
 
     The online one's dynamics are the offline one's, and its prior that of the latents. Batches are `times` as large.
-    Of explored trials, if there are some, the latent explains the dynamics alone: their actions are nobody's choice.
     """
     obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
@@ -68,17 +61,15 @@ def explain(
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, signature, draws)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
-    every = data if explored is None else data.joined(explored)
     for update in range(config.offline_updates):
-        index = draws.below(len(every), config.offline_batch * times)
-        batch, chosen = every.trials(index), (index < len(data))[..., None]
+        batch = data.draw_trials(config.offline_batch * times, draws)
         belief = offline.belief(offline.last(batch))
         mean, std = belief.chunk(2, -1)
         index, steps = draws.below(batch.mask.shape[2], config.offline_steps), batch.mask.shape[2]
         some = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
         theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, config.offline_steps, -1)
         log_next = offline.dynamics.log_prob(some.obs, some.action, some.next_obs, theta_hat)[..., 0]
-        log_policy = chosen * policy.log_prob(torch.cat([online.inputs.obs(some.obs), theta_hat], -1), some.action)
+        log_policy = policy.log_prob(torch.cat([online.inputs.obs(some.obs), theta_hat], -1), some.action)
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
         weight = some.mask * (steps / config.offline_steps)  # so that their sum is that of all, on average
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)

@@ -89,7 +89,7 @@ class TestBadInput:
             assert said.count("\n") == 1
 
 
-CLEAR = Findings(memory=1.0, actions=1.0, explored=0.2, explained=0.5, stakes=3.0, naive=0.2, latent=0.9)
+CLEAR = Findings(memory=1.0, explored=0.2, explained=0.5, stakes=3.0, naive=0.2, latent=0.9)
 
 
 class TestJudge:
@@ -140,7 +140,7 @@ def test_measures(make) -> None:
     assert np.isfinite(once).all()
     alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
     assert np.isnan([alone.explored, alone.explained]).all()
-    assert np.isfinite([alone.memory, alone.actions, alone.stakes, alone.naive, alone.latent]).all()
+    assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
 
 def test_memory_is_found() -> None:

@@ -65,10 +65,7 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
     """Title, two sentences, and what to draw."""
     figure = found.found
     memory, naive, latent, stakes = (figure[key] for key in ("memory", "naive", "latent", "stakes"))
-    predictors: Rows = {
-        "memory": (memory, colour("naive_rnn")),
-        "one latent a trial": (figure["actions"], colour("conditional")),
-    }
+    predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
     whence = "Exploration would show how much of that the world's answers tell, and how much past actions alone."
     if "explained" in figure:
         world = figure["explained"]
