@@ -19,7 +19,7 @@ from deconfounded.experts.demos import Trials
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.03, 0.01  # nats a step: of memory, of the world
 FINE, GAP = 0.8, 0.15  # scores
-STAKES = 1.3  # times chance
+STAKES = 2.0  # times chance
 
 
 class Next(NamedTuple):

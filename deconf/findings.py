@@ -101,7 +101,7 @@ def measure(
         model, _, policy = offline.explain(data, signature, how, draws, part)
     else:
         tried, rest = (Batch.of(some, 1) for some in split(explore, amounts.held_out, rng))
-        model = _dynamics(tried.joined(data), signature, amounts.exploring, draws, part)
+        model = _dynamics(tried, signature, amounts.exploring, draws, part)
         policy = _conditional(model, data, amounts.cloning, draws)
         explored = _apart(model, rest, draws)
     with torch.no_grad():
@@ -151,13 +151,17 @@ def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
 
 
 def _dynamics(
-    seen: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
+    explored: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
 ) -> VariationalModel:
-    """A latent that explains the world's answers and nothing else: Eq. (6), on exploration and expert trials alike."""
-    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(seen), draws)
+    """A latent that explains the world's answers and nothing else: Eq. (6).
+
+    Not on expert trials: these hold nearly one action for each observation and latent, so that what an action does and
+    what the latent does cannot be told apart. (On `swapped_lander`, of both, it learned that the engine does nothing.)
+    """
+    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(explored), draws)
     optimizer = Adam([model], how.inference_rate, how.inference_updates)
     for update in range(how.inference_updates):
-        batch = seen.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
+        batch = explored.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
         beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
         loss = model.learn(optimizer, batch, how.inference_steps, beta, draws)
         monitor.update(update + 1, how.inference_updates, {"inference": loss})
