@@ -46,6 +46,7 @@ TRY = Next(
     "offline.fit(trials, offline.OfflineConfig(), np.random.default_rng(0))",
 )
 VARY = Next("Record trials under other circumstances too, and diagnose again.")
+WIDER = Next("Explore where the expert goes, by any behaviour that is blind to what it knows, and diagnose again.")
 MORE = Next("Record more trials of the same kind, and diagnose again.")
 
 
@@ -160,8 +161,6 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         return told("cannot tell", None, why, VARY)
     said.append(f"The expert acts on something that trials differ in. Who mistakes it goes {stakes} times as far off")
     said[-1] += " the way as chance does."
-    if stakes.high < STAKES:
-        return told("not confounded", 1, "That is little: what the expert knows hardly matters.", CLONE)
     if explored is not None:
         said.append(f"In exploration the world tells it by {explored} nats a step.")
         if explored.high < SILENT:
@@ -170,6 +169,9 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
                 " the expert would do where the clone goes; if the world tells it nowhere, only a sensor helps."
             )
             return told("confounded", 3, why, ASK)
+    if stakes.high < STAKES:
+        why = "That is little: either it hardly matters, or the dynamics are not known well enough where it does."
+        return told("cannot tell", None, why, WIDER)
     said.append(
         f"In the learned dynamics a naive clone scores {naive}, one that infers the latent from the world {latent}: 1"
         " knows the latent, 0 acts on another one."

@@ -119,7 +119,7 @@ def measure(
         (one, home), (zero, away), *others = (dreamt.visit(actor, rngs) for actor in actors)
         again = dreamt.visit(knower, rngs)[1]
         naive, latent = (float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others)
-        stakes = float((_astray(away, home, again) / _astray(again, home, again)).max())
+        stakes = _astray(away, home, again) / _astray(again, home, again)
     tell(1)
     return Findings(memory, explored, explained, stakes, naive, latent)
 
@@ -195,12 +195,17 @@ def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws
     return policy
 
 
-def _astray(path: Tensor, home: Tensor, again: Tensor) -> Tensor:
-    """How far a path [1, N, T, O] is from that of one who knows the latent, home, in units of chance: [O].
+def _astray(path: Tensor, home: Tensor, again: Tensor) -> float:
+    """How far a path [1, N, T, O] is from that of one who knows the latent, home, in units of chance.
 
-    Squares, at each time, of which more than 9 is 9; chance is how far that one is from itself when it goes again, or a
-    hundredth of all that it comes to.
+    In squares of which more than 9 is 9, of the coordinate that shows it most: at each time, or over the episode, of
+    its mean or its mean square. Chance is how far that one is from itself when it goes again, or a hundredth of all
+    that it comes to.
     """
-    chance = (again - home).square().mean(1, keepdim=True)
-    floor = (0.01 * (home.amax((1, 2), keepdim=True) - home.amin((1, 2), keepdim=True))).square().clamp(min=1e-12)
-    return ((path - home).square() / (chance + floor)).clamp(max=9).mean((0, 1, 2))
+    found = []
+    for of in (lambda x: x, lambda x: x.mean(2, keepdim=True), lambda x: x.square().mean(2, keepdim=True)):
+        here, there, back = of(path), of(home), of(again)
+        floor = (0.01 * (there.amax((1, 2), keepdim=True) - there.amin((1, 2), keepdim=True))).square().clamp(min=1e-12)
+        unit = (back - there).square().mean(1, keepdim=True) + floor
+        found.append(((here - there).square() / unit).clamp(max=9).mean((0, 1, 2)))
+    return float(torch.cat(found).max())

@@ -101,7 +101,7 @@ class TestJudge:
             ({}, "confounded", 2, diagnose.EXPLORE),
             ({"explored": NAN, "explained": NAN}, "confounded", None, diagnose.TRY),
             ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
-            ({"stakes": 1.1}, "not confounded", 1, diagnose.CLONE),
+            ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
             ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
