@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -136,11 +135,10 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
 
 def judge(refits: Sequence[Findings]) -> Diagnosis:
     """The verdict, and why."""
-    found = {
-        key: Figure(sum(each) / len(each), min(each), max(each))
-        for key, each in zip(Findings._fields, map(list, zip(*refits, strict=True)), strict=True)
-        if not math.isnan(each[0])
-    }
+    found = {}
+    for key, each in zip(Findings._fields, zip(*refits, strict=True), strict=True):
+        if values := [value for value in each if value is not None]:
+            found[key] = Figure(sum(values) / len(values), min(values), max(values))
     memory, stakes, naive, latent = (found[key] for key in ("memory", "stakes", "naive", "latent"))
     explored = found.get("explored")
     said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]

@@ -58,12 +58,12 @@ class Findings(NamedTuple):
     goes who holds another latent for true, as one who knows it goes by chance, in what it shows most. naive, latent:
     predicted scores in the last episode, of a naive clone and of one that infers the latent from the world: 0 is an
     expert who holds another latent for true, 1 the one who knows it. Without exploration, explained and explored are
-    NaN, and the latent is one that explains actions too, Eq. (7).
+    None, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
-    explored: float
-    explained: float
+    explored: float | None
+    explained: float | None
     stakes: float
     naive: float
     latent: float
@@ -96,7 +96,7 @@ def measure(
     recurrent = naive_rnn.fit(shown, amounts.naive, rng, Part(tell, 0.1, 0.3))
     data, other = Batch.of(shown, 1), Batch.of(held, 1)
     draws, part, how = Draws(rngs, "cpu"), Part(tell, 0.3, 0.8), amounts.offline
-    explored = explained = float("nan")
+    explored = explained = None
     if explore is None:
         model, _, policy = offline.explain(data, signature, how, draws, part)
     else:

@@ -25,7 +25,6 @@ from deconfounded.experts import policy
 from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
 
 ROOT = Path(__file__).parents[1]
-NAN = float("nan")
 TINY = Amounts(
     rivals=2,
     dreams=4,
@@ -63,7 +62,7 @@ class TestBadInput:
     def test_nan(self) -> None:
         some = trials()
         with pytest.raises(InputError, match="NaN"):
-            Trials(some.obs * NAN, some.action, some.mask)
+            Trials(some.obs * np.nan, some.action, some.mask)
 
     def test_another_world(self) -> None:
         some, other = trials(), trials(seed=1)
@@ -99,13 +98,13 @@ class TestJudge:
         ("changes", "verdict", "tier", "then"),
         [
             ({}, "confounded", 2, diagnose.EXPLORE),
-            ({"explored": NAN, "explained": NAN}, "confounded", None, diagnose.TRY),
+            ({"explored": None, "explained": None}, "confounded", None, diagnose.TRY),
             ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
             ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
             ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
-            ({"memory": 0.001, "explored": NAN}, "cannot tell", None, diagnose.VARY),
+            ({"memory": 0.001, "explored": None}, "cannot tell", None, diagnose.VARY),
             ({"latent": 0.1}, "cannot tell", None, diagnose.MORE),
         ],
     )
@@ -121,7 +120,7 @@ class TestJudge:
     def test_figures(self) -> None:
         found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
         assert found == pytest.approx((0.3, 0.2, 0.4))
-        assert "explored" not in diagnose.judge([CLEAR._replace(explored=NAN, explained=NAN)]).found
+        assert "explored" not in diagnose.judge([CLEAR._replace(explored=None, explained=None)]).found
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
@@ -139,7 +138,7 @@ def test_measures(make) -> None:
     assert once == again
     assert np.isfinite(once).all()
     alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
-    assert np.isnan([alone.explored, alone.explained]).all()
+    assert (alone.explored, alone.explained) == (None, None)
     assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
 
@@ -180,6 +179,9 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     command.main()
     assert "measured in" not in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["found"] == told["found"]
+    monkeypatch.setattr("sys.argv", ["diagnose", *asked[:2], "--out", str(tmp_path / "alone")])
+    command.main()
+    assert "explored" not in json.loads((tmp_path / "alone" / "diagnosis.json").read_text())["found"]
 
 
 FEWER = {
