@@ -504,7 +504,8 @@ class TestMethods:
         trials, env = demonstrations("tilted_cartpole", 48)
         theta = env.theta[:, 0].copy()
         config = deconfounded.DeconfoundedConfig(
-            rounds=2, inference_updates=150, inference_batch=8, imitation_updates=100, final_updates=100, latent=2
+            **{"rounds": 2, "inference_updates": 150, "inference_batch": 8, "inference_rate": 3e-3, "latent": 2},
+            **{"imitation_updates": 100, "final_updates": 100},
         )
         agent = deconfounded.fit(trials, explorer("tilted_cartpole", 32), config, np.random.default_rng(0))
         mean = agent.model.point(deconfounded.final_belief(agent.model, Batch.of(trials, 1)))[0]
