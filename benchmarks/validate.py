@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.envs.files import save_figure, write_json
+from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.deconf.diagnose import Diagnosis
@@ -102,26 +102,6 @@ def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     return bool(json.loads(kept.read_text())["verdict"] == "passed")
 
 
-def picture(rows: list[dict[str, Any]], file: Path) -> None:
-    """Predicted gaps against measured ones."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6.4, 5), layout="constrained")
-    for row in rows:
-        hue = "tab:red" if row["certified"] else "tab:green"
-        axes.plot(row["predicted"], row["measured"], "o", color=hue, ms=5)
-        axes.annotate(
-            row["task"], (row["predicted"], row["measured"]), xytext=(4, 3), textcoords="offset points", size=7
-        )
-    axes.set(xlabel="gap that the diagnosis predicts", ylabel="gap measured: deconfounded less naive_rnn")
-    axes.spines[["top", "right"]].set_visible(False)
-    save_figure(figure, file, 110)
-    plt.close(figure)
-
-
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -135,10 +115,12 @@ def main() -> None:
     from scipy import stats
 
     from deconfounded.benchmarks.diagnose import run
+    from deconfounded.benchmarks.output.gap import Gap, picture
 
+    tasks = [envs.get(known[name]) for name in args.tasks or known]
     rows: list[dict[str, Any]] = []
-    for name in args.tasks or known:
-        task, source = envs.get(known[name]), CASES[known[name]]
+    for name, task in zip(args.tasks or known, tasks, strict=True):
+        source = CASES[known[name]]
         folder = args.out / task.name
         folder.mkdir(parents=True, exist_ok=True)
         files = data(task, source, folder)
@@ -166,7 +148,9 @@ def main() -> None:
     gaps = [[row[key] for row in rows] for key in ("predicted", "measured")]
     rank = float(stats.spearmanr(*gaps).statistic) if len(rows) > 2 else 0.0
     write_json(args.out / "validation.json", {"right": share, "rank_correlation": rank, "rows": rows})
-    picture(rows, args.out / "validation.png")
+    points = [Gap(task, row["predicted"], row["measured"]) for task, row in zip(tasks, rows, strict=True)]
+    hues = ["tab:red" if row["certified"] else "tab:green" for row in rows]
+    picture(points, args.out / "validation.png", "the diagnosis", hues)
     print(f"{share:.0%} right; rank correlation of predicted and measured gaps {rank:.2f} -> {args.out}")
 
 

@@ -157,8 +157,10 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             " circumstances of these trials a clone does as well as the expert; of others they tell nothing."
         )
         return told("cannot tell", None, why, VARY)
-    said.append(f"The expert acts on something that trials differ in. Who mistakes it goes {stakes} times as far off")
-    said[-1] += " the way as chance does."
+    said.append(
+        f"The expert acts on something that trials differ in. Who mistakes it goes {stakes} times as far off the way as"
+        " chance does."
+    )
     if explored is not None:
         said.append(f"In exploration the world tells it by {explored} nats a step.")
         if explored.high < SILENT:

@@ -146,8 +146,12 @@ def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
 
 def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
     """What a latent-conditional policy reads at each step: the observation and the trial's latent, [1, B, T, O + D]."""
-    theta_hat = _inferred(model, batch, draws)[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
-    return torch.cat([model.inputs.obs(batch.obs), theta_hat], -1)
+    return torch.cat([model.inputs.obs(batch.obs), _along(batch, _inferred(model, batch, draws))], -1)
+
+
+def _along(batch: Batch, latents: Tensor) -> Tensor:
+    """Each trial's latent [1, B, D] at each of its steps."""
+    return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
 
 
 def _dynamics(
@@ -174,9 +178,7 @@ def _apart(model: VariationalModel, rest: Batch, draws: Draws) -> float:
     even = torch.arange(rest.mask.shape[2]) % 2 == 0
     own, odd = _inferred(model, replace(rest, mask=rest.mask * even), draws), replace(rest, mask=rest.mask * ~even)
     true, other = (
-        model.dynamics.log_prob(
-            rest.obs, rest.action, rest.next_obs, latent[:, :, None].expand(-1, -1, rest.mask.shape[2], -1)
-        )[..., 0]
+        model.dynamics.log_prob(rest.obs, rest.action, rest.next_obs, _along(rest, latent))[..., 0]
         for latent in (own, own.roll(1, 1))
     )
     return _mean(true - other, odd)

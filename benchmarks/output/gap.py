@@ -13,9 +13,11 @@ from deconfounded.benchmarks.output.cards import markdown_table
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.envs.files import save_figure
 
+FORETOLD = "exact interventional less conditional"
+
 
 class Gap(NamedTuple):
-    """Of a task, in scores of the last episode: exact interventional less conditional, deconfounded less naive_rnn."""
+    """Of a task, in scores of the last episode: as something foretells it, and deconfounded less naive_rnn."""
 
     task: envs.Task
     predicted: float
@@ -23,7 +25,7 @@ class Gap(NamedTuple):
 
 
 def gap(task: envs.Task, methods: dict[str, Any]) -> Gap | None:
-    """From the `methods` of results.json; None if one of the four is not there."""
+    """FORETOLD and measured, from the `methods` of results.json; None if one of the four is not there."""
     if not {"interventional", "conditional", "deconfounded", "naive_rnn"} <= set(methods):
         return None
     last = {name: float(methods[name]["score_last"]) for name in methods}
@@ -51,8 +53,8 @@ With those of Tier 3, whose gap only queries of the expert can close, it is {_co
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
 
 
-def picture(gaps: Sequence[Gap], file: Path) -> None:
-    """A dot for each task."""
+def picture(gaps: Sequence[Gap], file: Path, foretold: str = FORETOLD, hues: Sequence[str] | None = None) -> None:
+    """A dot for each task; foretold: what predicts; hues: the dots' colours, if they differ."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -60,12 +62,12 @@ def picture(gaps: Sequence[Gap], file: Path) -> None:
 
     figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
     axes.axline((0, 0), slope=1, color="0.8", lw=1)
-    axes.plot([one.predicted for one in gaps], [one.measured for one in gaps], "o", color="tab:blue")
-    for one in gaps:
+    for one, hue in zip(gaps, hues or ["tab:blue"] * len(gaps), strict=True):
+        axes.plot(one.predicted, one.measured, "o", color=hue)
         axes.annotate(
             one.task.name, (one.predicted, one.measured), xytext=(4, 4), textcoords="offset points", fontsize=8
         )
-    axes.set(xlabel="predicted: exact interventional less conditional", ylabel="measured: deconfounded less naive_rnn")
+    axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
     axes.margins(0.14, 0.08)
     axes.set_title("what cloning loses, score in the last episode", fontsize=11)
     save_figure(figure, file, 100)
