@@ -13,6 +13,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,35 +34,41 @@ CASES: dict[str, str | None] = {
 }
 """Each task, and its expert if that is not its own."""
 
-TRIALS, EXPLORED, SEED = {"bandit": 2000}, 128, 11  # trials: 256 of all others
+TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
 
 
 def right(task: envs.Task, certified: bool, told: Diagnosis) -> bool:
-    """Whether a diagnosis with exploration says what is so."""
+    """Whether a diagnosis with exploration says what is so.
+
+    That of a task without latent may be that trials are alike: those of one theta look no other.
+    """
+    from deconfounded.deconf.diagnose import VARY
+
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
         return bool(told.verdict == "confounded" and told.tier == 3)
-    return bool(told.verdict == ("confounded" if certified else "not confounded"))
+    alike = task.name == "nothing_hidden" and told.next is VARY
+    return bool(alike or told.verdict == ("confounded" if certified else "not confounded"))
 
 
 def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:
-    """Files of expert trials and of exploration, made if they are not there."""
-    from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
-    from deconfounded.benchmarks.engine.identity import demonstrations
-    from deconfounded.experts import policy
-    from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
+    """Files of expert trials, and of exploration: half at random, half by a clone without memory that tries things."""
+    from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.context import Context
+    from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.deconf import wander
+    from deconfounded.experts.demos import Trials, joined
 
-    expert, files = policy.load(task, source), (folder / "expert.npz", folder / "explored.npz")
-    counts, purposes = (TRIALS.get(task.name, 256), EXPLORED), (DEMOS, EXPLORATION)
-    for file, count, purpose in zip(files, counts, purposes, strict=True):
-        made_of = demonstrations(task, source, count, stream(purpose, SEED))
-        try:
-            Trials.load(file, made_of)
-        except envs.InputError:
-            env = envs.BatchEnv(task, count)
-            agent = ExpertAgent(env, expert) if purpose == DEMOS else RandomAgent(task.action_space)
-            run_trials(env, agent, task.episodes, stream(purpose, SEED))[0].save(file, made_of)
-    return files
+    settings = replace(preset("default", task, "cpu"), expert_trials=TRIALS.get(task.name, 256), explore_trials=64)
+    context = Context(task, settings, (SEED,), folder=folder, expert=source)
+    shown, file = context.demonstrations, folder / "explored.npz"
+    made_of = f"{shown.sha256} {identity.module('deconf/wander')}"
+    try:
+        Trials.load(file, made_of)
+    except envs.InputError:
+        wanderer = wander.fit(shown, settings.cloning, context.rngs)
+        joined([context.explore(agent, context.rngs) for agent in (None, wanderer)]).save(file, made_of)
+    return folder / f"demonstrations-{SEED}.npz", file
 
 
 def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, float]:
@@ -129,7 +136,7 @@ def main() -> None:
             for kind, other in (("alone", None), ("explored", files[1]))
         )
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
-        gap = told.gap if told.verdict == "confounded" and told.tier != 3 else 0.0
+        gap = told.found["gap"].value if told.verdict == "confounded" and told.tier != 3 else 0.0
         rows.append(
             {
                 "task": task.name,

@@ -18,7 +18,7 @@ from deconfounded.experts.demos import Trials
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.03, 0.01  # nats a step: of memory, of the world
 FINE, GAP = 0.8, 0.15  # scores
-STAKES = 2.0  # times chance
+STAKES, LIKE = 1.5, 2.0  # how strange: the ways of who is mistaken, at least; dreams that can be believed, at most
 
 
 class Next(NamedTuple):
@@ -65,6 +65,11 @@ class Figure(NamedTuple):
     low: float
     high: float
 
+    @staticmethod
+    def of(refits: Sequence[float]) -> Figure:
+        """Of what each refit found."""
+        return Figure(sum(refits) / len(refits), min(refits), max(refits))
+
     def __str__(self) -> str:
         return f"{self.value:.2g} ({self.low:.2g} to {self.high:.2g})"
 
@@ -73,7 +78,8 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
 
-    tier: of the paper; None if it is not known, or if none does.
+    Found is also the `gap`: what cloning is predicted to lose, in scores. tier: of the paper; None if it is not known,
+    or if none does.
     """
 
     verdict: Verdict
@@ -81,11 +87,6 @@ class Diagnosis:
     reasons: tuple[str, ...]
     tier: int | None
     next: Next
-
-    @property
-    def gap(self) -> float:
-        """What cloning is predicted to lose, in scores."""
-        return self.found["latent"].value - self.found["naive"].value
 
 
 def diagnose(
@@ -138,8 +139,9 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     found = {}
     for key, each in zip(Findings._fields, zip(*refits, strict=True), strict=True):
         if values := [value for value in each if value is not None]:
-            found[key] = Figure(sum(values) / len(values), min(values), max(values))
-    memory, stakes, naive, latent = (found[key] for key in ("memory", "stakes", "naive", "latent"))
+            found[key] = Figure.of(values)
+    gap = found["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
+    memory, stakes, unlike, naive, latent = (found[key] for key in ("memory", "stakes", "unlike", "naive", "latent"))
     explored = found.get("explored")
     said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]
 
@@ -158,8 +160,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         )
         return told("cannot tell", None, why, VARY)
     said.append(
-        f"The expert acts on something that trials differ in. Who mistakes it goes {stakes} times as far off the way as"
-        " chance does."
+        "The expert acts on something that trials differ in. Among the ways of those who know it, the ways of one who"
+        f" mistakes it are {stakes} times as strange as their own."
     )
     if explored is not None:
         said.append(f"In exploration the world tells it by {explored} nats a step.")
@@ -169,16 +171,22 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
                 " the expert would do where the clone goes; if the world tells it nowhere, only a sensor helps."
             )
             return told("confounded", 3, why, ASK)
-    if stakes.high < STAKES:
-        why = "That is little: either it hardly matters, or the dynamics are not known well enough where it does."
+    if stakes.high < STAKES and unlike.high < LIKE:
+        why = "That is chance: who mistakes it comes about like the others, and so will a clone."
+        return told("not confounded", 1, why, CLONE)
+    if stakes.low < STAKES:
+        why = (
+            "That may be chance: either it hardly matters, or the dynamics are not known well enough where it does"
+            f" (of ways in the learned ones, seen among those of the data, the same figure is {unlike})."
+        )
         return told("cannot tell", None, why, WIDER)
     said.append(
         f"In the learned dynamics a naive clone scores {naive}, one that infers the latent from the world {latent}: 1"
-        " knows the latent, 0 acts on another one."
+        " comes about like those who know the latent, 0 nowhere near."
     )
-    if naive.value > FINE and latent.value - naive.value < GAP:
+    if naive.low > FINE and gap.high < GAP:
         return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
-    if latent.low <= naive.high:
+    if gap.low <= 0:
         return told("cannot tell", None, "The two overlap: more trials, or exploration, would settle it.", MORE)
     if explored is None:
         why = (

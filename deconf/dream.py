@@ -101,10 +101,19 @@ class Clone:
         self.agent.remember(step)
 
 
+def known_range(held: Batch) -> tuple[Tensor, Tensor]:
+    """Least and largest observation [S, 1, O] for which dynamics are to hold: the data's, and half their range beyond."""
+    padding = held.mask[..., None] == 0
+    low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
+    high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
+    margin = 0.5 * (high - low)
+    return low - margin, high + margin
+
+
 class World:
     """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
 
-    held: expert trials [S, B, T], in whose range of observations the dynamics hold; starts [S, K, O].
+    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O].
     """
 
     def __init__(self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int) -> None:
@@ -112,11 +121,7 @@ class World:
         draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
         n = judge.theta_hat.shape[1]
         self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
-        padding = held.mask[..., None] == 0
-        low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
-        high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
-        margin = 0.1 * (high - low)
-        self.low, self.high = low - margin, high + margin
+        self.low, self.high = known_range(held)
         self.scale = self._scale(held)
 
     def _scale(self, held: Batch) -> Tensor:
@@ -143,7 +148,7 @@ class World:
     def visit(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
         """An actor's last episode: how far its actions are from the judge's [S], and its observations [S, N, T, O].
 
-        The first is a mean over steps, 0 to 1; where the expert's range is left, the rest of the episode counts as 1,
+        The first is a mean over steps, 0 to 1; where that range is left, the rest of the episode counts as 1,
         and observations stay as they are.
         """
         seeds, n, _ = self.judge.theta_hat.shape

@@ -22,11 +22,12 @@ from deconfounded.deconf.agents import Monitor, ramp
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, Signature, take, take_steps
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.dream import Clone, Expert, Filter, World
+from deconfounded.deconf.dream import Clone, Expert, Filter, World, known_range
 from deconfounded.deconf.equations import imitation_loss, masked_mean
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.deconf.paths import familiar, last_episode, strange
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.experts.demos import Agent, Trials
 
@@ -40,7 +41,7 @@ class Amounts:
 
     held_out: float = 0.25  # share of the trials
     rivals: int = 24
-    dreams: int = 96
+    dreams: int = 192
     cloning: CloningConfig = field(default_factory=lambda: CloningConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
@@ -54,19 +55,24 @@ class Findings(NamedTuple):
 
     memory: what memory adds to predicting the expert's action over the present observation. explained: what a latent
     adds that explains the world's answers, and nothing else. explored: how much more likely a trial's own latent makes
-    the world's answers in exploration than another trial's does. stakes: how many times as far off the way an expert
-    goes who holds another latent for true, as one who knows it goes by chance, in what it shows most. naive, latent:
-    predicted scores in the last episode, of a naive clone and of one that infers the latent from the world: 0 is an
-    expert who holds another latent for true, 1 the one who knows it. Without exploration, explained and explored are
-    None, and the latent is one that explains actions too, Eq. (7).
+    the world's answers in exploration than another trial's does. stakes: how strange the ways of an expert are who
+    holds another latent for true, among those of experts who know theirs, in what shows it most; 1: not at all. unlike:
+    how strange these are in turn, in the learned dynamics, among those of the data, on the whole. naive, latent:
+    predicted scores in the last episode, of a naive clone and of one that infers the latent from the world: 1 comes
+    about like the experts who know it, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges their
+    actions, Eq. (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without exploration,
+    explained and explored are None, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
     explored: float | None
     explained: float | None
     stakes: float
+    unlike: float
     naive: float
     latent: float
+    naive_judged: float
+    latent_judged: float
 
 
 class Part(Monitor):
@@ -100,8 +106,9 @@ def measure(
     if explore is None:
         model, _, policy = offline.explain(data, signature, how, draws, part)
     else:
-        tried, rest = (Batch.of(some, 1) for some in split(explore, amounts.held_out, rng))
+        tried, rest = (_near(data, Batch.of(some, 1)) for some in split(explore, amounts.held_out, rng))
         model = _dynamics(tried, signature, amounts.exploring, draws, part)
+        _refit_noise(model, data, draws)
         policy = _conditional(model, data, amounts.cloning, draws)
         explored = _apart(model, rest, draws)
     with torch.no_grad():
@@ -117,11 +124,11 @@ def measure(
         dreamt = World(knower, data, starts, *trials.mask.shape[1:])
         actors = (knower, Expert(model, policy, mistaken), Clone(recurrent), Filter(model, policy, rivals))
         (one, home), (zero, away), *others = (dreamt.visit(actor, rngs) for actor in actors)
-        again = dreamt.visit(knower, rngs)[1]
-        naive, latent = (float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others)
-        stakes = _astray(away, home, again) / _astray(again, home, again)
+        judged = [float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others]
+        naive, latent = (familiar(_oddest(path, home)) for _, path in others)
+        unlike = float(strange(home[0], last_episode(data, trials.mask.shape[2])).mean())
     tell(1)
-    return Findings(memory, explored, explained, stakes, naive, latent)
+    return Findings(memory, explored, explained, _oddest(away, home), unlike, naive, latent, *judged)
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
@@ -137,6 +144,11 @@ def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trial
 def _mean(x: Tensor, batch: Batch) -> float:
     """Over all steps [1, B, T] that took place."""
     return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
+
+
+def _oddest(path: Tensor, home: Tensor) -> float:
+    """How strange observations [1, N, T, O] are among those of who knows the latent, in what shows it most."""
+    return float(strange(path[0], home[0]).max())
 
 
 def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
@@ -172,6 +184,23 @@ def _dynamics(
     return model
 
 
+def _near(data: Batch, explored: Batch) -> Batch:
+    """Exploration without its steps from outside of the range in which dynamics are to hold."""
+    low, high = known_range(data)
+    near = ((explored.obs >= low[:, None]) & (explored.obs <= high[:, None])).all(-1)
+    return replace(explored, mask=explored.mask * near)
+
+
+@torch.no_grad()
+def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
+    """Noise of the size it has where experts go: falls, and what else is seldom there, would swell it."""
+    head, latents = model.dynamics, _along(data, _inferred(model, data, draws))
+    if not model.inputs.signature.binary:
+        off = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
+        square = masked_mean(off.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
+        head.log_std.copy_(0.5 * square.clamp(min=1e-12).log())
+
+
 @torch.no_grad()
 def _apart(model: VariationalModel, rest: Batch, draws: Draws) -> float:
     """How much more likely a trial's own latent, inferred from its even steps, makes its odd ones than another's."""
@@ -195,19 +224,3 @@ def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws
         log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
         optimizer.step(imitation_loss(log_policy, torch.ones_like(log_policy)))
     return policy
-
-
-def _astray(path: Tensor, home: Tensor, again: Tensor) -> float:
-    """How far a path [1, N, T, O] is from that of one who knows the latent, home, in units of chance.
-
-    In squares of which more than 9 is 9, of the coordinate that shows it most: at each time, or over the episode, of
-    its mean or its mean square. Chance is how far that one is from itself when it goes again, or a hundredth of all
-    that it comes to.
-    """
-    found = []
-    for of in (lambda x: x, lambda x: x.mean(2, keepdim=True), lambda x: x.square().mean(2, keepdim=True)):
-        here, there, back = of(path), of(home), of(again)
-        floor = (0.01 * (there.amax((1, 2), keepdim=True) - there.amin((1, 2), keepdim=True))).square().clamp(min=1e-12)
-        unit = (back - there).square().mean(1, keepdim=True) + floor
-        found.append(((here - there).square() / unit).clamp(max=9).mean((0, 1, 2)))
-    return float(torch.cat(found).max())

@@ -88,7 +88,17 @@ class TestBadInput:
             assert said.count("\n") == 1
 
 
-CLEAR = Findings(memory=1.0, explored=0.2, explained=0.5, stakes=3.0, naive=0.2, latent=0.9)
+CLEAR = Findings(
+    memory=1.0,
+    explored=0.2,
+    explained=0.5,
+    stakes=3.0,
+    unlike=3.0,
+    naive=0.2,
+    latent=0.9,
+    naive_judged=-0.1,
+    latent_judged=0.8,
+)
 
 
 class TestJudge:
@@ -101,6 +111,7 @@ class TestJudge:
             ({"explored": None, "explained": None}, "confounded", None, diagnose.TRY),
             ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
             ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
+            ({"stakes": 1.1, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
             ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
@@ -116,6 +127,9 @@ class TestJudge:
         """No confident verdict where refits lie on both sides of what decides."""
         assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
+        alike = CLEAR._replace(unlike=1.2)
+        assert diagnose.judge([alike, alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:
         found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
@@ -171,7 +185,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     first = capsys.readouterr().out
     told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert told["verdict"].upper() in first
-    assert set(told["found"]) == set(Findings._fields)
+    assert set(told["found"]) == {*Findings._fields, "gap"}
     page = (tmp_path / "out" / "index.html").read_text()
     assert told["reasons"][0] in html.unescape(page)
     assert not re.search(r"(src|href)=\"(?!data:)", page)

@@ -31,7 +31,6 @@ def write(found: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "tier": found.tier,
         "reasons": list(found.reasons),
         "next": {"advice": found.next.advice, "code": code},
-        "predicted_gap": found.gap,
         "found": {key: figure._asdict() for key, figure in found.found.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
@@ -96,12 +95,14 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         "naive clone": (naive, colour("naive_rnn")),
         "infers the latent": (latent, colour("deconfounded")),
     }
+    judged = (figure["naive_judged"], figure["latent_judged"])
     sections.append(
         (
             "What will it cost?",
-            f"Whoever acts on another latent goes {stakes} times as far off the way as chance does; below {STAKES} that"
-            f" hardly matters. In learned dynamics a naive clone scores {naive}, and one that infers the latent from"
-            f" the world {latent}, as the expert would judge it: 1 knows the latent, 0 acts on another one.",
+            f"The ways of an expert who acts on another latent are {stakes} times as strange as usual; below {STAKES}"
+            f" it hardly matters. In the learned dynamics a naive clone scores {naive}, and one that infers the latent"
+            f" from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near. (As the expert"
+            f" would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 1 knows the latent, 0 acts on another.)",
             lambda axes: _bars(axes, actors, "predicted score, last episode", FINE),
         )
     )
