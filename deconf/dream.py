@@ -102,7 +102,7 @@ class Clone:
 
 
 def known_range(held: Batch) -> tuple[Tensor, Tensor]:
-    """Least and largest observation [S, 1, O] for which dynamics are to hold: the data's, and half their range beyond."""
+    """Least and largest observation [S, 1, O] for which dynamics are to hold: the data, and half its range beyond."""
     padding = held.mask[..., None] == 0
     low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
     high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]

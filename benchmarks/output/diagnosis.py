@@ -102,7 +102,7 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
             f"The ways of an expert who acts on another latent are {stakes} times as strange as usual; below {STAKES}"
             f" it hardly matters. In the learned dynamics a naive clone scores {naive}, and one that infers the latent"
             f" from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near. (As the expert"
-            f" would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 1 knows the latent, 0 acts on another.)",
+            f" would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 0 is one who acts on another.)",
             lambda axes: _bars(axes, actors, "predicted score, last episode", FINE),
         )
     )
