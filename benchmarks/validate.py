@@ -1,8 +1,8 @@
 """Is a diagnosis right, where the truth is known? `python benchmarks/validate.py`
 
 It diagnoses expert trials of every task of the suite, and of three that are not confounded (tests/fixtures.py), with
-exploration and without; beside each verdict stand the task's certificate, and the scores that were measured.
-Interrupted, it goes on where it was.
+exploration and without; beside each verdict stand the task's certificate, and the scores that were measured. Of all of
+them, table and picture are kept in docs/diagnose. Interrupted, it goes on where it was.
 """
 
 from __future__ import annotations
@@ -122,43 +122,48 @@ def main() -> None:
     from scipy import stats
 
     from deconfounded.benchmarks.diagnose import run
+    from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.output.gap import Gap, picture
 
-    tasks = [envs.get(known[name]) for name in args.tasks or known]
+    names = args.tasks or list(known)
+    tasks, told = [envs.get(known[name]) for name in names], dict[tuple[str, str], Diagnosis]()
+    for kind in ("explored", "alone"):
+        for name, task in zip(names, tasks, strict=True):
+            folder = args.out / task.name
+            folder.mkdir(parents=True, exist_ok=True)
+            trials, exploration = data(task, CASES[known[name]], folder)
+            asked = f"deconf validate --tasks {name}"
+            told[name, kind], _ = run(trials, exploration if kind == "explored" else None, 0, folder / kind, asked)
+            print(f"{name}, {kind}: {told[name, kind].verdict}")
     rows: list[dict[str, Any]] = []
-    for name, task in zip(args.tasks or known, tasks, strict=True):
-        source = CASES[known[name]]
-        folder = args.out / task.name
-        folder.mkdir(parents=True, exist_ok=True)
-        files = data(task, source, folder)
-        alone, told = (
-            run(files[0], other, 0, folder / kind, f"deconf validate --tasks {name}")[0]
-            for kind, other in (("alone", None), ("explored", files[1]))
-        )
+    for name, task in zip(names, tasks, strict=True):
+        source, folder, best = CASES[known[name]], args.out / task.name, told[name, "explored"]
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
-        gap = told.found["gap"].value if told.verdict == "confounded" and told.tier != 3 else 0.0
+        gap = best.found["gap"].value if best.verdict == "confounded" and best.tier != 3 else 0.0
         rows.append(
             {
                 "task": task.name,
                 "certified": certified,
-                "alone": alone.verdict,
-                "verdict": told.verdict,
-                "tier": told.tier,
-                "right": right(task, certified, told),
+                "alone": told[name, "alone"].verdict,
+                "verdict": best.verdict,
+                "tier": best.tier,
+                "right": right(task, certified, best),
                 "predicted": gap,
                 "measured": scores["deconfounded"] - scores["naive_rnn"],
-                "found": {key: figure._asdict() for key, figure in told.found.items()},
+                "found": {key: figure._asdict() for key, figure in best.found.items()},
             }
         )
-        print(f"{task.name}: {told.verdict}, {'right' if rows[-1]['right'] else 'WRONG'}")
     share = sum(row["right"] for row in rows) / len(rows)
     gaps = [[row[key] for row in rows] for key in ("predicted", "measured")]
     rank = float(stats.spearmanr(*gaps).statistic) if len(rows) > 2 else 0.0
-    write_json(args.out / "validation.json", {"right": share, "rank_correlation": rank, "rows": rows})
+    kept = args.out if args.tasks else DOCS / "diagnose"
+    kept.mkdir(exist_ok=True)
+    about = {"machine": identity.machine("cpu"), "versions": identity.versions()}
+    write_json(kept / "validation.json", {"right": share, "rank_correlation": rank, **about, "rows": rows})
     points = [Gap(task, row["predicted"], row["measured"]) for task, row in zip(tasks, rows, strict=True)]
     hues = ["tab:red" if row["certified"] else "tab:green" for row in rows]
-    picture(points, args.out / "validation.png", "the diagnosis", hues)
-    print(f"{share:.0%} right; rank correlation of predicted and measured gaps {rank:.2f} -> {args.out}")
+    picture(points, kept / "validation.png", "the diagnosis", hues)
+    print(f"{share:.0%} right; rank correlation of predicted and measured gaps {rank:.2f} -> {kept}")
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ PARTS = 6  # of an episode
 FAR = 9.0  # in squares of what is usual: as strange as it gets
 
 
-def last_episode(trials: Batch, horizon: int) -> Tensor:
-    """Next observations [N, T, O] of trials [1, N, E T]; an episode that is over stays where it ended."""
-    path, lasts = trials.next_obs[0, :, -horizon:], trials.mask[0, :, -horizon:].sum(1).long()
-    index = torch.minimum(torch.arange(horizon), (lasts[:, None] - 1).clamp(min=0))
+def ways(episodes: Batch) -> Tensor:
+    """Where episodes [1, N, T] went, [N, T, O]; one that is over stays where it ended."""
+    path, mask = episodes.next_obs[0], episodes.mask[0]
+    index = torch.minimum(torch.arange(path.shape[1]), (mask.sum(1).long()[:, None] - 1).clamp(min=0))
     return path.gather(1, index[..., None].expand_as(path))
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deconfounded.deconf.data import Batch
-from deconfounded.deconf.paths import FAR, familiar, last_episode, strange
+from deconfounded.deconf.paths import FAR, familiar, strange, ways
 from deconfounded.experts.demos import Trials
 
 
@@ -36,10 +36,10 @@ def test_as_score() -> None:
     assert [familiar(s) for s in (0.5, 1.0, FAR**0.5, FAR, 2 * FAR)] == pytest.approx([1, 1, 0.5, 0, 0])
 
 
-def test_last_episode() -> None:
-    """Of an episode that is over, what it came to last; of the last episode alone."""
-    obs = np.arange(2 * 2 * 5, dtype=np.float32).reshape(2, 2, 5, 1)
-    mask = np.ones((2, 2, 4), bool)
-    mask[1, 1, 2:] = False
-    path = last_episode(Batch.of(Trials(obs, np.zeros((2, 2, 4, 1)), mask), 1), 4)
-    assert path[..., 0].tolist() == [[6, 7, 8, 9], [16, 17, 17, 17]]
+def test_ways() -> None:
+    """Of an episode that is over, what it came to last."""
+    obs = np.arange(2 * 5, dtype=np.float32).reshape(2, 1, 5, 1)
+    mask = np.ones((2, 1, 4), bool)
+    mask[1, 0, 2:] = False
+    path = ways(Batch.of(Trials(obs, np.zeros((2, 1, 4, 1)), mask), 1))
+    assert path[..., 0].tolist() == [[1, 2, 3, 4], [6, 7, 7, 7]]

@@ -1,7 +1,8 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
-docs/index.html (of the records that `publish.py` kept) and the tables in README, docs/paper.md and docs/speed.md.
+docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and that
+in docs/diagnose.md (of what `validate.py` kept).
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ AUTHORS = {
     "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
+VALIDATED = ("memory", "explored", "stakes", "unlike")  # figures of a diagnosis in the table of docs/diagnose.md
 
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
@@ -159,6 +161,28 @@ def costs() -> str:
     return markdown_table(head, rows)
 
 
+def validation() -> str:
+    """The table of docs/diagnose.md: what `validate.py` found where the truth is known."""
+    found = json.loads((DOCS / "diagnose" / "validation.json").read_text())
+    rows = []
+    for row in found["rows"]:
+        told = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
+        figures = (row["found"][key]["value"] if key in row["found"] else None for key in VALIDATED)
+        cells = ("" if value is None else score.two_decimals(value) for value in (*figures, row["predicted"]))
+        measured, certified = score.two_decimals(row["measured"]), "passed" if row["certified"] else "failed"
+        rows.append((row["task"], certified, row["alone"], told, "" if row["right"] else "wrong", *cells, measured))
+    head = ("task", "certificate", "alone", "with exploration", "", *VALIDATED, "predicted gap", "measured")
+    rank, where = score.two_decimals(found["rank_correlation"]), f"{found['machine']}, {found['versions']['torch']}"
+    text = f"""{found["right"]:.0%} of the verdicts with exploration are right; the rank correlation of predicted and
+measured gaps is {rank} ({where})."""
+    return f"{text}\n\n{markdown_table(head, rows)}"
+
+
+def diagnose() -> str:
+    """docs/diagnose.md with its table."""
+    return _filled((DOCS / "diagnose.md").read_text(), validation)
+
+
 def speed() -> str:
     """docs/speed.md with its table."""
     return _filled((DOCS / "speed.md").read_text(), costs)
@@ -211,6 +235,7 @@ def write() -> None:
     write_atomically(DOCS / "tasks.md", cards.tasks_page())
     write_atomically(DOCS / "results.md", results_page())
     gap.picture(_gaps(), DOCS / "gap.png")
+    write_atomically(DOCS / "diagnose.md", diagnose())
     write_atomically(DOCS / "speed.md", speed())
     write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())

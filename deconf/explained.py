@@ -1,0 +1,143 @@
+"""A latent that explains an expert's trials: as what the world answers tells it, or as actions and answers do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from deconfounded.deconf import offline
+from deconfounded.deconf.agents import Monitor, ramp
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.data import Batch, Draws, Signature, take_steps
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.dream import known_range
+from deconfounded.deconf.equations import imitation_loss, masked_mean
+from deconfounded.deconf.models import VariationalModel
+from deconfounded.deconf.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.experts.demos import Trials
+
+
+class Explanation(NamedTuple):
+    """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
+
+    actions: log-likelihood of the expert's held-out actions given latents, nats a step. told: how much more likely a
+    trial's own latent makes what held-out exploration met than another trial's does. None without exploration.
+    """
+
+    model: VariationalModel
+    policy: ActionHead
+    latents: Tensor
+    actions: float | None = None
+    told: float | None = None
+
+
+def alone(shown: Trials, how: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
+    """Of expert trials: a latent that explains actions and answers, Eq. (7)."""
+    data = Batch.of(shown, 1)
+    model, _, policy = offline.explain(data, Signature.of(shown), how, draws, monitor)
+    return Explanation(model, policy, _inferred(model, data, draws))
+
+
+def by_world(
+    expert: tuple[Trials, Trials],
+    explored: tuple[Trials, Trials],
+    each: int,
+    exploring: DeconfoundedConfig,
+    cloning: CloningConfig,
+    draws: Draws,
+    monitor: Monitor,
+) -> Explanation:
+    """A latent that explains what the world answers, Eq. (6), and a policy given it; of each, the second is held out.
+
+    Not on expert trials: these hold nearly one action for each observation and latent, so that what an action does and
+    what the latent does cannot be told apart. (On `swapped_lander`, of both, it learned that the engine does nothing.)
+    each: how many trials, side by side, may be of one theta.
+    """
+    shown, held, tried, rest = (Batch.of(some, 1) for some in (*expert, *explored))
+    tried, rest = (_near(shown, some) for some in (tried, rest))
+    model = _dynamics(tried, Signature.of(expert[0]), exploring, draws, monitor)
+    _refit_noise(model, shown, draws)
+    policy = _conditional(model, shown, cloning, draws)
+    with torch.no_grad():
+        actions = mean(policy.log_prob(_features(model, held, draws), held.action), held)
+    return Explanation(model, policy, _inferred(model, shown, draws), actions, _told(model, rest, each, draws))
+
+
+def mean(x: Tensor, batch: Batch) -> float:
+    """Over all steps [1, B, T] that took place."""
+    return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
+
+
+def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
+    """A latent [1, B, D] for each trial."""
+    return model.sample(model.belief(model.last(batch)), draws)
+
+
+def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
+    """What a latent-conditional policy reads at each step: observation and the trial's latent, [1, B, T, O + D]."""
+    return torch.cat([model.inputs.obs(batch.obs), _along(batch, _inferred(model, batch, draws))], -1)
+
+
+def _along(batch: Batch, latents: Tensor) -> Tensor:
+    """Each trial's latent [1, B, D] at each of its steps."""
+    return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
+
+
+def _dynamics(
+    explored: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
+) -> VariationalModel:
+    """Eq. (6)."""
+    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(explored), draws)
+    optimizer = Adam([model], how.inference_rate, how.inference_updates)
+    for update in range(how.inference_updates):
+        batch = explored.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
+        beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
+        loss = model.learn(optimizer, batch, how.inference_steps, beta, draws)
+        monitor.update(update + 1, how.inference_updates, {"inference": loss})
+    return model
+
+
+def _near(data: Batch, explored: Batch) -> Batch:
+    """Exploration without its steps from outside of the range in which dynamics are to hold."""
+    low, high = known_range(data)
+    near = ((explored.obs >= low[:, None]) & (explored.obs <= high[:, None])).all(-1)
+    return replace(explored, mask=explored.mask * near)
+
+
+@torch.no_grad()
+def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
+    """Noise of the size it has where experts go: falls, and what else is seldom there, would swell it."""
+    head, latents = model.dynamics, _along(data, _inferred(model, data, draws))
+    if not model.inputs.signature.binary:
+        off = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
+        square = masked_mean(off.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
+        head.log_std.copy_(0.5 * square.clamp(min=1e-12).log())
+
+
+@torch.no_grad()
+def _told(model: VariationalModel, rest: Batch, each: int, draws: Draws) -> float:
+    """How much likelier a trial's latent, of its even steps, makes its odd ones than that of the trial `each` on."""
+    even = torch.arange(rest.mask.shape[2]) % 2 == 0
+    own, odd = _inferred(model, replace(rest, mask=rest.mask * even), draws), replace(rest, mask=rest.mask * ~even)
+    true, other = (
+        model.dynamics.log_prob(rest.obs, rest.action, rest.next_obs, _along(rest, latent))[..., 0]
+        for latent in (own, own.roll(each, 1))
+    )
+    return mean(true - other, odd)
+
+
+def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
+    """A policy, cloned given the latents that a model infers from the trials."""
+    with torch.no_grad():
+        features = _features(model, data, draws)
+    policy = ActionHead(features.shape[-1], how.width, model.inputs.signature, draws)
+    optimizer = Adam([policy], how.learning_rate, how.updates)
+    for _ in range(how.updates):
+        index = data.draw_steps(how.batch, draws)
+        log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
+        optimizer.step(imitation_loss(log_policy, torch.ones_like(log_policy)))
+    return policy
