@@ -126,7 +126,7 @@ def main() -> None:
     from deconfounded.benchmarks.output.gap import Gap, picture
 
     names = args.tasks or list(known)
-    tasks, told = [envs.get(known[name]) for name in names], dict[tuple[str, str], Diagnosis]()
+    tasks, told = [envs.get(known[name]) for name in names], {}
     for kind in ("explored", "alone"):
         for name, task in zip(names, tasks, strict=True):
             folder = args.out / task.name
