@@ -59,7 +59,8 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     from deconfounded.deconf import wander
     from deconfounded.experts.demos import Trials, joined
 
-    settings = replace(preset("default", task, "cpu"), expert_trials=TRIALS.get(task.name, 256), explore_trials=64)
+    count = TRIALS.get(task.name, 256)
+    settings = replace(preset("default", task, "cpu"), expert_trials=count, explore_trials=count // 4)
     context = Context(task, settings, (SEED,), folder=folder, expert=source)
     shown, file = context.demonstrations, folder / "explored.npz"
     made_of = f"{shown.sha256} {identity.module('deconf/wander')}"
