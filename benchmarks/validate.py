@@ -1,7 +1,7 @@
 """Is a diagnosis right, where the truth is known? `python benchmarks/validate.py`
 
-It diagnoses expert trials of every task of the suite, and of three that are not confounded (tests/fixtures.py), with
-exploration and without; beside each verdict stand the task's certificate, and the scores that were measured. Of all of
+It diagnoses expert trials, with exploration, of every task of the suite, and of three that are not confounded
+(tests/fixtures.py); beside each verdict stand the task's certificate, and the scores that were measured. Of all of
 them, table and picture are kept in docs/diagnose. Interrupted, it goes on where it was.
 """
 
@@ -39,7 +39,7 @@ LEARNED = ("naive_rnn", "deconfounded")
 
 
 def right(task: envs.Task, certified: bool, told: Diagnosis) -> bool:
-    """Whether a diagnosis with exploration says what is so.
+    """Whether a diagnosis says what is so.
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
@@ -63,7 +63,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     settings = replace(preset("default", task, "cpu"), expert_trials=count, explore_trials=count // 4)
     context = Context(task, settings, (SEED,), folder=folder, expert=source)
     shown, file = context.demonstrations, folder / "explored.npz"
-    made_of = f"{shown.sha256} {identity.module('deconf/wander')}"
+    made_of = f"{shown.sha256} {settings.explore_trials} {identity.module('deconf/wander')}"
     try:
         Trials.load(file, made_of)
     except envs.InputError:
@@ -127,33 +127,27 @@ def main() -> None:
     from deconfounded.benchmarks.output.gap import Gap, picture
 
     names = args.tasks or list(known)
-    tasks, told = [envs.get(known[name]) for name in names], {}
-    for kind in ("explored", "alone"):
-        for name, task in zip(names, tasks, strict=True):
-            folder = args.out / task.name
-            folder.mkdir(parents=True, exist_ok=True)
-            trials, exploration = data(task, CASES[known[name]], folder)
-            asked = f"deconf validate --tasks {name}"
-            told[name, kind], _ = run(trials, exploration if kind == "explored" else None, 0, folder / kind, asked)
-            print(f"{name}, {kind}: {told[name, kind].verdict}")
-    rows: list[dict[str, Any]] = []
+    tasks, rows = [envs.get(known[name]) for name in names], list[dict[str, Any]]()
     for name, task in zip(names, tasks, strict=True):
-        source, folder, best = CASES[known[name]], args.out / task.name, told[name, "explored"]
+        source, folder = CASES[known[name]], args.out / task.name
+        folder.mkdir(parents=True, exist_ok=True)
+        files = data(task, source, folder)
+        told, _ = run(*files, 0, folder / "diagnosis", f"deconf validate --tasks {name}")
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
-        gap = best.found["gap"].value if best.verdict == "confounded" and best.tier != 3 else 0.0
+        gap = told.found["gap"].value if told.verdict == "confounded" and told.tier != 3 else 0.0
         rows.append(
             {
                 "task": task.name,
                 "certified": certified,
-                "alone": told[name, "alone"].verdict,
-                "verdict": best.verdict,
-                "tier": best.tier,
-                "right": right(task, certified, best),
+                "verdict": told.verdict,
+                "tier": told.tier,
+                "right": right(task, certified, told),
                 "predicted": gap,
                 "measured": scores["deconfounded"] - scores["naive_rnn"],
-                "found": {key: figure._asdict() for key, figure in best.found.items()},
+                "found": {key: figure._asdict() for key, figure in told.found.items()},
             }
         )
+        print(f"{task.name}: {told.verdict}, {'right' if rows[-1]['right'] else 'WRONG'}")
     share = sum(row["right"] for row in rows) / len(rows)
     gaps = [[row[key] for row in rows] for key in ("predicted", "measured")]
     rank = float(stats.spearmanr(*gaps).statistic) if len(rows) > 2 else 0.0

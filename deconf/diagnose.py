@@ -161,36 +161,34 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         return told("cannot tell", None, why, VARY)
     said.append(
         "The expert acts on something that trials differ in. Among the ways of those who know it, the ways of one who"
-        f" mistakes it are {stakes} times as strange as their own."
+        f" mistakes it are {stakes} times as strange as their own, in the learned dynamics; there a naive clone scores"
+        f" {naive}, one that infers the latent from the world {latent}: 1 comes about like those who know it, 0 nowhere"
+        " near."
     )
-    if explored is not None:
-        said.append(f"In exploration the world tells it by {explored} nats a step.")
-        if explored.high < SILENT:
-            why = (
-                "That is nothing, and expert trials say nothing either: where the expert goes depends on it. Ask what"
-                " the expert would do where the clone goes; if the world tells it nowhere, only a sensor helps."
-            )
-            return told("confounded", 3, why, ASK)
+    if explored is None:
+        why = (
+            "But these were learned from expert trials alone, which hold nearly one action for each observation and"
+            " latent: what an action does, and what the latent does, cannot be told apart there."
+        )
+        return told("cannot tell", None, why, TRY)
+    said.append(f"In exploration the world tells it by {explored} nats a step.")
+    if explored.high < SILENT:
+        why = (
+            "That is nothing, and expert trials say nothing either: where the expert goes depends on it. Ask what"
+            " the expert would do where the clone goes; if the world tells it nowhere, only a sensor helps."
+        )
+        return told("confounded", 3, why, ASK)
     if stakes.high < STAKES and unlike.high < LIKE:
-        why = "That is chance: who mistakes it comes about like the others, and so will a clone."
+        why = "Strangeness is chance: who mistakes it comes about like the others, and so will a clone."
         return told("not confounded", 1, why, CLONE)
     if stakes.low < STAKES:
         why = (
-            "That may be chance: either it hardly matters, or the dynamics are not known well enough where it does"
-            f" (of ways in the learned ones, seen among those of the data, the same figure is {unlike})."
+            "Strangeness may be chance: either it hardly matters, or the dynamics are not known well enough where it"
+            f" does (of ways in the learned ones, seen among those of the data, the same figure is {unlike})."
         )
         return told("cannot tell", None, why, WIDER)
-    said.append(
-        f"In the learned dynamics a naive clone scores {naive}, one that infers the latent from the world {latent}: 1"
-        " comes about like those who know the latent, 0 nowhere near."
-    )
     if naive.low > FINE and gap.high < GAP:
         return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
     if gap.low <= 0:
-        return told("cannot tell", None, "The two overlap: more trials, or exploration, would settle it.", MORE)
-    if explored is None:
-        why = (
-            "A clone would take its own actions for evidence. Expert trials cannot say whether the world gives better."
-        )
-        return told("confounded", None, why, TRY)
+        return told("cannot tell", None, "The scores overlap: more trials, or exploration, would settle it.", MORE)
     return told("confounded", 2, "A clone would take its own actions for evidence; the world gives better.", EXPLORE)

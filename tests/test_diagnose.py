@@ -108,7 +108,8 @@ class TestJudge:
         ("changes", "verdict", "tier", "then"),
         [
             ({}, "confounded", 2, diagnose.EXPLORE),
-            ({"explored": None, "explained": None}, "confounded", None, diagnose.TRY),
+            ({"explored": None, "explained": None}, "cannot tell", None, diagnose.TRY),
+            ({"explored": None, "explained": None, "stakes": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
             ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
             ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
             ({"stakes": 1.1, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),

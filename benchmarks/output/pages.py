@@ -170,10 +170,10 @@ def validation() -> str:
         figures = (row["found"][key]["value"] if key in row["found"] else None for key in VALIDATED)
         cells = ("" if value is None else score.two_decimals(value) for value in (*figures, row["predicted"]))
         measured, certified = score.two_decimals(row["measured"]), "passed" if row["certified"] else "failed"
-        rows.append((row["task"], certified, row["alone"], told, "" if row["right"] else "wrong", *cells, measured))
-    head = ("task", "certificate", "alone", "with exploration", "", *VALIDATED, "predicted gap", "measured")
+        rows.append((row["task"], certified, told, "" if row["right"] else "wrong", *cells, measured))
+    head = ("task", "certificate", "diagnosis", "", *VALIDATED, "predicted gap", "measured")
     rank, where = score.two_decimals(found["rank_correlation"]), f"{found['machine']}, {found['versions']['torch']}"
-    text = f"""{found["right"]:.0%} of the verdicts with exploration are right; the rank correlation of predicted and
+    text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
 measured gaps is {rank} ({where})."""
     return f"{text}\n\n{markdown_table(head, rows)}"
 
