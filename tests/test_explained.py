@@ -1,0 +1,65 @@
+"""What the world tells of a latent is found in a small world whose truth is known, and so is the size of its noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from deconfounded.deconf import explained, findings
+from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.cloning import CloningConfig
+from deconfounded.deconf.data import Draws
+from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.findings import Amounts, split
+from deconfounded.experts.demos import Trials
+
+NOISE, FALL = 0.1, 1.5
+EXPLORING = DeconfoundedConfig(inference_updates=400, inference_rate=3e-3)
+CLONING = CloningConfig(updates=200)
+
+
+def world(push: float, expert: bool, n: int, seed: int, episodes: int = 1, drifts: bool = False) -> Trials:
+    """s' = s + a / 2 + push theta + noise, wild beyond |s| = 1.5; the expert holds s at 0, others do anything."""
+    rng = np.random.default_rng(seed)
+    theta = np.repeat(rng.choice([-1.0, 1.0], (n, 1)), episodes, 1)
+    if drifts:
+        theta = rng.choice([-1.0, 1.0], (n, episodes))
+    obs, actions = [rng.normal(0, 0.1 if expert else 3.0, (n, episodes))], []
+    for _ in range(40):
+        s = obs[-1]
+        act = -2 * s - 0.4 * theta + rng.normal(0, 0.05, s.shape) if expert else rng.uniform(-1, 1, s.shape) - s
+        act = act.clip(-1, 1)
+        noise = np.where(abs(s) > FALL, 20 * NOISE, NOISE) * rng.normal(size=s.shape)
+        obs.append(s + act / 2 + push * theta + noise)
+        actions.append(act)
+    return Trials(np.stack(obs, -1)[..., None], np.stack(actions, -1)[..., None], np.ones((n, episodes, 40), bool))
+
+
+def by_world(push: float) -> explained.Explanation:
+    rng = np.random.default_rng(0)
+    expert, explored = (split(world(push, kind, 128, seed), 0.25, rng) for seed, kind in enumerate((True, False)))
+    return explained.by_world(expert, explored, 1, EXPLORING, CLONING, Draws([rng], "cpu"), Monitor())
+
+
+def test_world_that_tells() -> None:
+    """theta moves s by .2 either way, in noise of .1: 8 nats a step between opposite ones, and so are half of all pairs."""
+    found = by_world(0.2)
+    assert found.told == pytest.approx(4, rel=0.35)
+    head = found.model.dynamics
+    assert (torch.exp(head.log_std) * head.change.std).item() == pytest.approx(NOISE, rel=0.3)
+
+
+def test_world_that_says_nothing() -> None:
+    assert by_world(0.0).told == pytest.approx(0, abs=0.02)
+
+
+def test_theta_that_drifts() -> None:
+    """Latents are of episodes, and so twice as many per trial as there are trials, where that explains the expert."""
+    rng, amounts = np.random.default_rng(0), Amounts(exploring=EXPLORING, cloning=CLONING)
+    for drifts, each in ((True, 4), (False, 1)):
+        expert, explored = (
+            split(world(0.2, kind, 64, seed, 4, drifts), 0.25, rng) for seed, kind in enumerate((True, False))
+        )
+        found = findings._by_world(expert, explored, amounts, Draws([rng], "cpu"), lambda share: None)
+        assert found.latents.shape[1] == each * 48
