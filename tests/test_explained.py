@@ -43,7 +43,7 @@ def by_world(push: float) -> explained.Explanation:
 
 
 def test_world_that_tells() -> None:
-    """theta moves s by .2 either way, in noise of .1: 8 nats a step between opposite ones, and so are half of all pairs."""
+    """theta moves s by .2 either way, in noise of .1: 8 nats a step between opposite ones, as half of all pairs are."""
     found = by_world(0.2)
     assert found.told == pytest.approx(4, rel=0.35)
     head = found.model.dynamics
