@@ -67,8 +67,9 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     try:
         Trials.load(file, made_of)
     except envs.InputError:
-        wanderer = wander.fit(shown, settings.cloning, context.rngs)
-        joined([context.explore(agent, context.rngs) for agent in (None, wanderer)]).save(file, made_of)
+        rngs = context.rngs  # once: each exploration draws thetas of its own
+        wanderer = wander.fit(shown, settings.cloning, rngs)
+        joined([context.explore(agent, rngs) for agent in (None, wanderer)]).save(file, made_of)
     return folder / f"demonstrations-{SEED}.npz", file
 
 
@@ -150,7 +151,7 @@ def main() -> None:
         print(f"{task.name}: {told.verdict}, {'right' if rows[-1]['right'] else 'WRONG'}")
     share = sum(row["right"] for row in rows) / len(rows)
     gaps = [[row[key] for row in rows] for key in ("predicted", "measured")]
-    rank = float(stats.spearmanr(*gaps).statistic) if len(rows) > 2 else 0.0
+    rank = float(stats.spearmanr(*gaps).statistic) if min(len(set(some)) for some in gaps) > 1 else 0.0
     kept = args.out if args.tasks else DOCS / "diagnose"
     kept.mkdir(exist_ok=True)
     about = {"machine": identity.machine("cpu"), "versions": identity.versions()}

@@ -1,4 +1,4 @@
-"""Is this data confounded? From an expert's trials alone: no theta, no simulator, no name of a task.
+"""Is this data confounded? From an expert's trials and some exploration: no theta, no simulator, no name of a task.
 
 `findings.measure` takes the figures, on several splits of the trials; here they are judged.
 """
@@ -11,14 +11,18 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from deconfounded.deconf.data import Batch
+from deconfounded.deconf.explained import near
 from deconfounded.deconf.findings import Amounts, Findings, measure
 from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Trials
 
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.03, 0.01  # nats a step: of memory, of the world
+WORSE = 0.2  # nats a step by which a clone may be worse for its memory
 FINE, GAP = 0.8, 0.15  # scores
-STAKES, LIKE = 1.5, 2.0  # how strange: the ways of who is mistaken, at least; dreams that can be believed, at most
+STAKES, STRAYED = 1.5, 3.0  # times chance
+LIKE = 2.0  # how strange dreams may be, among what happened, and be believed of what does not show
 
 
 class Next(NamedTuple):
@@ -41,7 +45,8 @@ ASK = Next(
     "dagger.fit(query, dagger.DaggerConfig(), np.random.default_rng(0))",
 )
 TRY = Next(
-    "Explore a little, with random actions, and diagnose again; or try Tier 1, Algorithm 3, which needs no more.",
+    "Explore a little, with a clone without memory that tries things (deconf/wander.py), and diagnose again; or try"
+    " Tier 1, Algorithm 3, which needs no more.",
     "offline.fit(trials, offline.OfflineConfig(), np.random.default_rng(0))",
 )
 VARY = Next("Record trials under other circumstances too, and diagnose again.")
@@ -132,6 +137,8 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
         trials.actions,
     ):
         raise InputError("exploration has other observations or actions than the expert's trials; both must be alike")
+    if explore is not None:
+        near(Batch.of(trials, 1), Batch.of(explore, 1))
 
 
 def judge(refits: Sequence[Findings]) -> Diagnosis:
@@ -141,13 +148,17 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         if values := [value for value in each if value is not None]:
             found[key] = Figure.of(values)
     gap = found["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
-    memory, stakes, unlike, naive, latent = (found[key] for key in ("memory", "stakes", "unlike", "naive", "latent"))
+    memory, stakes, strayed, unlike = (found[key] for key in ("memory", "stakes", "strayed", "unlike"))
+    naive, latent = found["naive"], found["latent"]
     explored = found.get("explored")
     said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]
 
     def told(verdict: Verdict, tier: int | None, why: str, then: Next) -> Diagnosis:
         return Diagnosis(verdict, found, (*said, why), tier, then)
 
+    if memory.low < -WORSE:
+        why = "With memory it was cloned the worse: the recurrent clone did not fit, and that says nothing."
+        return told("cannot tell", None, why, MORE)
     if memory.low <= LITTLE:
         if memory.high > LITTLE:
             return told("cannot tell", None, "That may be nothing, or something: more trials would settle it.", MORE)
@@ -160,10 +171,10 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         )
         return told("cannot tell", None, why, VARY)
     said.append(
-        "The expert acts on something that trials differ in. Among the ways of those who know it, the ways of one who"
-        f" mistakes it are {stakes} times as strange as their own, in the learned dynamics; there a naive clone scores"
-        f" {naive}, one that infers the latent from the world {latent}: 1 comes about like those who know it, 0 nowhere"
-        " near."
+        "The expert acts on something that the present observation does not show. In the learned dynamics, one who"
+        f" mistakes it goes ways {stakes} times as strange as the ways of those who know it, and {strayed} times as far"
+        f" from that one's own as chance does. A naive clone scores {naive} there, one that infers the latent from the"
+        f" world {latent}: 1 comes about like those who know it, 0 nowhere near."
     )
     if explored is None:
         why = (
@@ -172,23 +183,25 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         )
         return told("cannot tell", None, why, TRY)
     said.append(f"In exploration the world tells it by {explored} nats a step.")
-    if explored.high < SILENT:
-        why = (
-            "That is nothing, and expert trials say nothing either: where the expert goes depends on it. Ask what"
-            " the expert would do where the clone goes; if the world tells it nowhere, only a sensor helps."
-        )
-        return told("confounded", 3, why, ASK)
-    if stakes.high < STAKES and unlike.high < LIKE:
-        why = "Strangeness is chance: who mistakes it comes about like the others, and so will a clone."
+    if explored.low <= SILENT:
+        if explored.low > -SILENT and explored.high < SILENT:
+            why = (
+                "That is nothing: where this exploration went, the world is silent. Ask what the expert would do where"
+                " the clone goes; if the world tells it nowhere, only a sensor helps."
+            )
+            return told("confounded", 3, why, ASK)
+        return told("cannot tell", None, "That may be nothing, or something: more exploration would settle it.", WIDER)
+    if stakes.high < STAKES and strayed.high < STRAYED and unlike.high < LIKE:
+        why = "Who mistakes it comes about like the others, and so will a clone."
         return told("not confounded", 1, why, CLONE)
     if stakes.low < STAKES:
         why = (
-            "Strangeness may be chance: either it hardly matters, or the dynamics are not known well enough where it"
-            f" does (of ways in the learned ones, seen among those of the data, the same figure is {unlike})."
+            "The ways may be strange by chance: either it hardly matters, or the dynamics are not known well enough"
+            f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"
         )
         return told("cannot tell", None, why, WIDER)
     if naive.low > FINE and gap.high < GAP:
         return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
-    if gap.low <= 0:
-        return told("cannot tell", None, "The scores overlap: more trials, or exploration, would settle it.", MORE)
+    if gap.low <= 0 or gap.high < GAP:
+        return told("cannot tell", None, "The scores hardly differ; more of both would settle it.", MORE)
     return told("confounded", 2, "A clone would take its own actions for evidence; the world gives better.", EXPLORE)

@@ -106,7 +106,7 @@ def known_range(held: Batch) -> tuple[Tensor, Tensor]:
     padding = held.mask[..., None] == 0
     low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
     high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
-    margin = 0.5 * (high - low)
+    margin = (0.5 * (high - low)).clamp(min=1e-3)
     return low - margin, high + margin
 
 

@@ -11,21 +11,25 @@ from torch import Tensor
 from deconfounded.deconf import offline
 from deconfounded.deconf.agents import Monitor, ramp
 from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Batch, Draws, Signature, take_steps
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig, final_belief
 from deconfounded.deconf.dream import known_range
-from deconfounded.deconf.equations import imitation_loss, masked_mean
+from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.offline import OfflineConfig
+from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Trials
+
+LEAST = 0.02  # share of exploring steps that are where the expert goes
 
 
 class Explanation(NamedTuple):
     """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
 
-    actions: log-likelihood of the expert's held-out actions given latents, nats a step. told: how much more likely a
-    trial's own latent makes what held-out exploration met than another trial's does. None without exploration.
+    actions: log-likelihood of half of the expert's held-out actions, given latents of the other half, nats a step.
+    told: how much more likely a trial's own latent makes what held-out exploration met than another trial's does; the
+    latent is of half of the steps, what was met of the others. None without exploration.
     """
 
     model: VariationalModel
@@ -55,16 +59,21 @@ def by_world(
 
     Not on expert trials: these hold nearly one action for each observation and latent, so that what an action does and
     what the latent does cannot be told apart. (On `swapped_lander`, of both, it learned that the engine does nothing.)
-    each: how many trials, side by side, may be of one theta.
+    each: how many explored trials, side by side, are of one theta. Raises InputError if exploration hardly comes to
+    where the expert goes.
     """
     shown, held, tried, rest = (Batch.of(some, 1) for some in (*expert, *explored))
-    tried, rest = (_near(shown, some) for some in (tried, rest))
+    tried, rest = (near(shown, some) for some in (tried, rest))
     model = _dynamics(tried, Signature.of(expert[0]), exploring, draws, monitor)
+    _refit_noise(model, tried, draws)
+    told = _told(model, rest, each, draws)
     _refit_noise(model, shown, draws)
     policy = _conditional(model, shown, cloning, draws)
     with torch.no_grad():
-        actions = mean(policy.log_prob(_features(model, held, draws), held.action), held)
-    return Explanation(model, policy, _inferred(model, shown, draws), actions, _told(model, rest, each, draws))
+        latents, odd = _halved(model, held, draws)
+        inputs = torch.cat([model.inputs.obs(odd.obs), _along(odd, latents)], -1)
+        actions = mean(policy.log_prob(inputs, odd.action), odd)
+    return Explanation(model, policy, _inferred(model, shown, draws), actions, told)
 
 
 def mean(x: Tensor, batch: Batch) -> float:
@@ -74,12 +83,13 @@ def mean(x: Tensor, batch: Batch) -> float:
 
 def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
     """A latent [1, B, D] for each trial."""
-    return model.sample(model.belief(model.last(batch)), draws)
+    return model.sample(final_belief(model, batch), draws)
 
 
-def _features(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
-    """What a latent-conditional policy reads at each step: observation and the trial's latent, [1, B, T, O + D]."""
-    return torch.cat([model.inputs.obs(batch.obs), _along(batch, _inferred(model, batch, draws))], -1)
+def _halved(model: VariationalModel, batch: Batch, draws: Draws) -> tuple[Tensor, Batch]:
+    """A latent [1, B, D] for each trial, inferred from its even steps, and the odd ones."""
+    even = torch.arange(batch.mask.shape[2]) % 2 == 0
+    return _inferred(model, replace(batch, mask=batch.mask * even), draws), replace(batch, mask=batch.mask * ~even)
 
 
 def _along(batch: Batch, latents: Tensor) -> Tensor:
@@ -101,16 +111,22 @@ def _dynamics(
     return model
 
 
-def _near(data: Batch, explored: Batch) -> Batch:
-    """Exploration without its steps from outside of the range in which dynamics are to hold."""
+def near(data: Batch, explored: Batch) -> Batch:
+    """Explored trials without their steps from outside of the range in which dynamics are to hold."""
     low, high = known_range(data)
-    near = ((explored.obs >= low[:, None]) & (explored.obs <= high[:, None])).all(-1)
-    return replace(explored, mask=explored.mask * near)
+    inside = ((explored.obs >= low[:, None]) & (explored.obs <= high[:, None])).all(-1) * explored.mask
+    some = inside[0].sum(-1) > 0
+    if (share := float(inside.sum() / explored.mask.sum())) < LEAST or some.sum() < 2:
+        raise InputError(
+            f"exploration was where the expert goes for {share:.1%} of its steps; {LEAST:.0%} are needed, in several"
+            " trials: explore by a behaviour that stays nearer"
+        )
+    return replace(explored, mask=inside)[:, some.nonzero()[:, 0]]
 
 
 @torch.no_grad()
 def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
-    """Noise of the size it has where experts go: falls, and what else is seldom there, would swell it."""
+    """Noise of the size it has in these trials: what is learned last, and falls and the like swell it."""
     head, latents = model.dynamics, _along(data, _inferred(model, data, draws))
     if not model.inputs.signature.binary:
         off = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
@@ -121,10 +137,9 @@ def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
 @torch.no_grad()
 def _told(model: VariationalModel, rest: Batch, each: int, draws: Draws) -> float:
     """How much likelier a trial's latent, of its even steps, makes its odd ones than that of the trial `each` on."""
-    even = torch.arange(rest.mask.shape[2]) % 2 == 0
-    own, odd = _inferred(model, replace(rest, mask=rest.mask * even), draws), replace(rest, mask=rest.mask * ~even)
+    own, odd = _halved(model, rest, draws)
     true, other = (
-        model.dynamics.log_prob(rest.obs, rest.action, rest.next_obs, _along(rest, latent))[..., 0]
+        model.dynamics.log_prob(odd.obs, odd.action, odd.next_obs, _along(odd, latent))[..., 0]
         for latent in (own, own.roll(each, 1))
     )
     return mean(true - other, odd)
@@ -132,12 +147,9 @@ def _told(model: VariationalModel, rest: Batch, each: int, draws: Draws) -> floa
 
 def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
     """A policy, cloned given the latents that a model infers from the trials."""
-    with torch.no_grad():
-        features = _features(model, data, draws)
-    policy = ActionHead(features.shape[-1], how.width, model.inputs.signature, draws)
+    policy = ActionHead(model.inputs.obs_width + model.latent, how.width, model.inputs.signature, draws)
+    agent, belief = DeconfoundedAgent(model, policy), final_belief(model, data)
     optimizer = Adam([policy], how.learning_rate, how.updates)
     for _ in range(how.updates):
-        index = data.draw_steps(how.batch, draws)
-        log_policy = policy.log_prob(take_steps(features, index), take_steps(data.action, index))
-        optimizer.step(imitation_loss(log_policy, torch.ones_like(log_policy)))
+        optimizer.step(agent.loss(data, belief, how.batch, draws))
     return policy

@@ -26,9 +26,11 @@ from deconfounded.deconf.dream import Clone, Expert, Filter, World
 from deconfounded.deconf.drift import apart
 from deconfounded.deconf.explained import Explanation, mean
 from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.paths import familiar, strange, ways
+from deconfounded.deconf.paths import familiar, oddest, strange, strayed, ways
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.experts.demos import Agent, Trials
+
+CLEARLY = 0.1  # nats a step
 
 
 @dataclass(frozen=True)
@@ -54,19 +56,22 @@ class Findings(NamedTuple):
 
     memory: what memory adds to predicting the expert's action over the present observation. explained: what a latent
     adds that explains the world's answers, and nothing else. explored: how much more likely an episode's own latent
-    makes the world's answers in exploration than another trial's does. stakes: how strange the ways of one are who
-    holds another latent for true, among those of experts who know theirs, in what shows it most; 1: not at all. unlike:
-    how strange these are in turn, in the learned dynamics, among those of the data, on the whole. naive, latent:
-    predicted scores in the last episode, of a naive clone and of one that infers the latent from the world: 1 comes
-    about like the experts who know it, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges their
-    actions, Eq. (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without exploration,
-    explained and explored are None, and the latent is one that explains actions too, Eq. (7).
+    makes the world's answers in exploration than another trial's does. The others are seen in the last episode of
+    trials in the learned dynamics. stakes: how strange the ways of one are who holds another latent for true, among
+    those of experts who know theirs, in what shows it most, over the same by chance. strayed: how far they are from
+    those of the expert who knows that latent, from the same start, over the same by chance. unlike: how strange these
+    are in turn, among those of the data, on the whole. naive, latent: scores of a naive clone and of one that infers
+    the latent from the world, the logarithm of their strangeness: 1 comes about like the experts who know, 0 nowhere
+    near. naive_judged, latent_judged: the same as the expert judges their actions, Eq. (1): 0 is an expert who holds
+    another latent for true, 1 the one who knows it. Without exploration, explained and explored are None, and the
+    latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
     explored: float | None
     explained: float | None
     stakes: float
+    strayed: float
     unlike: float
     naive: float
     latent: float
@@ -121,13 +126,22 @@ def measure(
             Clone(recurrent),
             Filter(found.model, found.policy, rivals),
         )
-        (one, home), (zero, away), *others = (dreamt.visit(actor, rngs) for actor in actors)
-        judged = [float(1 - (off - one) / (zero - one).clamp(min=1e-3)) for off, _ in others]
-        naive, latent = (familiar(_oddest(path, home)) for _, path in others)
-        unlike = float(strange(home[0], ways(episodes)).mean())
+        (one, home), (zero, away), *others, (_, again) = (dreamt.visit(actor, rngs) for actor in (*actors, knower))
+        judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off, _ in others]
+
+        def odd(path: Tensor) -> float:
+            """Among the ways of those who know, over what chance is among as many others of them."""
+            half = amounts.dreams // 2
+            usual, chance = home[0, :half], strange(home[0, half:], home[0, :half], again[0, half:])
+            return oddest(strange(path[0, half:], usual, again[0, half:]), chance)
+
+        naive, latent = (familiar(odd(path)) for _, path in others)
+        went = ways(episodes)[torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))]
+        unlike = float(strange(home[0], *went.tensor_split(2)).mean())
+        far = oddest(*(strayed(path[0], home[0], again[0]) for path in (away, again)))
     tell(1)
     world = None if found.actions is None else found.actions - present
-    return Findings(memory, found.told, world, _oddest(away, home), unlike, naive, latent, *judged)
+    return Findings(memory, found.told, world, odd(away), far, unlike, naive, latent, *judged)
 
 
 def _by_world(
@@ -137,21 +151,22 @@ def _by_world(
     draws: Draws,
     tell: Callable[[float], None],
 ) -> Explanation:
-    """Of a latent that stays for a trial, or for an episode alone, whichever explains the expert's actions better.
+    """Of a latent that stays for a trial; or for an episode alone, if that explains the expert clearly better.
 
     What the world tells of it is what it tells of either: an episode alone can tell too little of what stays.
     """
-    each, found = expert[0].mask.shape[1], list[Explanation]()
+    each, found = explored[0].mask.shape[1], list[Explanation]()
     how, batch = amounts.exploring, amounts.exploring.inference_batch
     units = [(expert, explored, 1, how)]
-    if each > 1:
+    if each > 1 or expert[0].mask.shape[1] > 1:
         longer = replace(how, inference_batch=batch and each * batch)  # as much evidence as of trials that are whole
         units.append(((apart(expert[0]), apart(expert[1])), (apart(explored[0]), apart(explored[1])), each, longer))
     for i, (shown, tried, at_once, how) in enumerate(units):
         part = Part(tell, 0.25 + 0.55 * i / len(units), 0.25 + 0.55 * (i + 1) / len(units))
         found.append(explained.by_world(shown, tried, at_once, how, amounts.cloning, draws, part))
     told = max(one.told or 0.0 for one in found)
-    return max(found, key=lambda one: one.actions or 0.0)._replace(told=told)
+    best = found[-1] if (found[-1].actions or 0.0) > (found[0].actions or 0.0) + CLEARLY else found[0]
+    return best._replace(told=told)
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
@@ -162,8 +177,3 @@ def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trial
         for index in (order[count:], order[:count])
     )
     return shown, held
-
-
-def _oddest(path: Tensor, home: Tensor) -> float:
-    """How strange observations [1, N, T, O] are among those of who knows the latent, in what shows it most."""
-    return float(strange(path[0], home[0]).max())

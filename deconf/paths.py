@@ -10,7 +10,7 @@ from torch import Tensor
 from deconfounded.deconf.data import Batch
 
 PARTS = 6  # of an episode
-FAR = 9.0  # in squares of what is usual: as strange as it gets
+FAR = 9.0  # in squares of what is usual: further off is no stranger
 
 
 def ways(episodes: Batch) -> Tensor:
@@ -20,24 +20,40 @@ def ways(episodes: Batch) -> Tensor:
     return path.gather(1, index[..., None].expand_as(path))
 
 
-def strange(paths: Tensor, usual: Tensor) -> Tensor:
-    """How far paths [N, T, O] are from usual ones [M, T, O]: [F, O], 1 if they are alike.
+def strange(paths: Tensor, usual: Tensor, again: Tensor) -> Tensor:
+    """How far paths [N, T, O] are from usual ones [M, T, O], whichever: [F, O], 1 if no further than others of these.
 
-    F figures of each coordinate: its mean over each of six parts of the episode, over all of it, and its mean square.
-    From the median of the usual ones, in squares of their median distance from it (as of a normal distribution's std),
-    of which more than 9 is 9; over the same for the other half of the usual ones.
+    again: others of the usual kind. F figures of each coordinate: its mean over each of six parts of the episode, over
+    all of it, and its mean square. From the median of the usual ones, in squares of their median distance from it (as
+    of a normal distribution's std), of which more than 9 is 9.
     """
-    known, rest = _figures(usual[::2]), _figures(usual[1::2])
+    known = _figures(usual)
     centre = known.median(0).values
-    least = (0.01 * (known.amax(0) - known.amin(0))).clamp(min=1e-6)
-    unit = torch.maximum(1.48 * (known - centre).abs().median(0).values, least)
-    far, near = (((some - centre) / unit).square().clamp(max=FAR).mean(0) for some in (_figures(paths), rest))
-    return far / near.clamp(min=0.5)
+    return _ratio(known, _figures(paths) - centre, _figures(again) - centre, known - centre)
+
+
+def strayed(paths: Tensor, home: Tensor, again: Tensor) -> Tensor:
+    """How far paths [N, T, O] are from home, each from its own, over how far those of a second visit are: [F, O]."""
+    known = _figures(home)
+    return _ratio(known, _figures(paths) - known, _figures(again) - known, _figures(again) - known)
+
+
+def oddest(strangeness: Tensor, chance: Tensor) -> float:
+    """In what shows it most, over the same by chance."""
+    return float(strangeness.max() / chance.max().clamp(min=1))
 
 
 def familiar(strangeness: float) -> float:
     """As a score: 1 if alike, falling with the logarithm, to 0 where nothing is as usual."""
-    return float(min(1, max(0, 1 - math.log(strangeness) / math.log(FAR))))
+    return min(1.0, max(0.0, 1 - math.log(max(1.0, strangeness)) / math.log(FAR)))
+
+
+def _ratio(known: Tensor, off: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
+    """Mean squares of two kinds of distances [N, F, O], in units of the usual ones; of what hardly varies, 1% of it."""
+    least = (0.01 * (known.amax(0) - known.amin(0))).clamp(min=1e-6)
+    unit = torch.maximum(1.48 * usual.abs().median(0).values, least)
+    far, near = ((some / unit).square().clamp(max=FAR).mean(0) for some in (off, by_chance))
+    return far / near.clamp(min=0.5)
 
 
 def _figures(path: Tensor) -> Tensor:

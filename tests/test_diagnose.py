@@ -74,6 +74,12 @@ class TestBadInput:
         with pytest.raises(InputError, match="5 trials of exploration given"):
             diagnose.check(trials(), trials(5), DiagnoseConfig())
 
+    def test_exploration_elsewhere(self) -> None:
+        some, other = trials(), trials(seed=1)
+        away = Trials(other.obs + 99, other.action, other.mask)
+        with pytest.raises(InputError, match="where the expert goes for"):
+            diagnose.check(some, away, DiagnoseConfig())
+
     def test_command(self, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
         """One line and exit code 2: no file, no trials in it, too few."""
         trials(5).save(tmp_path / "few.npz")
@@ -93,6 +99,7 @@ CLEAR = Findings(
     explored=0.2,
     explained=0.5,
     stakes=3.0,
+    strayed=9.0,
     unlike=3.0,
     naive=0.2,
     latent=0.9,
@@ -112,7 +119,12 @@ class TestJudge:
             ({"explored": None, "explained": None, "stakes": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
             ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
             ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
-            ({"stakes": 1.1, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
+            ({"stakes": 1.1, "unlike": 1.2}, "cannot tell", None, diagnose.WIDER),
+            ({"stakes": 1.1, "strayed": 1.4}, "cannot tell", None, diagnose.WIDER),
+            ({"stakes": 1.1, "strayed": 1.4, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
+            ({"explored": -0.5}, "cannot tell", None, diagnose.WIDER),
+            ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
+            ({"naive": 0.7, "latent": 0.75}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
@@ -129,7 +141,8 @@ class TestJudge:
         assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
-        alike = CLEAR._replace(unlike=1.2)
+        assert diagnose.judge([CLEAR, CLEAR._replace(explored=-0.002)]).verdict == "cannot tell"
+        alike = CLEAR._replace(unlike=1.2, strayed=1.4)
         assert diagnose.judge([alike, alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deconfounded.deconf.data import Batch
-from deconfounded.deconf.paths import FAR, familiar, strange, ways
+from deconfounded.deconf.paths import FAR, familiar, oddest, strange, strayed, ways
 from deconfounded.experts.demos import Trials
 
 
@@ -17,23 +17,31 @@ def walks(n: int, seed: int) -> torch.Tensor:
 
 
 def test_like_among_like() -> None:
-    """The mean over figures is 1, to .15: of 400 paths a side."""
-    assert float(strange(walks(400, 0), walks(400, 1)).mean()) == pytest.approx(1, abs=0.15)
+    """1 on average, to .15; the oddest of 16 figures is no odder than chance, to .35: of 400 paths a side."""
+    found = strange(walks(400, 0), walks(400, 1), walks(400, 2))
+    assert float(found.mean()) == pytest.approx(1, abs=0.15)
+    assert oddest(found, strange(walks(400, 3), walks(400, 1), walks(400, 2))) == pytest.approx(1, abs=0.35)
 
 
 def test_what_is_off_shows() -> None:
     off = walks(400, 0) + torch.tensor([0.0, 20.0])
-    here, there = strange(off, walks(400, 1)).T
+    here, there = strange(off, walks(400, 1), walks(400, 2)).T
     assert float(here.max()) < 1.5
     assert float(there.min()) > 3
 
 
-def test_never_stranger_than_can_be() -> None:
-    assert float(strange(walks(50, 0) + 1e9, walks(50, 1)).max()) <= 2 * FAR
+def test_of_each_its_own() -> None:
+    """Paths to as many places, mixed up, are no stranger than others; but each is far from its own."""
+    goals = torch.linspace(-1, 1, 200)[:, None, None] * torch.linspace(0, 1, 24)[:, None]
+    home, again, mixed = (goals + 0.01 * walks(200, seed)[..., :1] for seed in range(3))
+    mixed = mixed[torch.randperm(200, generator=torch.Generator().manual_seed(0))]
+    assert float(strange(mixed, home, again).max()) == pytest.approx(1, abs=0.1)
+    assert float(strayed(mixed, home, again).max()) > 5
+    assert float(strayed(again, home, again).max()) == pytest.approx(1)
 
 
 def test_as_score() -> None:
-    assert [familiar(s) for s in (0.5, 1.0, FAR**0.5, FAR, 2 * FAR)] == pytest.approx([1, 1, 0.5, 0, 0])
+    assert [familiar(s) for s in (0.0, 1.0, FAR**0.5, FAR, 2 * FAR)] == pytest.approx([1, 1, 0.5, 0, 0])
 
 
 def test_ways() -> None:

@@ -70,8 +70,8 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         world = figure["explained"]
         predictors["the world's answers"] = (world, colour("interventional"))
         whence = (
-            f"What the world answered tells {world} of it, as far as exploration taught to read it; the rest is read"
-            " off the expert's own past actions, and those tell a clone that acts by itself nothing new."
+            f"A latent that is read off the world's answers alone tells {world} of it; what is left is read off the"
+            " expert's own past actions, and those tell a clone that acts by itself nothing new."
         )
     sections: list[tuple[str, str, Callable[[Axes], None]]] = [
         (
@@ -99,10 +99,10 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
     sections.append(
         (
             "What will it cost?",
-            f"The ways of an expert who acts on another latent are {stakes} times as strange as usual; below {STAKES}"
-            f" it hardly matters. In the learned dynamics a naive clone scores {naive}, and one that infers the latent"
-            f" from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near. (As the expert"
-            f" would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 0 is one who acts on another.)",
+            f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange as"
+            f" usual; below {STAKES} that may be chance. There a naive clone scores {naive}, and one that infers the"
+            f" latent from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near. (As the"
+            f" expert would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 0 acts on another.)",
             lambda axes: _bars(axes, actors, "predicted score, last episode", FINE),
         )
     )
