@@ -55,7 +55,7 @@ def test_world_that_says_nothing() -> None:
 
 
 def test_theta_that_drifts() -> None:
-    """Each episode of the 48 trials that are learned from has a latent of its own; of whole trials the world is mute."""
+    """Each episode of the 48 trials that are learned from has a latent of its own; whole trials would show nothing."""
     rng, amounts = np.random.default_rng(0), Amounts(exploring=EXPLORING, cloning=CLONING)
     expert, explored = (
         split(world(0.2, kind, 64, seed, 4, drifts=True), 0.25, rng) for seed, kind in enumerate((True, False))

@@ -43,7 +43,7 @@ class TestIdentity:
             ("deconf/naive_rnn.py", {"naive_rnn"}),
             ("deconf/dagger.py", {"dagger"}),
             ("deconf/exact.py", {"conditional", "interventional"}),
-            ("deconf/recurrent.py", {"naive_rnn", "dagger", "naive_obs", "naive_dropout", "naive_transformer", "palr"}),
+            ("deconf/recurrent.py", {"naive_rnn", "naive_obs", "naive_dropout", "naive_transformer", "palr"}),
             ("envs/tasks/icy_road.py", set()),
             ("envs/tasks/slippery_cartpole.py", set(METHODS)),
             ("envs/render.py", set()),

@@ -109,5 +109,5 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
 
 def test_tier_3_works_at_the_fork() -> None:
     """forked_path: who is told what the expert would do at the bump learns to go where its push points."""
-    agent = trained("forked_path", "dagger", dagger=DaggerConfig(updates=6000))
+    agent = trained("forked_path", "dagger", dagger=DaggerConfig())
     assert scores(envs.BatchEnv(envs.get("forked_path"), N), agent)[-1] > 0.7

@@ -79,7 +79,7 @@ _CONTROL = Preset(
     ),
     offline=OfflineConfig(),
     naive=RecurrentConfig(),
-    dagger=DaggerConfig(updates=4500, learning_rate=2e-3),
+    dagger=DaggerConfig(),
     cloning=CloningConfig(),
     mean=MeanConfig(),
     gail=GailConfig(),
@@ -124,7 +124,7 @@ _BANDIT = Preset(
         learning_rate=3e-3,
     ),
     naive=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    dagger=DaggerConfig(updates=500, batch=128, chunk=50, learning_rate=1e-2),
+    dagger=DaggerConfig(batch=64, shortest=1.0, updates=1000),
     cloning=CloningConfig(updates=500),
     mean=MeanConfig(
         latent=5,
@@ -222,7 +222,7 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
             told[part] |= {"latent": SPACIOUS}
         updates = round(LONGER * amounts.deconfounded.inference_updates)
         told["deconfounded"] |= {"inference_updates": updates, "inference_rate": GENTLE}
-    for part in ("deconfounded", "discrete", "offline"):
+    for part in ("deconfounded", "discrete", "offline", "dagger"):
         told[part] |= {"drifts": task.drifts}
     return replace(amounts, **{part: replace(getattr(amounts, part), **values) for part, values in told.items()})
 
