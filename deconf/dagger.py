@@ -100,6 +100,7 @@ class DaggerAgent(LearnedAgent):
     def remember(self, step: Batch) -> None:
         self._memory = self.memory.update(self._memory, step)
 
+    @torch.no_grad()
     def features(self) -> NDArray[np.float32]:
         return self.memory.posterior(self._memory)[0].flatten(0, 1).cpu().numpy()
 
