@@ -83,8 +83,8 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
 
-    Found is also the `gap`: what cloning is predicted to lose, in scores. tier: of the paper; None if it is not known,
-    or if none does.
+    Found is also the `gap`: what cloning is predicted to lose, in scores; and `gap_judged`, by Eq. (1). tier: of the
+    paper; None if it is not known, or if none does.
     """
 
     verdict: Verdict
@@ -148,6 +148,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         if values := [value for value in each if value is not None]:
             found[key] = Figure.of(values)
     gap = found["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
+    judged = found["gap_judged"] = Figure.of([refit.latent_judged - refit.naive_judged for refit in refits])
     memory, stakes, strayed, unlike = (found[key] for key in ("memory", "stakes", "strayed", "unlike"))
     naive, latent = found["naive"], found["latent"]
     explored = found.get("explored")
@@ -174,7 +175,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         "The expert acts on something that the present observation does not show. In the learned dynamics, one who"
         f" mistakes it goes ways {stakes} times as strange as the ways of those who know it, and {strayed} times as far"
         f" from that one's own as chance does. A naive clone scores {naive} there, one that infers the latent from the"
-        f" world {latent}: 1 comes about like those who know it, 0 nowhere near."
+        f" world {latent}: 1 comes about like those who know it, 0 nowhere near. By their actions, Eq. (1), it is"
+        f" {found['naive_judged']} and {found['latent_judged']}: 1 knows the latent, 0 acts on another one."
     )
     if explored is None:
         why = (
@@ -200,8 +202,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"
         )
         return told("cannot tell", None, why, WIDER)
-    if naive.low > FINE and gap.high < GAP:
+    if naive.low > FINE and max(gap.high, judged.high) < GAP:
         return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
-    if gap.low <= 0 or gap.high < GAP:
+    if max(gap.low, judged.low) <= 0 or max(gap.high, judged.high) < GAP:
         return told("cannot tell", None, "The scores hardly differ; more of both would settle it.", MORE)
     return told("confounded", 2, "A clone would take its own actions for evidence; the world gives better.", EXPLORE)

@@ -124,12 +124,13 @@ class TestJudge:
             ({"stakes": 1.1, "strayed": 1.4, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
             ({"explored": -0.5}, "cannot tell", None, diagnose.WIDER),
             ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
-            ({"naive": 0.7, "latent": 0.75}, "cannot tell", None, diagnose.MORE),
-            ({"naive": 0.95, "latent": 1.0}, "not confounded", 1, diagnose.CLONE),
+            ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE),
+            ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
+            ({"naive": 0.95, "latent": 1.0}, "confounded", 2, diagnose.EXPLORE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
             ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
             ({"memory": 0.001, "explored": None}, "cannot tell", None, diagnose.VARY),
-            ({"latent": 0.1}, "cannot tell", None, diagnose.MORE),
+            ({"latent": 0.1, "latent_judged": -0.2}, "cannot tell", None, diagnose.MORE),
         ],
     )
     def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: diagnose.Next) -> None:
@@ -139,7 +140,7 @@ class TestJudge:
     def test_refits_that_disagree(self) -> None:
         """No confident verdict where refits lie on both sides of what decides."""
         assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
-        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_judged=-0.2)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
         assert diagnose.judge([CLEAR, CLEAR._replace(explored=-0.002)]).verdict == "cannot tell"
         alike = CLEAR._replace(unlike=1.2, strayed=1.4)
@@ -199,7 +200,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     first = capsys.readouterr().out
     told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert told["verdict"].upper() in first
-    assert set(told["found"]) == {*Findings._fields, "gap"}
+    assert set(told["found"]) == {*Findings._fields, "gap", "gap_judged"}
     page = (tmp_path / "out" / "index.html").read_text()
     assert told["reasons"][0] in html.unescape(page)
     assert not re.search(r"(src|href)=\"(?!data:)", page)

@@ -91,19 +91,17 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
                 lambda axes: _bars(axes, {"exploration": (told, colour("interventional"))}, "nats a step", SILENT),
             )
         )
-    actors: Rows = {
-        "naive clone": (naive, colour("naive_rnn")),
-        "infers the latent": (latent, colour("deconfounded")),
-    }
-    judged = (figure["naive_judged"], figure["latent_judged"])
+    actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
+    scores: Rows = {who: (figure[key], colour(hue)) for who, key, hue in actors}
+    scores |= {f"{who}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for who, key, hue in actors}
     sections.append(
         (
             "What will it cost?",
             f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange as"
             f" usual; below {STAKES} that may be chance. There a naive clone scores {naive}, and one that infers the"
-            f" latent from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near. (As the"
-            f" expert would judge their actions by Eq. (1): {judged[0]} and {judged[1]}; 0 acts on another.)",
-            lambda axes: _bars(axes, actors, "predicted score, last episode", FINE),
+            f" latent from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near; by their"
+            " actions, Eq. (1), 1 knows the latent and 0 acts on another one.",
+            lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
         )
     )
     return sections
