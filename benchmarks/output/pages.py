@@ -163,8 +163,9 @@ def costs() -> str:
 
 def validation() -> str:
     """The table of docs/diagnose.md: what `validate.py` found where the truth is known."""
-    found = json.loads((DOCS / "diagnose" / "validation.json").read_text())
-    rows = []
+    if not (file := DOCS / "diagnose" / "validation.json").is_file():
+        return "It has not been run yet with today's code."
+    found, rows = json.loads(file.read_text()), []
     for row in found["rows"]:
         told = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
         figures = (row["found"][key]["value"] if key in row["found"] else None for key in VALIDATED)
@@ -175,7 +176,7 @@ def validation() -> str:
     rank, where = score.two_decimals(found["rank_correlation"]), f"{found['machine']}, {found['versions']['torch']}"
     text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
 measured gaps is {rank} ({where})."""
-    return f"{text}\n\n{markdown_table(head, rows)}"
+    return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
 
 
 def diagnose() -> str:
