@@ -184,15 +184,16 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             " latent: what an action does, and what the latent does, cannot be told apart there."
         )
         return told("cannot tell", None, why, TRY)
-    said.append(f"In exploration the world tells it by {explored} nats a step.")
-    if explored.low <= SILENT:
-        if explored.low > -SILENT and explored.high < SILENT:
+    shown = found["shown"]
+    said.append(f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went.")
+    if shown.low <= SILENT:
+        if shown.low > -SILENT and shown.high < SILENT:
             why = (
-                "That is nothing: where this exploration went, the world is silent. Ask what the expert would do where"
-                " the clone goes; if the world tells it nowhere, only a sensor helps."
+                "The latter is nothing, so that expert trials do not say which latent was theirs: no exploration helps."
+                " Ask what the expert would do where the clone goes; if the world tells it nowhere, only a sensor does."
             )
             return told("confounded", 3, why, ASK)
-        return told("cannot tell", None, "That may be nothing, or something: more exploration would settle it.", WIDER)
+        return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
     if stakes.high < STAKES and strayed.high < STRAYED and unlike.high < LIKE:
         why = "Who mistakes it comes about like the others, and so will a clone."
         return told("not confounded", 1, why, CLONE)

@@ -28,15 +28,16 @@ class Explanation(NamedTuple):
     """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
 
     actions: log-likelihood of half of the expert's held-out actions, given latents of the other half, nats a step.
-    told: how much more likely a trial's own latent makes what held-out exploration met than another trial's does; the
-    latent is of half of the steps, what was met of the others. None without exploration.
+    explored, shown: how much more likely half of what a held-out trial met is, given the latent of the other half, than
+    given another trial's: in exploration, and where the expert went. None without exploration.
     """
 
     model: VariationalModel
     policy: ActionHead
     latents: Tensor
     actions: float | None = None
-    told: float | None = None
+    explored: float | None = None
+    shown: float | None = None
 
 
 def alone(shown: Trials, how: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
@@ -59,21 +60,21 @@ def by_world(
 
     Not on expert trials: these hold nearly one action for each observation and latent, so that what an action does and
     what the latent does cannot be told apart. (On `swapped_lander`, of both, it learned that the engine does nothing.)
-    each: how many explored trials, side by side, are of one theta. Raises InputError if exploration hardly comes to
+    each: how many trials of either, side by side, may be of one theta. Raises InputError if exploration hardly comes to
     where the expert goes.
     """
     shown, held, tried, rest = (Batch.of(some, 1) for some in (*expert, *explored))
     tried, rest = (near(shown, some) for some in (tried, rest))
     model = _dynamics(tried, Signature.of(expert[0]), exploring, draws, monitor)
     _refit_noise(model, tried, draws)
-    told = _told(model, rest, each, draws)
+    met = _told(model, rest, each, draws)
     _refit_noise(model, shown, draws)
     policy = _conditional(model, shown, cloning, draws)
     with torch.no_grad():
         latents, odd = _halved(model, held, draws)
         inputs = torch.cat([model.inputs.obs(odd.obs), _along(odd, latents)], -1)
         actions = mean(policy.log_prob(inputs, odd.action), odd)
-    return Explanation(model, policy, _inferred(model, shown, draws), actions, told)
+    return Explanation(model, policy, _inferred(model, shown, draws), actions, met, _told(model, held, each, draws))
 
 
 def mean(x: Tensor, batch: Batch) -> float:

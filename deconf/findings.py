@@ -56,19 +56,20 @@ class Findings(NamedTuple):
 
     memory: what memory adds to predicting the expert's action over the present observation. explained: what a latent
     adds that explains the world's answers, and nothing else. explored: how much more likely an episode's own latent
-    makes the world's answers in exploration than another trial's does. The others are seen in the last episode of
-    trials in the learned dynamics. stakes: how strange the ways of one are who holds another latent for true, among
-    those of experts who know theirs, in what shows it most, over the same by chance. strayed: how far they are from
-    those of the expert who knows that latent, from the same start, over the same by chance. unlike: how strange these
-    are in turn, among those of the data, on the whole. naive, latent: scores of a naive clone and of one that infers
-    the latent from the world, the logarithm of their strangeness: 1 comes about like the experts who know, 0 nowhere
-    near. naive_judged, latent_judged: the same as the expert judges their actions, Eq. (1): 0 is an expert who holds
-    another latent for true, 1 the one who knows it. Without exploration, explained and explored are None, and the
-    latent is one that explains actions too, Eq. (7).
+    makes the world's answers in exploration than another trial's does; shown: in the expert's trials. The others are
+    seen in the last episode of trials in the learned dynamics. stakes: how strange the ways of one are who holds
+    another latent for true, among those of experts who know theirs, in what shows it most, over the same by chance.
+    strayed: how far they are from those of the expert who knows that latent, from the same start, over the same by
+    chance. unlike: how strange these are in turn, among those of the data, on the whole. naive, latent: scores of a
+    naive clone and of one that infers the latent from the world, the logarithm of their strangeness: 1 comes about like
+    the experts who know, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges their actions, Eq.
+    (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without exploration, explored, shown
+    and explained are None, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
     explored: float | None
+    shown: float | None
     explained: float | None
     stakes: float
     strayed: float
@@ -141,7 +142,7 @@ def measure(
         far = oddest(*(strayed(path[0], home[0], again[0]) for path in (away, again)))
     tell(1)
     world = None if found.actions is None else found.actions - present
-    return Findings(memory, found.told, world, odd(away), far, unlike, naive, latent, *judged)
+    return Findings(memory, found.explored, found.shown, world, odd(away), far, unlike, naive, latent, *judged)
 
 
 def _by_world(
@@ -155,18 +156,18 @@ def _by_world(
 
     What the world tells of it is what it tells of either: an episode alone can tell too little of what stays.
     """
-    each, found = explored[0].mask.shape[1], list[Explanation]()
+    each, found = max(some[0].mask.shape[1] for some in (expert, explored)), list[Explanation]()
     how, batch = amounts.exploring, amounts.exploring.inference_batch
     units = [(expert, explored, 1, how)]
-    if each > 1 or expert[0].mask.shape[1] > 1:
+    if each > 1:
         longer = replace(how, inference_batch=batch and each * batch)  # as much evidence as of trials that are whole
         units.append(((apart(expert[0]), apart(expert[1])), (apart(explored[0]), apart(explored[1])), each, longer))
     for i, (shown, tried, at_once, how) in enumerate(units):
         part = Part(tell, 0.25 + 0.55 * i / len(units), 0.25 + 0.55 * (i + 1) / len(units))
         found.append(explained.by_world(shown, tried, at_once, how, amounts.cloning, draws, part))
-    told = max(one.told or 0.0 for one in found)
+    met, where = (max(key(one) or 0.0 for one in found) for key in (lambda x: x.explored, lambda x: x.shown))
     best = found[-1] if (found[-1].actions or 0.0) > (found[0].actions or 0.0) + CLEARLY else found[0]
-    return best._replace(told=told)
+    return best._replace(explored=met, shown=where)
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:

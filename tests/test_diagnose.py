@@ -97,6 +97,7 @@ class TestBadInput:
 CLEAR = Findings(
     memory=1.0,
     explored=0.2,
+    shown=0.1,
     explained=0.5,
     stakes=3.0,
     strayed=9.0,
@@ -107,6 +108,8 @@ CLEAR = Findings(
     latent_judged=0.8,
 )
 
+ALONE = {"explored": None, "shown": None, "explained": None}
+
 
 class TestJudge:
     """Each way through `judge`, by figures that lead there."""
@@ -115,14 +118,14 @@ class TestJudge:
         ("changes", "verdict", "tier", "then"),
         [
             ({}, "confounded", 2, diagnose.EXPLORE),
-            ({"explored": None, "explained": None}, "cannot tell", None, diagnose.TRY),
-            ({"explored": None, "explained": None, "stakes": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
-            ({"explored": -0.002}, "confounded", 3, diagnose.ASK),
+            (ALONE, "cannot tell", None, diagnose.TRY),
+            ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
+            ({"shown": -0.002}, "confounded", 3, diagnose.ASK),
             ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
             ({"stakes": 1.1, "unlike": 1.2}, "cannot tell", None, diagnose.WIDER),
             ({"stakes": 1.1, "strayed": 1.4}, "cannot tell", None, diagnose.WIDER),
             ({"stakes": 1.1, "strayed": 1.4, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
-            ({"explored": -0.5}, "cannot tell", None, diagnose.WIDER),
+            ({"shown": -0.5}, "cannot tell", None, diagnose.WIDER),
             ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
@@ -142,14 +145,14 @@ class TestJudge:
         assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_judged=-0.2)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
-        assert diagnose.judge([CLEAR, CLEAR._replace(explored=-0.002)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(shown=-0.002)]).verdict == "cannot tell"
         alike = CLEAR._replace(unlike=1.2, strayed=1.4)
         assert diagnose.judge([alike, alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:
         found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
         assert found == pytest.approx((0.3, 0.2, 0.4))
-        assert "explored" not in diagnose.judge([CLEAR._replace(explored=None, explained=None)]).found
+        assert "explored" not in diagnose.judge([CLEAR._replace(explored=None, shown=None, explained=None)]).found
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
@@ -167,7 +170,7 @@ def test_measures(make) -> None:
     assert once == again
     assert np.isfinite(once).all()
     alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
-    assert (alone.explored, alone.explained) == (None, None)
+    assert (alone.explored, alone.shown, alone.explained) == (None, None, None)
     assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
 

@@ -11,6 +11,7 @@ from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Draws
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.diagnose import SILENT
 from deconfounded.deconf.findings import Amounts, split
 from deconfounded.experts.demos import Trials
 
@@ -45,13 +46,16 @@ def by_world(push: float) -> explained.Explanation:
 def test_world_that_tells() -> None:
     """theta moves s by .2 either way, in noise of .1: 8 nats a step between opposite ones, as half of all pairs are."""
     found = by_world(0.2)
-    assert found.told == pytest.approx(4, rel=0.35)
+    assert found.explored == pytest.approx(4, rel=0.35)
+    assert found.shown == pytest.approx(4, rel=0.35)
     head = found.model.dynamics
     assert (torch.exp(head.log_std) * head.change.std).item() == pytest.approx(NOISE, rel=0.3)
 
 
 def test_world_that_says_nothing() -> None:
-    assert by_world(0.0).told == pytest.approx(0, abs=0.02)
+    found = by_world(0.0)
+    assert found.explored == pytest.approx(0, abs=SILENT)
+    assert found.shown == pytest.approx(0, abs=SILENT)
 
 
 def test_theta_that_drifts() -> None:
@@ -62,4 +66,4 @@ def test_theta_that_drifts() -> None:
     )
     found = findings._by_world(expert, explored, amounts, Draws([rng], "cpu"), lambda share: None)
     assert found.latents.shape[1] == 4 * 48
-    assert found.told == pytest.approx(4, rel=0.35)
+    assert found.explored == pytest.approx(4, rel=0.35)

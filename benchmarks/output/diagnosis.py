@@ -82,13 +82,18 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         ),
     ]
     if "explored" in figure:
-        told = figure["explored"]
+        met, shown = figure["explored"], figure["shown"]
+        told: Rows = {
+            "in exploration": (met, colour("interventional")),
+            "where the expert went": (shown, colour("expert")),
+        }
         sections.append(
             (
                 "Does the world tell it?",
-                f"In exploration, whose actions are blind to it, a trial's own latent makes the world's answers {told}"
-                f" nats a step more likely than another trial's. Below {SILENT} the world is silent there.",
-                lambda axes: _bars(axes, {"exploration": (told, colour("interventional"))}, "nats a step", SILENT),
+                f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
+                f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
+                f" below {SILENT}, expert trials do not say which latent was theirs.",
+                lambda axes: _bars(axes, told, "nats a step", SILENT),
             )
         )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]

@@ -31,7 +31,7 @@ AUTHORS = {
     "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
-VALIDATED = ("memory", "explored", "stakes", "unlike")  # figures of a diagnosis in the table of docs/diagnose.md
+VALIDATED = ("memory", "explored", "shown", "stakes", "strayed", "unlike")  # of a diagnosis, in docs/diagnose.md
 
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
