@@ -28,6 +28,7 @@ from deconfounded.deconf.explained import Explanation, mean
 from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.paths import familiar, oddest, strange, strayed, ways
 from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.deconf.sizes import MANY, SPACIOUS, WIDE
 from deconfounded.experts.demos import Agent, Trials
 
 CLEARLY = 0.1  # nats a step
@@ -49,6 +50,18 @@ class Amounts:
     exploring: DeconfoundedConfig = field(
         default_factory=lambda: DeconfoundedConfig(inference_updates=2000, inference_rate=3e-3)
     )
+
+    def fitting(self, observed: int) -> Amounts:
+        """The same, of networks that are large enough for so many observed numbers."""
+        if observed < MANY:
+            return self
+        return replace(
+            self,
+            cloning=replace(self.cloning, width=WIDE),
+            naive=replace(self.naive, width=WIDE),
+            offline=replace(self.offline, width=WIDE, latent=SPACIOUS),
+            exploring=replace(self.exploring, width=WIDE, latent=SPACIOUS),
+        )
 
 
 class Findings(NamedTuple):
@@ -102,6 +115,7 @@ def measure(
 
     tell: is told the share that is done.
     """
+    amounts = amounts.fitting(trials.obs.shape[-1])
     expert, rngs = split(trials, amounts.held_out, rng), [rng]
     shown, held = expert
     blind = cloning.fit(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))

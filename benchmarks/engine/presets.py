@@ -21,11 +21,13 @@ from deconfounded.deconf.offline import OfflineConfig
 from deconfounded.deconf.palr import PalrConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.deconf.rma import RmaConfig
+from deconfounded.deconf.sizes import MANY, SPACIOUS, WIDE
 
 MOST = 1e9  # of any amount
-MANY, WIDE = 16, 128  # from so many observed numbers on, all methods' networks on control are so wide
-SPACIOUS = 8  # dimensions of theta_hat there: with 4, one seed of three read it less well on ant_goal and the walker
-LONGER, GENTLE = 1.6, 2e-3  # updates of what infers theta there, and their rate: at 3e-3, less well on ant_goal
+LONGER, GENTLE = (
+    1.6,
+    2e-3,
+)  # where MANY numbers are observed, updates of what infers theta, and their rate: at 3e-3, less well on ant_goal
 
 
 @dataclass(frozen=True)
