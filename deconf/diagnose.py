@@ -197,7 +197,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     if stakes.high < STAKES and strayed.high < STRAYED and unlike.high < LIKE:
         why = "Who mistakes it comes about like the others, and so will a clone."
         return told("not confounded", 1, why, CLONE)
-    if stakes.low < STAKES:
+    if stakes.value < STAKES or stakes.low <= 1:
         why = (
             "The ways may be strange by chance: either it hardly matters, or the dynamics are not known well enough"
             f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"

@@ -146,8 +146,9 @@ class TestJudge:
         assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_judged=-0.2)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
         assert diagnose.judge([CLEAR, CLEAR._replace(shown=-0.002)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(stakes=0.9)]).verdict == "cannot tell"
         alike = CLEAR._replace(unlike=1.2, strayed=1.4)
-        assert diagnose.judge([alike, alike._replace(stakes=1.1)]).verdict == "cannot tell"
+        assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:
         found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
