@@ -18,7 +18,7 @@ from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Trials
 
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
-LITTLE, SILENT = 0.03, 0.01  # nats a step: of memory, of the world
+LITTLE, SILENT = 0.1, 0.01  # nats a step: of memory, of the world
 WORSE = 0.2  # nats a step by which a clone may be worse for its memory
 FINE, GAP = 0.8, 0.15  # scores
 STAKES, STRAYED = 1.5, 3.0  # times chance
@@ -163,7 +163,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     if memory.low <= LITTLE:
         if memory.high > LITTLE:
             return told("cannot tell", None, "That may be nothing, or something: more trials would settle it.", MORE)
-        if explored is not None and explored.low > SILENT:
+        if "shown" in found and found["shown"].low > SILENT:
             why = "The world differs from trial to trial, and the expert acts on nothing that a clone does not see."
             return told("not confounded", 1, why, CLONE)
         why = (

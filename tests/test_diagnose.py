@@ -131,8 +131,8 @@ class TestJudge:
             ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
             ({"naive": 0.95, "latent": 1.0}, "confounded", 2, diagnose.EXPLORE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
-            ({"memory": 0.001, "explored": -0.002}, "cannot tell", None, diagnose.VARY),
-            ({"memory": 0.001, "explored": None}, "cannot tell", None, diagnose.VARY),
+            ({"memory": 0.001, "shown": -0.002}, "cannot tell", None, diagnose.VARY),
+            ({"memory": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY),
             ({"latent": 0.1, "latent_judged": -0.2}, "cannot tell", None, diagnose.MORE),
         ],
     )
