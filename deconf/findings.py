@@ -144,11 +144,13 @@ def measure(
         (one, home), (zero, away), *others, (_, again) = (dreamt.visit(actor, rngs) for actor in (*actors, knower))
         judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off, _ in others]
 
+        half = amounts.dreams // 2
+        usual, more = home[0, :half], again[0, half:]
+        chance = strange(home[0, half:], usual, more)
+
         def odd(path: Tensor) -> float:
             """Among the ways of those who know, over what chance is among as many others of them."""
-            half = amounts.dreams // 2
-            usual, chance = home[0, :half], strange(home[0, half:], home[0, :half], again[0, half:])
-            return oddest(strange(path[0, half:], usual, again[0, half:]), chance)
+            return oddest(strange(path[0, half:], usual, more), chance)
 
         naive, latent = (familiar(odd(path)) for _, path in others)
         went = ways(episodes)[torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))]

@@ -24,10 +24,7 @@ from deconfounded.deconf.rma import RmaConfig
 from deconfounded.deconf.sizes import MANY, SPACIOUS, WIDE
 
 MOST = 1e9  # of any amount
-LONGER, GENTLE = (
-    1.6,
-    2e-3,
-)  # where MANY numbers are observed, updates of what infers theta, and their rate: at 3e-3, less well on ant_goal
+LONGER, GENTLE = 1.6, 2e-3  # where MANY are observed: updates of what infers theta, their rate (3e-3: ant_goal worse)
 
 
 @dataclass(frozen=True)

@@ -173,9 +173,9 @@ def validation() -> str:
         measured, certified = score.two_decimals(row["measured"]), "passed" if row["certified"] else "failed"
         rows.append((row["task"], certified, told, "" if row["right"] else "wrong", *cells, measured))
     head = ("task", "certificate", "diagnosis", "", *VALIDATED, "predicted gap", "measured")
-    rank, where = score.two_decimals(found["rank_correlation"]), f"{found['machine']}, {found['versions']['torch']}"
+    rank, torch = score.two_decimals(found["rank_correlation"]), found["versions"]["torch"]
     text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
-measured gaps is {rank} ({where})."""
+measured gaps is {rank} ({found["machine"]}, torch {torch})."""
     return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
 
 
