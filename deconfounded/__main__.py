@@ -30,6 +30,7 @@ COMMANDS = {
     "growth": ("benchmarks.growth", "how cost grows"),
     "seeds": ("benchmarks.seeds", "what seeds cost side by side"),
     "cost": ("benchmarks.cost", "score against CPU seconds"),
+    "tune": ("benchmarks.tune", "the opponents' tuning"),
     "spectrum": ("benchmarks.spectrum", "where delusion begins: more and less noise"),
 }
 

@@ -12,10 +12,34 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
+from deconfounded.benchmarks import tune
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import browser, index, pages, records, report, score, statistics
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is tried is the preset's amount so many times; of settings that score nearly alike, the cheaper is chosen."""
+    for method, changes in tune.TRIED.items():
+        for task in map(envs.get, tune.TASKS):
+            config = getattr(preset("default", task, "cpu"), METHODS[method].part)
+            tried = [config, *(tune.other(config, change) for change in changes)]
+            assert len(set(tried)) == 4, f"{method} on {task.name}: the same number of settings each"
+    config = tune.other(preset("default", envs.get("bandit"), "cpu").mean, {"latent": 0.5, "beta": 2, "model": "evidence"})
+    assert (config.latent, config.beta, config.model) == (2, 0.02, "evidence")
+    assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
+    rows = [
+        {"method": "gail", "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}}
+        for setting, scores, cpu in (("a", [0.1, 0.3], 5.0), ("b", [0.5, 0.7], 9.0), ("c", [0.59, 0.6], 4.0))
+    ]
+    found = {"rows": rows, "machine": "m", "versions": {"torch": "2"}, "commit": None}
+    (tmp_path / "tuning.json").write_text(json.dumps(found))
+    monkeypatch.setattr(pages, "DOCS", tmp_path)
+    lines = pages.tuning().splitlines()
+    assert [line.endswith("| chosen |") for line in lines[2:5]] == [False, False, True]
+    assert lines[2] == "| gail | a | 0.20 | 5 |  |"
 
 
 class TestStatistics:

@@ -1,8 +1,8 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
-docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and that
-in docs/diagnose.md (of what `validate.py` kept).
+docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and those
+in docs/diagnose.md (of what `validate.py` kept) and docs/tuning.md (of what `tune.py` kept).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ AUTHORS = {
     "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
+NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
 VALIDATED = ("memory", "explored", "shown", "stakes", "strayed", "unlike")  # of a diagnosis, in docs/diagnose.md
 
 
@@ -179,6 +180,31 @@ measured gaps is {rank} ({found["machine"]}, torch {torch})."""
     return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
 
 
+def tuning() -> str:
+    """The table of docs/tuning.md: what `tune.py` tried of each opponent, and what was best."""
+    if not (file := DOCS / "tuning.json").is_file():
+        return "It has not been run yet with today's code."
+    found, rows = json.loads(file.read_text()), []
+    tasks = list(found["rows"][0]["scores"])
+    for method in dict.fromkeys(row["method"] for row in found["rows"]):
+        of = [row for row in found["rows"] if row["method"] == method]
+        means = [np.mean([np.mean(scores) for scores in row["scores"].values()]) for row in of]
+        near = [i for i, mean in enumerate(means) if mean >= max(means) - NEAR]
+        best = min(near, key=lambda i: sum(of[i]["cpu_s"].values()))
+        for i, row in enumerate(of):
+            scores = [score.two_decimals(np.mean(row["scores"][task])) for task in tasks]
+            cpu = [f"{row['cpu_s'][task]:.0f}" for task in tasks]
+            rows.append((method, row["setting"], *scores, *cpu, "chosen" if i == best else ""))
+    head = ("method", "setting", *tasks, *(f"{task}, CPU s a seed" for task in tasks), "")
+    text = f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}."
+    return f"{markdown_table(head, rows)}\n\n{text}"
+
+
+def tuned() -> str:
+    """docs/tuning.md with its table."""
+    return _filled((DOCS / "tuning.md").read_text(), tuning)
+
+
 def diagnose() -> str:
     """docs/diagnose.md with its table."""
     return _filled((DOCS / "diagnose.md").read_text(), validation)
@@ -237,6 +263,7 @@ def write() -> None:
     write_atomically(DOCS / "results.md", results_page())
     gap.picture(_gaps(), DOCS / "gap.png")
     write_atomically(DOCS / "diagnose.md", diagnose())
+    write_atomically(DOCS / "tuning.md", tuned())
     write_atomically(DOCS / "speed.md", speed())
     write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())

@@ -1,0 +1,101 @@
+"""The opponents' tuning: `python benchmarks/tune.py`
+
+Each opponent gets four settings, its present one among them, on two development tasks: the cartpole on a tilted rail
+and the bandit. Their seeds are no others' (`SEEDS`). What came of it is kept in docs/tuning.json.
+Interrupted, it goes on where it was.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.envs.files import write_json
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
+_NETWORK = ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2})
+TRIED: dict[str, tuple[dict[str, float | str], ...]] = {
+    "naive_rnn": _NETWORK,
+    "naive_obs": _NETWORK,
+    "naive_dropout": _NETWORK,
+    "palr": ({"penalty": 10}, {"penalty": 100}, {"updates": 2}),
+    "rma": ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2}),
+    "deconfounded_mean": ({"beta": 0.1}, {"model": "evidence"}, {"inference_updates": 4}),
+    "naive_transformer": ({"learning_rate": 0.3}, {"updates": 2}, {"layers": 2}),
+    "gail": ({"policy_rate": 0.3}, {"discriminator_rate": 0.3}, {"rounds": 2}),
+}
+"""Of each opponent, what is tried beside the preset: an amount times so much, or what is put in its place."""
+
+
+def other(config: Any, change: dict[str, float | str]) -> Any:
+    """A method's configuration with the change."""
+    values = {}
+    for name, by in change.items():
+        now = getattr(config, name)
+        values[name] = by if isinstance(by, str) else type(now)(round(now * by) if isinstance(now, int) else now * by)
+    return replace(config, **values)
+
+
+def title(change: dict[str, float | str]) -> str:
+    """Of a setting."""
+    told = (f"{name} {by}" if isinstance(by, str) else f"{name} x {by:g}" for name, by in change.items())
+    return ", ".join(told) or "the preset"
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help=f"some of {', '.join(TRIED)}; default: all")
+    parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
+    args = parser.parse_args()
+    for name in args.methods or ():
+        if name not in TRIED:
+            raise envs.closest("method", name, list(TRIED))
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output.index import last_scores
+
+    rows = []
+    for name in args.methods or TRIED:
+        for change in ({}, *TRIED[name]):
+            row: dict[str, Any] = {"method": name, "setting": title(change), "scores": {}, "cpu_s": {}}
+            for task in (envs.get(one) for one in TASKS):
+                settings, part = preset("default", task, "cpu"), METHODS[name].part
+                settings = replace(settings, **{part: other(getattr(settings, part), change)})
+                own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
+                jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
+                with commands.locked(own):
+                    prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
+                    finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", Local())
+                found = records.gather(records.of_run(finished, "default", [], task.episodes))["methods"]
+                row["scores"][task.name] = [round(score, 4) for score in last_scores(found)[name].values()]
+                row["cpu_s"][task.name] = found[name]["cpu_s"]
+            rows.append(row)
+            told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
+            print(f"{name}, {row['setting']}: {told}")
+    kept = args.out if args.methods else DOCS
+    about = {"seeds": SEEDS, "commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    write_json(kept / "tuning.json", {**about, "rows": rows})
+    print(f"-> {kept / 'tuning.json'}")
+
+
+if __name__ == "__main__":
+    run_command(main, "what was finished is kept, and the same command goes on")
