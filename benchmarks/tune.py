@@ -12,7 +12,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,21 +27,24 @@ from deconfounded.envs.files import write_json
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
-_NETWORK = ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2})
-TRIED: dict[str, tuple[dict[str, float | str], ...]] = {
+Change = dict[str, float | str]
+"""Amounts by name, each times so much, or what is put in its place."""
+
+_NETWORK: tuple[Change, ...] = ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2})
+TRIED: dict[str, tuple[Change, ...]] = {
     "naive_rnn": _NETWORK,
     "naive_obs": _NETWORK,
     "naive_dropout": _NETWORK,
     "palr": ({"penalty": 10}, {"penalty": 100}, {"updates": 2}),
-    "rma": ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2}),
+    "rma": _NETWORK,
     "deconfounded_mean": ({"beta": 0.1}, {"model": "evidence"}, {"inference_updates": 4}),
     "naive_transformer": ({"learning_rate": 0.3}, {"updates": 2}, {"layers": 2}),
     "gail": ({"policy_rate": 0.3}, {"discriminator_rate": 0.3}, {"rounds": 2}),
 }
-"""Of each opponent, what is tried beside the preset: an amount times so much, or what is put in its place."""
+"""Of each opponent, what is tried beside the preset."""
 
 
-def other(config: Any, change: dict[str, float | str]) -> Any:
+def other(config: Any, change: Change) -> Any:
     """A method's configuration with the change."""
     values = {}
     for name, by in change.items():
@@ -51,7 +53,7 @@ def other(config: Any, change: dict[str, float | str]) -> Any:
     return replace(config, **values)
 
 
-def title(change: dict[str, float | str]) -> str:
+def title(change: Change) -> str:
     """Of a setting."""
     told = (f"{name} {by}" if isinstance(by, str) else f"{name} x {by:g}" for name, by in change.items())
     return ", ".join(told) or "the preset"
@@ -92,8 +94,8 @@ def main() -> None:
             told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
             print(f"{name}, {row['setting']}: {told}")
     kept = args.out if args.methods else DOCS
-    about = {"seeds": SEEDS, "commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
-    write_json(kept / "tuning.json", {**about, "rows": rows})
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    write_json(kept / "tuning.json", {"seeds": SEEDS, **about, "rows": rows})
     print(f"-> {kept / 'tuning.json'}")
 
 

@@ -21,13 +21,14 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
 def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is tried is the preset's amount so many times; of settings that score nearly alike, the cheaper is chosen."""
+    """The preset's amount so many times is tried; of settings that score nearly alike, the cheaper is chosen."""
     for method, changes in tune.TRIED.items():
         for task in map(envs.get, tune.TASKS):
             config = getattr(preset("default", task, "cpu"), METHODS[method].part)
             tried = [config, *(tune.other(config, change) for change in changes)]
             assert len(set(tried)) == 4, f"{method} on {task.name}: the same number of settings each"
-    config = tune.other(preset("default", envs.get("bandit"), "cpu").mean, {"latent": 0.5, "beta": 2, "model": "evidence"})
+    mean = preset("default", envs.get("bandit"), "cpu").mean
+    config = tune.other(mean, {"latent": 0.5, "beta": 2, "model": "evidence"})
     assert (config.latent, config.beta, config.model) == (2, 0.02, "evidence")
     assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
     rows = [

@@ -1,8 +1,8 @@
 """What docs/ and README show of tasks, certificates and results: `python benchmarks/pages.py`
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
-docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and those
-in docs/diagnose.md (of what `validate.py` kept) and docs/tuning.md (of what `tune.py` kept).
+docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and
+those in docs/diagnose.md (of what `validate.py` kept) and docs/tuning.md (of what `tune.py` kept).
 """
 
 from __future__ import annotations
