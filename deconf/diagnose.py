@@ -21,8 +21,8 @@ Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.1, 0.01  # nats a step: of memory, of the world
 WORSE = 0.2  # nats a step by which a clone may be worse for its memory
 FINE, GAP = 0.8, 0.15  # scores
-STAKES, STRAYED = 1.5, 3.0  # times chance
-LIKE = 2.0  # how strange dreams may be, among what happened, and be believed of what does not show
+STAKES, STRAYED = 1.5, 2.0  # times chance
+LIKE = 4.0  # how strange dreams may be, among what happened, and be believed of what does not show
 
 
 class Next(NamedTuple):
@@ -83,8 +83,8 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
 
-    Found is also the `gap`: what cloning is predicted to lose, in scores; and `gap_judged`, by Eq. (1). tier: of the
-    paper; None if it is not known, or if none does.
+    Found is also the `gap`: what cloning is predicted to lose, in scores of where it comes about; and `gap_judged`, by
+    Eq. (1). tier: of the paper; None if it is not known, or if none does.
     """
 
     verdict: Verdict
@@ -175,8 +175,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         "The expert acts on something that the present observation does not show. In the learned dynamics, one who"
         f" mistakes it goes ways {stakes} times as strange as the ways of those who know it, and {strayed} times as far"
         f" from that one's own as chance does. A naive clone scores {naive} there, one that infers the latent from the"
-        f" world {latent}: 1 comes about like those who know it, 0 nowhere near. By their actions, Eq. (1), it is"
-        f" {found['naive_judged']} and {found['latent_judged']}: 1 knows the latent, 0 acts on another one."
+        f" world {latent}: 1 comes about where the one who knows it does, 0 nowhere near. By their actions, Eq. (1),"
+        f" it is {found['naive_judged']} and {found['latent_judged']}: 1 knows the latent, 0 acts on another one."
     )
     if explored is None:
         why = (
@@ -184,22 +184,26 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             " latent: what an action does, and what the latent does, cannot be told apart there."
         )
         return told("cannot tell", None, why, TRY)
-    shown = found["shown"]
-    said.append(f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went.")
-    if shown.low <= SILENT:
-        if shown.low > -SILENT and shown.high < SILENT:
-            why = (
-                "The latter is nothing, so that expert trials do not say which latent was theirs: no exploration helps."
-                " Ask what the expert would do where the clone goes; if the world tells it nowhere, only a sensor does."
-            )
-            return told("confounded", 3, why, ASK)
-        return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
-    if stakes.high < STAKES and strayed.high < STRAYED and unlike.high < LIKE:
-        why = "Who mistakes it comes about like the others, and so will a clone."
-        return told("not confounded", 1, why, CLONE)
-    if stakes.value < STAKES or stakes.low <= 1:
+    shown, explained = found["shown"], found["explained"]
+    said.append(
+        f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went;"
+        f" what it tells explains the expert's actions better than the present observation by {explained} nats a step."
+    )
+    if shown.value < LITTLE and explained.high <= 0:
         why = (
-            "The ways may be strange by chance: either it hardly matters, or the dynamics are not known well enough"
+            "The latter is next to nothing, and what it tells does not explain what the expert does: expert trials do"
+            " not say which latent was theirs, and no exploration helps. Ask what the expert would do where the clone"
+            " goes; if the world tells it nowhere, only a sensor does."
+        )
+        return told("confounded", 3, why, ASK)
+    if shown.low <= SILENT:
+        return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
+    if stakes.high < STAKES and strayed.high < STRAYED and unlike.value < LIKE and explained.low > 0:
+        why = "Who mistakes it comes about like the others, and where they do; and so will a clone."
+        return told("not confounded", 1, why, CLONE)
+    if not any(one.value >= least and one.low > 1 for one, least in ((stakes, STAKES), (strayed, STRAYED))):
+        why = (
+            "The ways may be other ones by chance: either it hardly matters, or the dynamics are not known well enough"
             f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"
         )
         return told("cannot tell", None, why, WIDER)

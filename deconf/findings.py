@@ -74,10 +74,10 @@ class Findings(NamedTuple):
     another latent for true, among those of experts who know theirs, in what shows it most, over the same by chance.
     strayed: how far they are from those of the expert who knows that latent, from the same start, over the same by
     chance. unlike: how strange these are in turn, among those of the data, on the whole. naive, latent: scores of a
-    naive clone and of one that infers the latent from the world, the logarithm of their strangeness: 1 comes about like
-    the experts who know, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges their actions, Eq.
-    (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without exploration, explored, shown
-    and explained are None, and the latent is one that explains actions too, Eq. (7).
+    naive clone and of one that infers the latent from the world, by the logarithm of how far they strayed: 1 comes
+    about where the expert who knows does, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges
+    their actions, Eq. (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without
+    exploration, explored, shown and explained are None, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
@@ -144,21 +144,20 @@ def measure(
         (one, home), (zero, away), *others, (_, again) = (dreamt.visit(actor, rngs) for actor in (*actors, knower))
         judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off, _ in others]
 
-        half = amounts.dreams // 2
+        half, chance = amounts.dreams // 2, strayed(again[0], home[0], again[0])
+
+        def astray(path: Tensor) -> float:
+            """From those who know, each from its own, over what chance is."""
+            return oddest(strayed(path[0], home[0], again[0]), chance)
+
         usual, more = home[0, :half], again[0, half:]
-        chance = strange(home[0, half:], usual, more)
-
-        def odd(path: Tensor) -> float:
-            """Among the ways of those who know, over what chance is among as many others of them."""
-            return oddest(strange(path[0, half:], usual, more), chance)
-
-        naive, latent = (familiar(odd(path)) for _, path in others)
+        odd = oddest(*(strange(path[0, half:], usual, more) for path in (away, home)))
+        naive, latent = (familiar(astray(path)) for _, path in others)
         went = ways(episodes)[torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))]
         unlike = float(strange(home[0], *went.tensor_split(2)).mean())
-        far = oddest(*(strayed(path[0], home[0], again[0]) for path in (away, again)))
     tell(1)
     world = None if found.actions is None else found.actions - present
-    return Findings(memory, found.explored, found.shown, world, odd(away), far, unlike, naive, latent, *judged)
+    return Findings(memory, found.explored, found.shown, world, odd, astray(away), unlike, naive, latent, *judged)
 
 
 def _by_world(

@@ -97,7 +97,7 @@ class TestBadInput:
 CLEAR = Findings(
     memory=1.0,
     explored=0.2,
-    shown=0.1,
+    shown=0.2,
     explained=0.5,
     stakes=3.0,
     strayed=9.0,
@@ -120,12 +120,15 @@ class TestJudge:
             ({}, "confounded", 2, diagnose.EXPLORE),
             (ALONE, "cannot tell", None, diagnose.TRY),
             ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
-            ({"shown": -0.002}, "confounded", 3, diagnose.ASK),
-            ({"stakes": 1.1}, "cannot tell", None, diagnose.WIDER),
-            ({"stakes": 1.1, "unlike": 1.2}, "cannot tell", None, diagnose.WIDER),
-            ({"stakes": 1.1, "strayed": 1.4}, "cannot tell", None, diagnose.WIDER),
-            ({"stakes": 1.1, "strayed": 1.4, "unlike": 1.2}, "not confounded", 1, diagnose.CLONE),
+            ({"shown": 0.05, "explained": -0.1}, "confounded", 3, diagnose.ASK),
+            ({"shown": 0.05}, "confounded", 2, diagnose.EXPLORE),
+            ({"explained": -0.1}, "confounded", 2, diagnose.EXPLORE),
             ({"shown": -0.5}, "cannot tell", None, diagnose.WIDER),
+            ({"stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
+            ({"strayed": 1.1}, "confounded", 2, diagnose.EXPLORE),
+            ({"stakes": 1.1, "strayed": 1.4}, "not confounded", 1, diagnose.CLONE),
+            ({"stakes": 1.1, "strayed": 1.4, "unlike": 5.0}, "cannot tell", None, diagnose.WIDER),
+            ({"stakes": 1.1, "strayed": 1.4, "explained": -0.1}, "cannot tell", None, diagnose.WIDER),
             ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
@@ -146,8 +149,11 @@ class TestJudge:
         assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_judged=-0.2)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
         assert diagnose.judge([CLEAR, CLEAR._replace(shown=-0.002)]).verdict == "cannot tell"
-        assert diagnose.judge([CLEAR, CLEAR._replace(stakes=0.9)]).verdict == "cannot tell"
-        alike = CLEAR._replace(unlike=1.2, strayed=1.4)
+        mixed = CLEAR._replace(shown=0.05, explained=-0.1)
+        assert diagnose.judge([mixed, mixed]).tier == 3
+        assert diagnose.judge([mixed, mixed._replace(explained=0.1)]).tier == 2
+        alike = CLEAR._replace(strayed=1.4)
+        assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.deconf.diagnose import FINE, LITTLE, SILENT, STAKES, Diagnosis, Figure
+from deconfounded.deconf.diagnose import FINE, LITTLE, STAKES, STRAYED, Diagnosis, Figure
 from deconfounded.envs.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
@@ -63,7 +63,8 @@ agent.save("agent")
 def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
     """Title, two sentences, and what to draw."""
     figure = found.found
-    memory, naive, latent, stakes = (figure[key] for key in ("memory", "naive", "latent", "stakes"))
+    memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
+    stakes, strayed = figure["stakes"], figure["strayed"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
     whence = "Exploration would show how much of that the world's answers tell, and how much past actions alone."
     if "explained" in figure:
@@ -92,8 +93,8 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
                 "Does the world tell it?",
                 f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
                 f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
-                f" below {SILENT}, expert trials do not say which latent was theirs.",
-                lambda axes: _bars(axes, told, "nats a step", SILENT),
+                f" below {LITTLE}, and explains no action, expert trials do not say which latent was theirs.",
+                lambda axes: _bars(axes, told, "nats a step", LITTLE),
             )
         )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
@@ -103,9 +104,10 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         (
             "What will it cost?",
             f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange as"
-            f" usual; below {STAKES} that may be chance. There a naive clone scores {naive}, and one that infers the"
-            f" latent from the world {latent}: 1 comes about like those who know the latent, 0 nowhere near; by their"
-            " actions, Eq. (1), 1 knows the latent and 0 acts on another one.",
+            f" usual, and {strayed} times as far as usual from those of the expert who knows it; below {STAKES} and"
+            f" {STRAYED} that may be chance. There a naive clone scores {naive}, and one that infers the latent from"
+            f" the world {latent}: 1 comes about where the expert who knows it does, 0 nowhere near; by their actions,"
+            " Eq. (1), 1 knows the latent and 0 acts on another one.",
             lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
         )
     )
