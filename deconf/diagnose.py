@@ -83,8 +83,9 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
 
-    Found is also the `gap`: what cloning is predicted to lose, in scores of where it comes about; and `gap_judged`, by
-    Eq. (1). tier: of the paper; None if it is not known, or if none does.
+    Found is also the `gap`: what cloning is predicted to lose, in scores of where it comes about; `gap_judged`, by Eq.
+    (1); and the `ratio` of what actions tell to what the world does. tier: of the paper; None if it is not known, or if
+    none does.
     """
 
     verdict: Verdict
@@ -152,6 +153,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     memory, stakes, strayed, unlike = (found[key] for key in ("memory", "stakes", "strayed", "unlike"))
     naive, latent = found["naive"], found["latent"]
     explored = found.get("explored")
+    if explored is not None:
+        found["ratio"] = Figure.of([(refit.acted or 0) / max(refit.shown or 0, SILENT) for refit in refits])
     said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]
 
     def told(verdict: Verdict, tier: int | None, why: str, then: Next) -> Diagnosis:
@@ -186,8 +189,10 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         return told("cannot tell", None, why, TRY)
     shown, explained = found["shown"], found["explained"]
     said.append(
-        f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went;"
-        f" what it tells explains the expert's actions better than the present observation by {explained} nats a step."
+        f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went; what it"
+        f" tells explains the expert's actions better than the present observation by {explained}. These tell it by"
+        f" {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
+        " actions for the expert's."
     )
     if shown.value < LITTLE and explained.high <= 0:
         why = (

@@ -28,14 +28,15 @@ class Explanation(NamedTuple):
     """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
 
     actions: log-likelihood of half of the expert's held-out actions, given latents of the other half, nats a step.
-    explored, shown: how much more likely half of what a held-out trial met is, given the latent of the other half, than
-    given another trial's: in exploration, and where the expert went. None without exploration.
+    acted: how much less it is given another trial's; explored, shown: the same of what the world answered, in
+    exploration, and where the expert went. None without exploration.
     """
 
     model: VariationalModel
     policy: ActionHead
     latents: Tensor
     actions: float | None = None
+    acted: float | None = None
     explored: float | None = None
     shown: float | None = None
 
@@ -72,9 +73,12 @@ def by_world(
     policy = _conditional(model, shown, cloning, draws)
     with torch.no_grad():
         latents, odd = _halved(model, held, draws)
-        inputs = torch.cat([model.inputs.obs(odd.obs), _along(odd, latents)], -1)
-        actions = mean(policy.log_prob(inputs, odd.action), odd)
-    return Explanation(model, policy, _inferred(model, shown, draws), actions, met, _told(model, held, each, draws))
+        actions, others = (
+            mean(policy.log_prob(torch.cat([model.inputs.obs(odd.obs), _along(odd, latent)], -1), odd.action), odd)
+            for latent in (latents, latents.roll(each, 1))
+        )
+    told = _told(model, held, each, draws)
+    return Explanation(model, policy, _inferred(model, shown, draws), actions, actions - others, met, told)
 
 
 def mean(x: Tensor, batch: Batch) -> float:

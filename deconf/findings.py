@@ -69,7 +69,8 @@ class Findings(NamedTuple):
 
     memory: what memory adds to predicting the expert's action over the present observation. explained: what a latent
     adds that explains the world's answers, and nothing else. explored: how much more likely an episode's own latent
-    makes the world's answers in exploration than another trial's does; shown: in the expert's trials. The others are
+    makes the world's answers in exploration than another trial's does; shown: in the expert's trials; acted: how much
+    more likely it makes the expert's actions there, the evidence that a naive clone takes its own for. The others are
     seen in the last episode of trials in the learned dynamics. stakes: how strange the ways of one are who holds
     another latent for true, among those of experts who know theirs, in what shows it most, over the same by chance.
     strayed: how far they are from those of the expert who knows that latent, from the same start, over the same by
@@ -77,13 +78,14 @@ class Findings(NamedTuple):
     naive clone and of one that infers the latent from the world, by the logarithm of how far they strayed: 1 comes
     about where the expert who knows does, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges
     their actions, Eq. (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without
-    exploration, explored, shown and explained are None, and the latent is one that explains actions too, Eq. (7).
+    exploration, explained to acted are None, and the latent is one that explains actions too, Eq. (7).
     """
 
     memory: float
+    explained: float | None
     explored: float | None
     shown: float | None
-    explained: float | None
+    acted: float | None
     stakes: float
     strayed: float
     unlike: float
@@ -157,7 +159,8 @@ def measure(
         unlike = float(strange(home[0], *went.tensor_split(2)).mean())
     tell(1)
     world = None if found.actions is None else found.actions - present
-    return Findings(memory, found.explored, found.shown, world, odd, astray(away), unlike, naive, latent, *judged)
+    told = (world, found.explored, found.shown, found.acted)
+    return Findings(memory, *told, odd, astray(away), unlike, naive, latent, *judged)
 
 
 def _by_world(

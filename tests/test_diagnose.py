@@ -98,6 +98,7 @@ CLEAR = Findings(
     memory=1.0,
     explored=0.2,
     shown=0.2,
+    acted=50.0,
     explained=0.5,
     stakes=3.0,
     strayed=9.0,
@@ -108,7 +109,7 @@ CLEAR = Findings(
     latent_judged=0.8,
 )
 
-ALONE = {"explored": None, "shown": None, "explained": None}
+ALONE = dict.fromkeys(("explained", "explored", "shown", "acted"))
 
 
 class TestJudge:
@@ -157,9 +158,10 @@ class TestJudge:
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_figures(self) -> None:
-        found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4)]).found["naive"]
-        assert found == pytest.approx((0.3, 0.2, 0.4))
-        assert "explored" not in diagnose.judge([CLEAR._replace(explored=None, shown=None, explained=None)]).found
+        found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4, shown=0.5)]).found
+        assert found["naive"] == pytest.approx((0.3, 0.2, 0.4))
+        assert found["ratio"] == pytest.approx((175, 100, 250))
+        assert "explored" not in diagnose.judge([CLEAR._replace(**ALONE)]).found
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
@@ -177,7 +179,7 @@ def test_measures(make) -> None:
     assert once == again
     assert np.isfinite(once).all()
     alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
-    assert (alone.explored, alone.shown, alone.explained) == (None, None, None)
+    assert {alone.explained, alone.explored, alone.shown, alone.acted} == {None}
     assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
 
@@ -210,7 +212,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     first = capsys.readouterr().out
     told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert told["verdict"].upper() in first
-    assert set(told["found"]) == {*Findings._fields, "gap", "gap_judged"}
+    assert set(told["found"]) == {*Findings._fields, "gap", "gap_judged", "ratio"}
     page = (tmp_path / "out" / "index.html").read_text()
     assert told["reasons"][0] in html.unescape(page)
     assert not re.search(r"(src|href)=\"(?!data:)", page)
