@@ -154,7 +154,7 @@ def main() -> None:
     rank = float(stats.spearmanr(*gaps).statistic) if min(len(set(some)) for some in gaps) > 1 else 0.0
     kept = args.out if args.tasks else DOCS / "diagnose"
     kept.mkdir(exist_ok=True)
-    about = {"machine": identity.machine("cpu"), "versions": identity.versions()}
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
     write_json(kept / "validation.json", {"right": share, "rank_correlation": rank, **about, "rows": rows})
     points = [Gap(task, row["predicted"], row["measured"]) for task, row in zip(tasks, rows, strict=True)]
     hues = ["tab:red" if row["certified"] else "tab:green" for row in rows]

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from deconfounded.deconf.agents import LearnedAgent
 from deconfounded.deconf.data import Batch, Draws, take
+from deconfounded.deconf.endings import Endings
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, sample_index
@@ -113,11 +114,14 @@ def known_range(held: Batch) -> tuple[Tensor, Tensor]:
 class World:
     """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
 
-    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O].
+    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O]; ends: when an episode is
+    over before its horizon.
     """
 
-    def __init__(self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int) -> None:
-        self.judge, self.horizon = judge, horizon
+    def __init__(
+        self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int, ends: Endings | None
+    ) -> None:
+        self.judge, self.horizon, self.ends = judge, horizon, ends
         draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
         n = judge.theta_hat.shape[1]
         self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
@@ -148,21 +152,27 @@ class World:
     def visit(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
         """An actor's last episode: how far its actions are from the judge's [S], and its observations [S, N, T, O].
 
-        The first is a mean over steps, 0 to 1; where that range is left, the rest of the episode counts as 1,
-        and observations stay as they are.
+        The first is a mean over steps, 0 to 1; where that range is left, the rest of the episode counts as 1. Then, and
+        when it is over, observations stay as they are.
         """
         seeds, n, _ = self.judge.theta_hat.shape
         rngs = [np.random.default_rng(rng.integers(2**63)) for rng in rngs]
         draws = Draws(rngs, "cpu")
         actor.begin(n, rngs)
         for obs in self.starts:
-            there, total, went = torch.ones(seeds, n), torch.zeros(seeds, n), list[Tensor]()
+            there, lost = torch.ones(seeds, n), torch.zeros(seeds, n)
+            total, count, went = torch.zeros(seeds, n), torch.zeros(seeds, n), list[Tensor]()
             for _ in range(self.horizon):
                 action = actor.choose(obs)
-                total += torch.where(there > 0, self._off(obs, action), 1.0)
+                total += there * self._off(obs, action) + lost
+                count += there + lost
                 next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
                 actor.remember(Batch(obs, action, next_obs, there))
                 obs = torch.where(there[..., None] > 0, next_obs, obs)
-                there = there * ((obs >= self.low) & (obs <= self.high)).all(-1)
+                inside = ((obs >= self.low) & (obs <= self.high)).all(-1)
+                lost = torch.maximum(lost, there * ~inside)
+                there = there * inside
+                if self.ends is not None:
+                    there = there * (draws.uniform(n) >= self.ends.logit(obs).sigmoid())
                 went.append(obs)
-        return total.mean(1) / self.horizon, torch.stack(went, 2)
+        return (total / count).mean(1), torch.stack(went, 2)

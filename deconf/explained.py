@@ -11,10 +11,10 @@ from torch import Tensor
 from deconfounded.deconf import offline
 from deconfounded.deconf.agents import Monitor, ramp
 from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Batch, Draws, Signature
+from deconfounded.deconf.data import Batch, Draws, Signature, take
 from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig, final_belief
 from deconfounded.deconf.dream import known_range
-from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.equations import gaussian_kl, inference_loss, masked_mean
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.offline import OfflineConfig
@@ -105,14 +105,32 @@ def _along(batch: Batch, latents: Tensor) -> Tensor:
 def _dynamics(
     explored: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
 ) -> VariationalModel:
-    """Eq. (6)."""
+    """Eq. (6), of sets: half of a trial's steps, whichever, tell the latent that predicts the others.
+
+    In deployment it is the beginning that tells it, and what comes next that is predicted. A belief learned so is never
+    asked what came before: of single episodes it says how late it is, and nobody's start can be dreamt with it.
+    """
     model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(explored), draws)
     optimizer = Adam([model], how.inference_rate, how.inference_updates)
     for update in range(how.inference_updates):
-        batch = explored.beginnings(update, how.shortest).draw_trials(how.inference_batch, draws)
+        batch = explored.draw_trials(how.inference_batch, draws)
+        batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, how.shortest)
+        half = draws.uniform(*batch.mask.shape[1:]) < 0.5
+        known, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
+        model.train()
+        belief = model.belief(model.last(known))
+        index = rest.draw_steps(how.inference_steps, draws)
+        real, trial = rest.steps(index), index // batch.mask.shape[2]
+        log_next = model.dynamics.log_prob(
+            real.obs, real.action, real.next_obs, take(model.sample(belief, draws), trial)
+        )[..., 0]
+        centre, std = belief.chunk(2, -1)
+        kl = take(gaussian_kl(centre, std, *model.encoder.prior(centre)), trial)
         beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
-        loss = model.learn(optimizer, batch, how.inference_steps, beta, draws)
-        monitor.update(update + 1, how.inference_updates, {"inference": loss})
+        loss = inference_loss(log_next, kl, beta, real.mask)
+        model.eval()
+        optimizer.step(loss)
+        monitor.update(update + 1, how.inference_updates, {"inference": loss.mean().item()})
     return model
 
 

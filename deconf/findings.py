@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from deconfounded.deconf import cloning, explained, naive_rnn
+from deconfounded.deconf import cloning, endings, explained, naive_rnn
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, take
@@ -127,6 +127,7 @@ def measure(
         found = explained.alone(shown, amounts.offline, draws, Part(tell, 0.25, 0.8))
     else:
         found = _by_world(expert, split(explore, amounts.held_out, rng), amounts, draws, tell)
+    ends = endings.fit([shown] if explore is None else [shown, explore], blind.scaler, draws)
     with torch.no_grad():
         other, episodes = Batch.of(held, 1), Batch.of(apart(shown), 1)
         present = mean(blind.policy.log_prob(blind.scaler(other.obs), other.action), other)
@@ -136,7 +137,7 @@ def measure(
             for n in (amounts.dreams, amounts.dreams, amounts.rivals)
         )
         knower, starts = Expert(found.model, found.policy, known), episodes.obs[:, :, 0]
-        dreamt = World(knower, episodes, starts, *trials.mask.shape[1:])
+        dreamt = World(knower, episodes, starts, trials.mask.shape[1], trials.mask.shape[2], ends)
         actors = (
             knower,
             Expert(found.model, found.policy, mistaken),
@@ -170,9 +171,9 @@ def _by_world(
     draws: Draws,
     tell: Callable[[float], None],
 ) -> Explanation:
-    """Of a latent that stays for a trial; or for an episode alone, if that explains the expert clearly better.
+    """Of a latent that stays for a trial; or for an episode alone, if that clearly tells more of all that happened.
 
-    What the world tells of it is what it tells of either: an episode alone can tell too little of what stays.
+    Of the world's answers as of the expert's actions: what an episode alone tells can be where it went, no latent.
     """
     each, found = max(some[0].mask.shape[1] for some in (expert, explored)), list[Explanation]()
     how, batch = amounts.exploring, amounts.exploring.inference_batch
@@ -183,9 +184,9 @@ def _by_world(
     for i, (shown, tried, at_once, how) in enumerate(units):
         part = Part(tell, 0.25 + 0.55 * i / len(units), 0.25 + 0.55 * (i + 1) / len(units))
         found.append(explained.by_world(shown, tried, at_once, how, amounts.cloning, draws, part))
-    met, where = (max(key(one) or 0.0 for one in found) for key in (lambda x: x.explored, lambda x: x.shown))
-    best = found[-1] if (found[-1].actions or 0.0) > (found[0].actions or 0.0) + CLEARLY else found[0]
-    return best._replace(explored=met, shown=where)
+    whole, single = found[0], found[-1]
+    more = (single.actions or 0.0) - (whole.actions or 0.0), (single.shown or 0.0) - (whole.shown or 0.0)
+    return single if min(more) > CLEARLY else whole
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:

@@ -32,7 +32,15 @@ AUTHORS = {
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
-VALIDATED = ("memory", "explored", "shown", "stakes", "strayed", "unlike")  # of a diagnosis, in docs/diagnose.md
+VALIDATED = (
+    "memory",
+    "explored",
+    "shown",
+    "ratio",
+    "stakes",
+    "strayed",
+    "unlike",
+)  # of a diagnosis, in docs/diagnose.md
 
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
@@ -176,7 +184,7 @@ def validation() -> str:
     head = ("task", "certificate", "diagnosis", "", *VALIDATED, "predicted gap", "measured")
     rank, torch = score.two_decimals(found["rank_correlation"]), found["versions"]["torch"]
     text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
-measured gaps is {rank} ({found["machine"]}, torch {torch})."""
+measured gaps is {rank} ({found["machine"]}, torch {torch}, of {(found["commit"] or "unknown")[:7]})."""
     return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
 
 

@@ -1,0 +1,48 @@
+"""Episodes that end early end in dreams too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from deconfounded.deconf import endings
+from deconfounded.deconf.data import Batch, Draws
+from deconfounded.deconf.nets import scalers
+from deconfounded.experts.demos import Trials
+
+
+def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
+    """Random walks [n, 1, steps, 1], that are over where they come beyond the limit."""
+    obs = np.random.default_rng(0).normal(size=(n, 1, steps + 1, 1)).cumsum(2).astype(np.float32)
+    beyond = np.abs(obs[..., 0]) > limit
+    mask = ~(np.maximum.accumulate(beyond, -1)[..., :-1])
+    mask[..., 0] = True
+    return Trials(obs, np.zeros((n, 1, steps, 1)), mask)
+
+
+def test_what_ends_them_is_learned() -> None:
+    """Beyond the limit it is over, within it is not: right of 95% that are .3 or more away from it."""
+    some = walks()
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    ends = endings.fit([some], scalers(Batch.of(some, 1))[0], draws)
+    assert ends is not None
+    at = torch.linspace(-4, 4, 401)[None, :, None]
+    over = (ends.logit(at) > 0)[0]
+    clear = (at.abs() - 2).abs()[0, :, 0] > 0.3
+    right = over == (at.abs() > 2)[0, :, 0]
+    assert right[clear].float().mean() > 0.95
+
+
+def test_a_horizon_is_no_end() -> None:
+    some = walks(limit=1e9)
+    assert endings.fit([some], scalers(Batch.of(some, 1))[0], Draws([np.random.default_rng(0)], "cpu")) is None
+
+
+def test_arrivals() -> None:
+    """Of an episode of three steps of four the last arrival is its end; of one of four none is."""
+    obs = np.arange(10.0).reshape(2, 1, 5, 1)
+    mask = np.array([[[1, 1, 1, 0]], [[1, 1, 1, 1]]], bool)
+    came, over = endings.arrivals(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
+    assert came[:, 0].tolist() == [1, 2, 3, 6, 7, 8, 9]
+    assert over.tolist() == pytest.approx([0, 0, 1, 0, 0, 0, 0])
