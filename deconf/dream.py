@@ -114,8 +114,8 @@ def known_range(held: Batch) -> tuple[Tensor, Tensor]:
 class World:
     """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
 
-    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O]; ends: when an episode is
-    over before its horizon.
+    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O]; ends: where an episode is
+    over before its horizon, more likely than not.
     """
 
     def __init__(
@@ -173,6 +173,6 @@ class World:
                 lost = torch.maximum(lost, there * ~inside)
                 there = there * inside
                 if self.ends is not None:
-                    there = there * (draws.uniform(n) >= self.ends.logit(obs).sigmoid())
+                    there = there * (self.ends.logit(obs) <= 0)
                 went.append(obs)
         return (total / count).mean(1), torch.stack(went, 2)
