@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 
 from deconfounded.deconf import endings
 from deconfounded.deconf.data import Batch, Draws
+from deconfounded.deconf.dream import World
 from deconfounded.deconf.nets import scalers
 from deconfounded.experts.demos import Trials
 
@@ -46,3 +50,40 @@ def test_arrivals() -> None:
     came, over = endings.arrivals(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
     assert came[:, 0].tolist() == [1, 2, 3, 6, 7, 8, 9]
     assert over.tolist() == pytest.approx([0, 0, 1, 0, 0, 0, 0])
+
+
+class Walker:
+    """As judge and actor: it goes a step ahead, and holds that for right."""
+
+    theta_hat = torch.zeros(1, 3, 1)
+    policy = SimpleNamespace(signature=SimpleNamespace(actions=0))
+    model = SimpleNamespace(dynamics=SimpleNamespace(sample=lambda obs, action, latent, draws: obs + action))
+
+    def begin(self, n: int, rngs: Any) -> None:
+        self.went = 0.0
+
+    def choose(self, obs: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(obs)
+
+    def remember(self, step: Batch) -> None:
+        self.went += float(step.mask.sum()) / 3
+
+    def point(self, obs: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(obs)
+
+
+@pytest.mark.parametrize(
+    ("limit", "steps", "off"),
+    [(3.5, 4, 0.0), (99.0, 7, 13 / 20)],
+    ids=["over: what would have followed does not count", "lost: the rest of the episode counts as wrong"],
+)
+def test_dreams_end(limit: float, steps: int, off: float) -> None:
+    """From 0 on, a step at a time; dynamics are known of 0 to 4, and so hold from -2 to 6."""
+    obs = np.arange(6.0).reshape(1, 1, 6, 1)
+    held = Batch.of(Trials(obs, np.zeros((1, 1, 5, 1)), np.ones((1, 1, 5), bool)), 1)
+    walker, ends = Walker(), SimpleNamespace(logit=lambda obs: obs[..., 0] - limit)
+    dream: Any = World
+    found, path = dream(walker, held, torch.zeros(1, 1, 1), 1, 20, ends).visit(walker, [np.random.default_rng(0)])
+    assert walker.went == steps
+    assert found.item() == pytest.approx(off)
+    assert path[0, 0, :, 0].tolist() == [min(i, steps) for i in range(1, 21)]
