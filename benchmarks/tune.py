@@ -49,7 +49,7 @@ def other(config: Any, change: Change) -> Any:
     values = {}
     for name, by in change.items():
         now = getattr(config, name)
-        values[name] = by if isinstance(by, str) else type(now)(round(now * by) if isinstance(now, int) else now * by)
+        values[name] = by if isinstance(by, str) else round(now * by) if isinstance(now, int) else now * by
     return replace(config, **values)
 
 

@@ -32,15 +32,8 @@ AUTHORS = {
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
-VALIDATED = (
-    "memory",
-    "explored",
-    "shown",
-    "ratio",
-    "stakes",
-    "strayed",
-    "unlike",
-)  # of a diagnosis, in docs/diagnose.md
+VALIDATED = ("memory", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # in docs/diagnose.md
+NOT_RUN = "It has not been run yet with today's code."
 
 
 def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
@@ -170,10 +163,15 @@ def costs() -> str:
     return markdown_table(head, rows)
 
 
+def _origin(found: dict[str, Any]) -> str:
+    """Where what is kept was made, and of which code."""
+    return f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}"
+
+
 def validation() -> str:
     """The table of docs/diagnose.md: what `validate.py` found where the truth is known."""
     if not (file := DOCS / "diagnose" / "validation.json").is_file():
-        return "It has not been run yet with today's code."
+        return NOT_RUN
     found, rows = json.loads(file.read_text()), []
     for row in found["rows"]:
         told = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
@@ -182,16 +180,15 @@ def validation() -> str:
         measured, certified = score.two_decimals(row["measured"]), "passed" if row["certified"] else "failed"
         rows.append((row["task"], certified, told, "" if row["right"] else "wrong", *cells, measured))
     head = ("task", "certificate", "diagnosis", "", *VALIDATED, "predicted gap", "measured")
-    rank, torch = score.two_decimals(found["rank_correlation"]), found["versions"]["torch"]
     text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
-measured gaps is {rank} ({found["machine"]}, torch {torch}, of {(found["commit"] or "unknown")[:7]})."""
+measured gaps is {score.two_decimals(found["rank_correlation"])} ({_origin(found)})."""
     return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
 
 
 def tuning() -> str:
     """The table of docs/tuning.md: what `tune.py` tried of each opponent, and what was best."""
     if not (file := DOCS / "tuning.json").is_file():
-        return "It has not been run yet with today's code."
+        return NOT_RUN
     found, rows = json.loads(file.read_text()), []
     tasks = list(found["rows"][0]["scores"])
     for method in dict.fromkeys(row["method"] for row in found["rows"]):
@@ -204,8 +201,7 @@ def tuning() -> str:
             cpu = [f"{row['cpu_s'][task]:.0f}" for task in tasks]
             rows.append((method, row["setting"], *scores, *cpu, "chosen" if i == best else ""))
     head = ("method", "setting", *tasks, *(f"{task}, CPU s a seed" for task in tasks), "")
-    text = f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}."
-    return f"{markdown_table(head, rows)}\n\n{text}"
+    return f"{markdown_table(head, rows)}\n\n{_origin(found)}."
 
 
 def tuned() -> str:
