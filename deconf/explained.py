@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -68,17 +69,19 @@ def by_world(
     tried, rest = (near(shown, some) for some in (tried, rest))
     model = _dynamics(tried, Signature.of(expert[0]), exploring, draws, monitor)
     _refit_noise(model, tried, draws)
-    met = _told(model, rest, each, draws)
+
+    def answers(some: Batch, latent: Tensor) -> Tensor:
+        return model.dynamics.log_prob(some.obs, some.action, some.next_obs, latent)[..., 0]
+
+    def actions(some: Batch, latent: Tensor) -> Tensor:
+        return policy.log_prob(torch.cat([model.inputs.obs(some.obs), latent], -1), some.action)
+
+    _, met = _told(answers, model, rest, each, draws)
     _refit_noise(model, shown, draws)
     policy = _conditional(model, shown, cloning, draws)
-    with torch.no_grad():
-        latents, odd = _halved(model, held, draws)
-        actions, others = (
-            mean(policy.log_prob(torch.cat([model.inputs.obs(odd.obs), _along(odd, latent)], -1), odd.action), odd)
-            for latent in (latents, latents.roll(each, 1))
-        )
-    told = _told(model, held, each, draws)
-    return Explanation(model, policy, _inferred(model, shown, draws), actions, actions - others, met, told)
+    likely, acted = _told(actions, model, held, each, draws)
+    _, told = _told(answers, model, held, each, draws)
+    return Explanation(model, policy, _inferred(model, shown, draws), likely, acted, met, told)
 
 
 def mean(x: Tensor, batch: Batch) -> float:
@@ -91,12 +94,6 @@ def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
     return model.sample(final_belief(model, batch), draws)
 
 
-def _halved(model: VariationalModel, batch: Batch, draws: Draws) -> tuple[Tensor, Batch]:
-    """A latent [1, B, D] for each trial, inferred from its even steps, and the odd ones."""
-    even = torch.arange(batch.mask.shape[2]) % 2 == 0
-    return _inferred(model, replace(batch, mask=batch.mask * even), draws), replace(batch, mask=batch.mask * ~even)
-
-
 def _along(batch: Batch, latents: Tensor) -> Tensor:
     """Each trial's latent [1, B, D] at each of its steps."""
     return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
@@ -105,10 +102,10 @@ def _along(batch: Batch, latents: Tensor) -> Tensor:
 def _dynamics(
     explored: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
 ) -> VariationalModel:
-    """Eq. (6), of sets: half of a trial's steps, whichever, tell the latent that predicts the others.
+    """Eq. (6), of sets: half of a trial's steps, drawn at random, tell the latent that predicts the other half.
 
-    In deployment it is the beginning that tells it, and what comes next that is predicted. A belief learned so is never
-    asked what came before: of single episodes it says how late it is, and nobody's start can be dreamt with it.
+    Not the beginning, with what comes next to predict, as in deployment: a latent of single episodes, learned so, told
+    how late in its episode a step is, and dreams begun with it were of no use.
     """
     model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(explored), draws)
     optimizer = Adam([model], how.inference_rate, how.inference_updates)
@@ -158,14 +155,18 @@ def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
 
 
 @torch.no_grad()
-def _told(model: VariationalModel, rest: Batch, each: int, draws: Draws) -> float:
-    """How much likelier a trial's latent, of its even steps, makes its odd ones than that of the trial `each` on."""
-    own, odd = _halved(model, rest, draws)
-    true, other = (
-        model.dynamics.log_prob(odd.obs, odd.action, odd.next_obs, _along(odd, latent))[..., 0]
-        for latent in (own, own.roll(each, 1))
-    )
-    return mean(true - other, odd)
+def _told(
+    log_prob: Callable[[Batch, Tensor], Tensor], model: VariationalModel, data: Batch, each: int, draws: Draws
+) -> tuple[float, float]:
+    """How likely trials' odd steps are given latents inferred from the even ones, nats a step; and how much more so
+    than given that of the trial `each` on.
+
+    log_prob: of steps [1, B, T], given latents [1, B, T, D].
+    """
+    even = torch.arange(data.mask.shape[2]) % 2 == 0
+    odd, latents = replace(data, mask=data.mask * ~even), _inferred(model, replace(data, mask=data.mask * even), draws)
+    own, other = (mean(log_prob(odd, _along(odd, latent)), odd) for latent in (latents, latents.roll(each, 1)))
+    return own, own - other
 
 
 def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
