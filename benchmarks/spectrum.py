@@ -21,7 +21,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks import commands, noisier
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
 from deconfounded.envs.files import save_figure, write_json
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
@@ -90,9 +90,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(noisier.BASES), help="default: both")
     args = parser.parse_args()
     methods = commands.check(args, LEARNED, LEARNED)
-    for base in args.tasks:
-        if base not in noisier.BASES:
-            raise envs.closest("task", base, list(noisier.BASES))
+    check_names("task", args.tasks, list(noisier.BASES))
     from deconfounded.benchmarks.certify import certify
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
     from deconfounded.benchmarks.engine.pool import prepare, run_all

@@ -22,7 +22,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
-from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
 from deconfounded.envs.files import write_json
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -65,9 +65,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", metavar="NAME", help=f"some of {', '.join(TRIED)}; default: all")
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
     args = parser.parse_args()
-    for name in args.methods or ():
-        if name not in TRIED:
-            raise envs.closest("method", name, list(TRIED))
+    check_names("method", args.methods or (), list(TRIED))
     from deconfounded.benchmarks.engine.jobs import BenchmarkJob
     from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.pool import prepare, run_all

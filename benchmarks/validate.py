@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
@@ -118,9 +119,7 @@ def main() -> None:
     parser.add_argument("--out", type=place, default=Path("results") / "validation", help="output folder")
     args = parser.parse_args()
     known = {case.rpartition(":")[2]: case for case in CASES}
-    for name in args.tasks or ():
-        if name not in known:
-            raise envs.closest("task", name, list(known))
+    check_names("task", args.tasks or (), list(known))
     from scipy import stats
 
     from deconfounded.benchmarks.diagnose import run

@@ -104,12 +104,16 @@ PRESETS = {
 }
 
 
+def check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raises InputError for a name that is not known."""
+    for name in names:
+        if name not in known:
+            raise envs.closest(kind, name, list(known))
+
+
 def check(name: str, methods: Sequence[str] | None, seeds: int | None, known: Sequence[str]) -> None:
     """Raises InputError for a preset, methods, or a number of seeds (None: the preset's) that cannot be."""
-    for method in methods or ():
-        if method not in known:
-            raise envs.closest("method", method, list(known))
-    if name not in PRESETS:
-        raise envs.closest("preset", name, list(PRESETS))
+    check_names("method", methods or (), known)
+    check_names("preset", [name], list(PRESETS))
     if seeds is not None and not 1 <= seeds <= MOST_SEEDS:
         raise envs.InputError(f"--seeds was {seeds}; it must be at least 1, and at most {MOST_SEEDS:,}")
