@@ -21,7 +21,7 @@ Verdict = Literal["confounded", "not confounded", "cannot tell"]
 LITTLE, SILENT = 0.1, 0.01  # nats a step: of memory, of the world
 WORSE = 0.2  # nats a step by which a clone may be worse for its memory
 FINE, GAP = 0.8, 0.15  # scores
-STAKES, STRAYED = 1.5, 2.0  # times chance
+STAKES = 1.5  # times chance
 LIKE = 4.0  # how strange dreams may be, among what happened, and be believed of what does not show
 
 
@@ -194,9 +194,9 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         f" {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
         " actions for the expert's."
     )
-    if shown.value < LITTLE and explained.high <= 0:
+    if shown.value < LITTLE and explained.high < LITTLE:
         why = (
-            "The latter is next to nothing, and what it tells does not explain what the expert does: expert trials do"
+            "Both are next to nothing, and what the world tells does not explain what the expert does: expert trials do"
             " not say which latent was theirs, and no exploration helps. Ask what the expert would do where the clone"
             " goes; if the world tells it nowhere, only a sensor does."
         )

@@ -102,11 +102,19 @@ class Clone:
         self.agent.remember(step)
 
 
+def seen_range(*data: Batch) -> tuple[Tensor, Tensor]:
+    """Least and largest observation [S, 1, O] of trials [S, B, T]."""
+    low, high = [], []
+    for some in data:
+        padding, both = some.mask[..., None] == 0, (some.obs, some.next_obs)
+        low += [obs.masked_fill(padding, torch.inf).amin((1, 2)) for obs in both]
+        high += [obs.masked_fill(padding, -torch.inf).amax((1, 2)) for obs in both]
+    return torch.stack(low).amin(0)[:, None], torch.stack(high).amax(0)[:, None]
+
+
 def known_range(held: Batch) -> tuple[Tensor, Tensor]:
     """Least and largest observation [S, 1, O] for which dynamics are to hold: the data, and half its range beyond."""
-    padding = held.mask[..., None] == 0
-    low = held.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
-    high = held.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
+    low, high = seen_range(held)
     margin = (0.5 * (high - low)).clamp(min=1e-3)
     return low - margin, high + margin
 
@@ -114,18 +122,19 @@ def known_range(held: Batch) -> tuple[Tensor, Tensor]:
 class World:
     """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
 
-    held: expert trials [S, B, T], in whose known_range the dynamics hold; starts [S, K, O]; ends: where an episode is
-    over before its horizon, more likely than not.
+    held: expert trials [S, B, T], in whose known_range the dynamics hold, and from whose starts episodes begin; all
+    trials that there are say what is ever observed, beyond which no dream goes: a sensor may reach no further. ends:
+    where an episode is over before its horizon, more likely than not.
     """
 
     def __init__(
-        self, judge: Expert, held: Batch, starts: Tensor, episodes: int, horizon: int, ends: Endings | None
+        self, judge: Expert, held: Batch, every: Sequence[Batch], episodes: int, horizon: int, ends: Endings | None
     ) -> None:
         self.judge, self.horizon, self.ends = judge, horizon, ends
+        n, starts = judge.theta_hat.shape[1], held.obs[:, :, 0]
         draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
-        n = judge.theta_hat.shape[1]
         self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
-        self.low, self.high = known_range(held)
+        self.known, self.seen = known_range(held), seen_range(*every)
         self.scale = self._scale(held)
 
     def _scale(self, held: Batch) -> Tensor:
@@ -167,9 +176,10 @@ class World:
                 total += there * self._off(obs, action) + lost
                 count += there + lost
                 next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
+                next_obs = next_obs.clamp(*self.seen)
                 actor.remember(Batch(obs, action, next_obs, there))
                 obs = torch.where(there[..., None] > 0, next_obs, obs)
-                inside = ((obs >= self.low) & (obs <= self.high)).all(-1)
+                inside = ((obs >= self.known[0]) & (obs <= self.known[1])).all(-1)
                 lost = torch.maximum(lost, there * ~inside)
                 there = there * inside
                 if self.ends is not None:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from deconfounded.deconf import cloning, endings, explained, naive_rnn
 from deconfounded.deconf.agents import Monitor
@@ -26,7 +25,7 @@ from deconfounded.deconf.dream import Clone, Expert, Filter, World
 from deconfounded.deconf.drift import apart
 from deconfounded.deconf.explained import Explanation, mean
 from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.paths import familiar, oddest, strange, strayed, ways
+from deconfounded.deconf.paths import back, oddest, strange, strayed, ways
 from deconfounded.deconf.recurrent import RecurrentConfig
 from deconfounded.deconf.sizes import MANY, SPACIOUS, WIDE
 from deconfounded.experts.demos import Agent, Trials
@@ -38,11 +37,12 @@ CLEARLY = 0.1  # nats a step
 class Amounts:
     """Of training, for one split; offline: of Eq. (7); exploring: of Eq. (6).
 
-    rivals: latents that each episode's own is weighed against. dreams: trials of each actor in the learned dynamics.
+    rivals: latents of the data, each as likely as the others, of which dreams have one. dreams: trials of each actor in
+    the learned dynamics.
     """
 
     held_out: float = 0.25  # share of the trials
-    rivals: int = 24
+    rivals: int = 32
     dreams: int = 192
     cloning: CloningConfig = field(default_factory=lambda: CloningConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
@@ -75,10 +75,10 @@ class Findings(NamedTuple):
     another latent for true, among those of experts who know theirs, in what shows it most, over the same by chance.
     strayed: how far they are from those of the expert who knows that latent, from the same start, over the same by
     chance. unlike: how strange these are in turn, among those of the data, on the whole. naive, latent: scores of a
-    naive clone and of one that infers the latent from the world, by the logarithm of how far they strayed: 1 comes
-    about where the expert who knows does, 0 nowhere near. naive_judged, latent_judged: the same as the expert judges
-    their actions, Eq. (1): 0 is an expert who holds another latent for true, 1 the one who knows it. Without
-    exploration, explained to acted are None, and the latent is one that explains actions too, Eq. (7).
+    naive clone and of one that infers the latent from the world, by how far they strayed: 1 is the expert who knows the
+    latent, 0 the one who holds another for true. naive_judged, latent_judged: the same as the expert judges their
+    actions, Eq. (1). Without exploration, explained to acted are None, and the latent is one that explains actions
+    too, Eq. (7).
     """
 
     memory: float
@@ -127,41 +127,32 @@ def measure(
         found = explained.alone(shown, amounts.offline, draws, Part(tell, 0.25, 0.8))
     else:
         found = _by_world(expert, split(explore, amounts.held_out, rng), amounts, draws, tell)
-    ends = endings.fit([shown] if explore is None else [shown, explore], blind.scaler, draws)
+    data = [shown] if explore is None else [shown, explore]
+    ends = endings.fit(data, blind.scaler, draws)
     with torch.no_grad():
         other, episodes = Batch.of(held, 1), Batch.of(apart(shown), 1)
         present = mean(blind.policy.log_prob(blind.scaler(other.obs), other.action), other)
         memory = -float(recurrent.held_out_loss(other)) - present
-        known, mistaken, rivals = (
-            take(found.latents, draws.below(found.latents.shape[1], n))
-            for n in (amounts.dreams, amounts.dreams, amounts.rivals)
-        )
-        knower, starts = Expert(found.model, found.policy, known), episodes.obs[:, :, 0]
-        dreamt = World(knower, episodes, starts, trials.mask.shape[1], trials.mask.shape[2], ends)
-        actors = (
-            knower,
-            Expert(found.model, found.policy, mistaken),
-            Clone(recurrent),
-            Filter(found.model, found.policy, rivals),
-        )
-        (one, home), (zero, away), *others, (_, again) = (dreamt.visit(actor, rngs) for actor in (*actors, knower))
-        judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off, _ in others]
-
-        half, chance = amounts.dreams // 2, strayed(again[0], home[0], again[0])
-
-        def astray(path: Tensor) -> float:
-            """From those who know, each from its own, over what chance is."""
-            return oddest(strayed(path[0], home[0], again[0]), chance)
-
-        usual, more = home[0, :half], again[0, half:]
-        odd = oddest(*(strange(path[0, half:], usual, more) for path in (away, home)))
-        naive, latent = (familiar(astray(path)) for _, path in others)
-        went = ways(episodes)[torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))]
-        unlike = float(strange(home[0], *went.tensor_split(2)).mean())
+        rivals = take(found.latents, draws.below(found.latents.shape[1], amounts.rivals))
+        known, mistaken = (take(rivals, draws.below(amounts.rivals, amounts.dreams)) for _ in range(2))
+        knower, every = Expert(found.model, found.policy, known), [Batch.of(some, 1) for some in data]
+        dreamt = World(knower, episodes, every, trials.mask.shape[1], trials.mask.shape[2], ends)
+        mistaker, cloned = Expert(found.model, found.policy, mistaken), Clone(recurrent)
+        inferring = Filter(found.model, found.policy, rivals)
+        visits = [dreamt.visit(actor, rngs) for actor in (knower, mistaker, cloned, inferring, knower, knower)]
+        one, zero, *others = (off for off, _ in visits[:4])
+        judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off in others]
+        home, away, *went, again, anew = (path[0] for _, path in visits)
+        mistake, chance, *astray = (strayed(path, home, again) for path in (away, anew, *went))
+        naive, latent = (back(off, mistake, chance) for off in astray)
+        half = amounts.dreams // 2
+        odd = oddest(*(strange(path[half:], home[:half], again[half:]) for path in (away, home)))
+        shuffled = torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))
+        unlike = float(strange(home, *ways(episodes)[shuffled].tensor_split(2)).mean())
     tell(1)
     world = None if found.actions is None else found.actions - present
     told = (world, found.explored, found.shown, found.acted)
-    return Findings(memory, *told, odd, astray(away), unlike, naive, latent, *judged)
+    return Findings(memory, *told, odd, oddest(mistake, chance), unlike, naive, latent, *judged)
 
 
 def _by_world(

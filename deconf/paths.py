@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -43,9 +41,11 @@ def oddest(strangeness: Tensor, chance: Tensor) -> float:
     return float(strangeness.max() / chance.max().clamp(min=1))
 
 
-def familiar(strangeness: float) -> float:
-    """As a score: 1 if alike, falling with the logarithm, to 0 where nothing is as usual."""
-    return min(1.0, max(0.0, 1 - math.log(max(1.0, strangeness)) / math.log(FAR)))
+def back(off: Tensor, mistaken: Tensor, chance: Tensor) -> float:
+    """As a score, how far one strayed [F, O]: 1 is by chance, 0 as far as one who is mistaken, in least squares."""
+    known = (mistaken - chance).clamp(min=0)
+    lost = (known * (off - chance)).sum() / known.square().sum().clamp(min=1e-6)
+    return float(1 - lost.clamp(0, 1))
 
 
 def _ratio(known: Tensor, off: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from deconfounded.deconf.data import Batch
-from deconfounded.deconf.paths import FAR, familiar, oddest, strange, strayed, ways
+from deconfounded.deconf.paths import back, oddest, strange, strayed, ways
 from deconfounded.experts.demos import Trials
 
 
@@ -41,7 +41,12 @@ def test_of_each_its_own() -> None:
 
 
 def test_as_score() -> None:
-    assert [familiar(s) for s in (0.0, 1.0, FAR**0.5, FAR, 2 * FAR)] == pytest.approx([1, 1, 0.5, 0, 0])
+    """Of three figures the mistaken one is off in two, three times as far in the first: it weighs nine times."""
+    chance, mistaken = torch.ones(3), torch.tensor([4.0, 2.0, 1.0])
+    for off, score in (([1, 1, 9], 1), ([4, 2, 1], 0), ([2.5, 1.5, 1], 0.5), ([4, 1, 1], 0.1), ([1, 2, 1], 0.9)):
+        assert back(torch.tensor(off), mistaken, chance) == pytest.approx(score)
+    assert back(torch.tensor([9.0, 9.0, 1.0]), mistaken, chance) == 0
+    assert back(torch.tensor([0.5, 0.5, 1.0]), mistaken, chance) == 1
 
 
 def test_ways() -> None:

@@ -32,7 +32,7 @@ AUTHORS = {
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
-VALIDATED = ("memory", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # in docs/diagnose.md
+VALIDATED = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # in docs/diagnose.md
 NOT_RUN = "It has not been run yet with today's code."
 
 
