@@ -83,8 +83,8 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
 
-    Found is also the `gap`: what cloning is predicted to lose, in scores of where it comes about; `gap_judged`, by Eq.
-    (1); and the `ratio` of what actions tell to what the world does. tier: of the paper; None if it is not known, or if
+    Found is also the `gap`: what cloning is predicted to lose, in scores of where it goes; `gap_judged`, by Eq. (1);
+    and the `ratio` of what actions tell to what the world does. tier: of the paper; None if it is not known, or if
     none does.
     """
 
@@ -178,8 +178,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         "The expert acts on something that the present observation does not show. In the learned dynamics, one who"
         f" mistakes it goes ways {stakes} times as strange as the ways of those who know it, and {strayed} times as far"
         f" from that one's own as chance does. A naive clone scores {naive} there, one that infers the latent from the"
-        f" world {latent}: 1 comes about where the one who knows it does, 0 nowhere near. By their actions, Eq. (1),"
-        f" it is {found['naive_judged']} and {found['latent_judged']}: 1 knows the latent, 0 acts on another one."
+        f" world {latent}; by their actions, Eq. (1), it is {found['naive_judged']} and {found['latent_judged']}: 1"
+        " is the expert who knows the latent, 0 one who mistakes it."
     )
     if explored is None:
         why = (
@@ -203,10 +203,10 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         return told("confounded", 3, why, ASK)
     if shown.low <= SILENT:
         return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
-    if stakes.high < STAKES and strayed.high < STRAYED and unlike.value < LIKE and explained.low > 0:
+    if max(stakes.high, strayed.high) < STAKES and unlike.value < LIKE and explained.low > 0:
         why = "Who mistakes it comes about like the others, and where they do; and so will a clone."
         return told("not confounded", 1, why, CLONE)
-    if not any(one.value >= least and one.low > 1 for one, least in ((stakes, STAKES), (strayed, STRAYED))):
+    if not any(one.value >= STAKES and one.low > 1 for one in (stakes, strayed)):
         why = (
             "The ways may be other ones by chance: either it hardly matters, or the dynamics are not known well enough"
             f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"

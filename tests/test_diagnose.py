@@ -122,6 +122,7 @@ class TestJudge:
             (ALONE, "cannot tell", None, diagnose.TRY),
             ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
             ({"shown": 0.05, "explained": -0.1}, "confounded", 3, diagnose.ASK),
+            ({"shown": 0.05, "explained": 0.05}, "confounded", 3, diagnose.ASK),
             ({"shown": 0.05}, "confounded", 2, diagnose.EXPLORE),
             ({"explained": -0.1}, "confounded", 2, diagnose.EXPLORE),
             ({"shown": -0.5}, "cannot tell", None, diagnose.WIDER),
@@ -152,7 +153,7 @@ class TestJudge:
         assert diagnose.judge([CLEAR, CLEAR._replace(shown=-0.002)]).verdict == "cannot tell"
         mixed = CLEAR._replace(shown=0.05, explained=-0.1)
         assert diagnose.judge([mixed, mixed]).tier == 3
-        assert diagnose.judge([mixed, mixed._replace(explained=0.1)]).tier == 2
+        assert diagnose.judge([mixed, mixed._replace(explained=0.2)]).tier == 2
         alike = CLEAR._replace(strayed=1.4)
         assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"

@@ -73,17 +73,27 @@ class Walker:
 
 
 @pytest.mark.parametrize(
-    ("limit", "steps", "off"),
-    [(3.5, 4, 0.0), (99.0, 7, 13 / 20)],
-    ids=["over: what would have followed does not count", "lost: the rest of the episode counts as wrong"],
+    ("limit", "seen", "steps", "last", "off"),
+    [(3.5, 99.0, 4, 4.0, 0.0), (99.0, 99.0, 8, 8.0, 12 / 20), (99.0, 5.0, 20, 5.0, 0.0)],
+    ids=[
+        "over: what would have followed does not count",
+        "lost: the rest of the episode counts as wrong",
+        "what was never observed is not dreamt of",
+    ],
 )
-def test_dreams_end(limit: float, steps: int, off: float) -> None:
-    """From 0 on, a step at a time; dynamics are known of 0 to 4, and so hold from -2 to 6."""
-    obs = np.arange(6.0).reshape(1, 1, 6, 1)
-    held = Batch.of(Trials(obs, np.zeros((1, 1, 5, 1)), np.ones((1, 1, 5), bool)), 1)
+def test_dreams_end(limit: float, seen: float, steps: int, last: float, off: float) -> None:
+    """From 0 on, a step at a time; dynamics are known of 0 to 5, and so hold from -2.5 to 7.5."""
+
+    def trial(*obs: float) -> Batch:
+        steps = len(obs) - 1
+        return Batch.of(
+            Trials(np.reshape(obs, (1, 1, -1, 1)), np.zeros((1, 1, steps, 1)), np.ones((1, 1, steps), bool)), 1
+        )
+
     walker, ends = Walker(), SimpleNamespace(logit=lambda obs: obs[..., 0] - limit)
     dream: Any = World
-    found, path = dream(walker, held, torch.zeros(1, 1, 1), 1, 20, ends).visit(walker, [np.random.default_rng(0)])
+    held = trial(*range(6))
+    found, path = dream(walker, held, [held, trial(-1, seen)], 1, 20, ends).visit(walker, [np.random.default_rng(0)])
     assert walker.went == steps
     assert found.item() == pytest.approx(off)
-    assert path[0, 0, :, 0].tolist() == [min(i, steps) for i in range(1, 21)]
+    assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.deconf.diagnose import FINE, LITTLE, STAKES, STRAYED, Diagnosis, Figure
+from deconfounded.deconf.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
@@ -96,8 +96,8 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
                 "Does the world tell it?",
                 f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
                 f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
-                f" below {LITTLE}, and explains no action, expert trials do not say which latent was theirs. The"
-                f" expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so sure is a clone"
+                f" below {LITTLE}, and explains next to none of the actions, expert trials do not say which latent was"
+                f" theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so sure is a clone"
                 " that takes its own actions for the expert's.",
                 lambda axes: _bars(axes, told, "nats a step", LITTLE),
             )
@@ -109,10 +109,9 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         (
             "What will it cost?",
             f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange as"
-            f" usual, and {strayed} times as far as usual from those of the expert who knows it; below {STAKES} and"
-            f" {STRAYED} that may be chance. There a naive clone scores {naive}, and one that infers the latent from"
-            f" the world {latent}: 1 comes about where the expert who knows it does, 0 nowhere near; by their actions,"
-            " Eq. (1), 1 knows the latent and 0 acts on another one.",
+            f" usual, and {strayed} times as far as usual from those of the expert who knows it; below {STAKES} that"
+            f" may be chance. Between that one, 0, and the expert who knows, 1, a naive clone scores {naive} by where"
+            f" it goes, and one that infers the latent from the world {latent}; Eq. (1) is the same by their actions.",
             lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
         )
     )
