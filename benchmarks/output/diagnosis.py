@@ -97,8 +97,8 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
                 f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
                 f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
                 f" below {LITTLE}, and explains next to none of the actions, expert trials do not say which latent was"
-                f" theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so sure is a clone"
-                " that takes its own actions for the expert's.",
+                f" theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so"
+                " sure is a clone that takes its own actions for the expert's.",
                 lambda axes: _bars(axes, told, "nats a step", LITTLE),
             )
         )
