@@ -12,6 +12,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,14 @@ def title(change: Change) -> str:
     return ", ".join(told) or "the preset"
 
 
+def share(source: Path, other: Path, but: str = "") -> None:
+    """Demonstrations and references are the same for all settings: those that another folder lacks are copied there."""
+    other.mkdir(parents=True, exist_ok=True)
+    for file in source.glob("*.npz"):
+        if not (other / file.name).exists() and file.stem.rpartition("-")[0] != but:
+            shutil.copyfile(file, other / file.name)
+
+
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -84,7 +93,9 @@ def main() -> None:
                 jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
                 with commands.locked(own):
                     prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
+                    share(args.out / task.name, own / "jobs")
                     finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", Local())
+                    share(own / "jobs", args.out / task.name, but=name)
                 found = records.gather(records.of_run(finished, "default", [], task.episodes))["methods"]
                 row["scores"][task.name] = [round(score, 4) for score in last_scores(found)[name].values()]
                 row["cpu_s"][task.name] = found[name]["cpu_s"]
