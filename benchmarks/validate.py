@@ -40,7 +40,7 @@ LEARNED = ("naive_rnn", "deconfounded")
 
 
 def right(task: envs.Task, certified: bool, told: Diagnosis) -> bool:
-    """Whether a diagnosis says what is so.
+    """Whether a diagnosis says what is so; of a certified task, that Tier 2 cures it.
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
@@ -49,7 +49,7 @@ def right(task: envs.Task, certified: bool, told: Diagnosis) -> bool:
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
         return bool(told.verdict == "confounded" and told.tier == 3)
     alike = task.name == "nothing_hidden" and told.next is VARY
-    return bool(alike or told.verdict == ("confounded" if certified else "not confounded"))
+    return bool(alike or (told.verdict, told.tier) == (("confounded", 2) if certified else ("not confounded", 1)))
 
 
 def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:

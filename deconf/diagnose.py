@@ -143,10 +143,14 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
 
 
 def judge(refits: Sequence[Findings]) -> Diagnosis:
-    """The verdict, and why."""
+    """The verdict, and why. Raises InputError if a figure is not finite."""
     found = {}
     for key, each in zip(Findings._fields, zip(*refits, strict=True), strict=True):
         if values := [value for value in each if value is not None]:
+            if not np.isfinite(values).all():
+                raise InputError(
+                    f"learning failed: {key} is {values}; are there outliers, or scales that differ a lot?"
+                )
             found[key] = Figure.of(values)
     gap = found["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
     judged = found["gap_judged"] = Figure.of([refit.latent_judged - refit.naive_judged for refit in refits])
@@ -154,7 +158,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     naive, latent = found["naive"], found["latent"]
     explored = found.get("explored")
     if explored is not None:
-        found["ratio"] = Figure.of([(refit.acted or 0) / max(refit.shown or 0, SILENT) for refit in refits])
+        found["ratio"] = Figure.of([(refit.acted or 0.0) / max(refit.shown or 0.0, SILENT) for refit in refits])
     said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]
 
     def told(verdict: Verdict, tier: int | None, why: str, then: Next) -> Diagnosis:
@@ -194,11 +198,12 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         f" {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
         " actions for the expert's."
     )
-    if shown.value < LITTLE and explained.high < LITTLE:
+    if max(-shown.low, shown.high, explained.high) < LITTLE:
         why = (
             "Both are next to nothing, and what the world tells does not explain what the expert does: expert trials do"
             " not say which latent was theirs, and no exploration helps. Ask what the expert would do where the clone"
-            " goes; if the world tells it nowhere, only a sensor does."
+            " goes; if the world tells it nowhere, only a sensor does. (An expert that remembers, or whose noise lasts,"
+            " looks the same; asked, it shows that too.)"
         )
         return told("confounded", 3, why, ASK)
     if shown.low <= SILENT:

@@ -65,11 +65,6 @@ class Filter(Expert):
         every, latent = self._every(step)
         return self.model.dynamics.log_prob(every.obs, every.action, every.next_obs, latent)[..., 0]
 
-    def log_policy(self, step: Batch) -> Tensor:
-        """log pi(a | s, theta_hat_k) [..., K] of steps [S, ...]."""
-        every, latent = self._every(step)
-        return self.policy.log_prob(self.features(every.obs, latent), every.action)
-
     def _every(self, step: Batch) -> tuple[Batch, Tensor]:
         """Each step under each latent."""
         shape = (*step.mask.shape, self.theta_hat.shape[1])
@@ -100,6 +95,13 @@ class Clone:
 
     def remember(self, step: Batch) -> None:
         self.agent.remember(step)
+
+
+def farther(rivals: Tensor, known: Tensor, draws: Draws) -> Tensor:
+    """For each of known ones [S, N] of latents [S, K, D], another, of the half that is farther from it."""
+    half = max(1, rivals.shape[1] // 2)
+    far = torch.cdist(rivals, rivals).argsort(-1, descending=True)[..., :half]
+    return take(far, known).gather(-1, draws.below(half, known.shape[1])[..., None])[..., 0]
 
 
 def seen_range(*data: Batch) -> tuple[Tensor, Tensor]:
@@ -176,9 +178,8 @@ class World:
                 total += there * self._off(obs, action) + lost
                 count += there + lost
                 next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
-                next_obs = next_obs.clamp(*self.seen)
-                actor.remember(Batch(obs, action, next_obs, there))
-                obs = torch.where(there[..., None] > 0, next_obs, obs)
+                actor.remember(Batch(obs, action, next_obs, there))  # as drawn: of that, log_next is the likelihood
+                obs = torch.where(there[..., None] > 0, next_obs.clamp(*self.seen), obs)
                 inside = ((obs >= self.known[0]) & (obs <= self.known[1])).all(-1)
                 lost = torch.maximum(lost, there * ~inside)
                 there = there * inside

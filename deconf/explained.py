@@ -28,7 +28,8 @@ LEAST = 0.02  # share of exploring steps that are where the expert goes
 class Explanation(NamedTuple):
     """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
 
-    actions: log-likelihood of half of the expert's held-out actions, given latents of the other half, nats a step.
+    actions: log-likelihood of half of the expert's held-out actions (`odd`), given latents of the other half, nats a
+    step.
     acted: how much less it is given another trial's; explored, shown: the same of what the world answered, in
     exploration, and where the expert went. None without exploration.
     """
@@ -46,7 +47,7 @@ def alone(shown: Trials, how: OfflineConfig, draws: Draws, monitor: Monitor) -> 
     """Of expert trials: a latent that explains actions and answers, Eq. (7)."""
     data = Batch.of(shown, 1)
     model, _, policy = offline.explain(data, Signature.of(shown), how, draws, monitor)
-    return Explanation(model, policy, _inferred(model, data, draws))
+    return Explanation(model, policy, model.sample(final_belief(model, data), draws))
 
 
 def by_world(
@@ -81,7 +82,7 @@ def by_world(
     policy = _conditional(model, shown, cloning, draws)
     likely, acted = _told(actions, model, held, each, draws)
     _, told = _told(answers, model, held, each, draws)
-    return Explanation(model, policy, _inferred(model, shown, draws), likely, acted, met, told)
+    return Explanation(model, policy, model.sample(_belief(model, shown), draws), likely, acted, met, told)
 
 
 def mean(x: Tensor, batch: Batch) -> float:
@@ -89,9 +90,14 @@ def mean(x: Tensor, batch: Batch) -> float:
     return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
 
 
-def _inferred(model: VariationalModel, batch: Batch, draws: Draws) -> Tensor:
-    """A latent [1, B, D] for each trial."""
-    return model.sample(final_belief(model, batch), draws)
+def odd(batch: Batch) -> Batch:
+    """Every other step, beginning with the second."""
+    return replace(batch, mask=batch.mask * (torch.arange(batch.mask.shape[2]) % 2))
+
+
+def _belief(model: VariationalModel, batch: Batch) -> Tensor:
+    """Of each trial [1, B, P], told by the other steps: half of them, as where it was learned."""
+    return final_belief(model, replace(batch, mask=batch.mask - odd(batch).mask))
 
 
 def _along(batch: Batch, latents: Tensor) -> Tensor:
@@ -147,7 +153,7 @@ def near(data: Batch, explored: Batch) -> Batch:
 @torch.no_grad()
 def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
     """Noise of the size it has in these trials: what is learned last, and falls and the like swell it."""
-    head, latents = model.dynamics, _along(data, _inferred(model, data, draws))
+    head, latents = model.dynamics, _along(data, model.sample(_belief(model, data), draws))
     if not model.inputs.signature.binary:
         off = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
         square = masked_mean(off.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
@@ -158,21 +164,20 @@ def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
 def _told(
     log_prob: Callable[[Batch, Tensor], Tensor], model: VariationalModel, data: Batch, each: int, draws: Draws
 ) -> tuple[float, float]:
-    """How likely trials' odd steps are given latents inferred from the even ones, nats a step; and how much more so
-    than given that of the trial `each` on.
+    """How likely trials' odd steps are given latents inferred from the others, nats a step; and how much more so than
+    given that of the trial `each` on.
 
     log_prob: of steps [1, B, T], given latents [1, B, T, D].
     """
-    even = torch.arange(data.mask.shape[2]) % 2 == 0
-    odd, latents = replace(data, mask=data.mask * ~even), _inferred(model, replace(data, mask=data.mask * even), draws)
-    own, other = (mean(log_prob(odd, _along(odd, latent)), odd) for latent in (latents, latents.roll(each, 1)))
+    rest, latents = odd(data), model.sample(_belief(model, data), draws)
+    own, other = (mean(log_prob(rest, _along(rest, latent)), rest) for latent in (latents, latents.roll(each, 1)))
     return own, own - other
 
 
 def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
     """A policy, cloned given the latents that a model infers from the trials."""
     policy = ActionHead(model.inputs.obs_width + model.latent, how.width, model.inputs.signature, draws)
-    agent, belief = DeconfoundedAgent(model, policy), final_belief(model, data)
+    agent, belief = DeconfoundedAgent(model, policy), _belief(model, data)
     optimizer = Adam([policy], how.learning_rate, how.updates)
     for _ in range(how.updates):
         optimizer.step(agent.loss(data, belief, how.batch, draws))

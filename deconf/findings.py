@@ -9,19 +9,20 @@ drawn from the data, and are judged by the expert who knows the latent, as in Eq
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from deconfounded.deconf import cloning, endings, explained, naive_rnn
-from deconfounded.deconf.agents import Monitor
+from deconfounded.deconf.agents import LearnedAgent, Monitor
 from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, take
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.dream import Clone, Expert, Filter, World
+from deconfounded.deconf.dream import Actor, Clone, Expert, Filter, World, farther
 from deconfounded.deconf.drift import apart
 from deconfounded.deconf.explained import Explanation, mean
 from deconfounded.deconf.offline import OfflineConfig
@@ -72,7 +73,8 @@ class Findings(NamedTuple):
     makes the world's answers in exploration than another trial's does; shown: in the expert's trials; acted: how much
     more likely it makes the expert's actions there, the evidence that a naive clone takes its own for. The others are
     seen in the last episode of trials in the learned dynamics. stakes: how strange the ways of one are who holds
-    another latent for true, among those of experts who know theirs, in what shows it most, over the same by chance.
+    another latent for true, of the half that is farther from it, among those of experts who know theirs, in what shows
+    it most, over the same by chance.
     strayed: how far they are from those of the expert who knows that latent, from the same start, over the same by
     chance. unlike: how strange these are in turn, among those of the data, on the whole. naive, latent: scores of a
     naive clone and of one that infers the latent from the world, by how far they strayed: 1 is the expert who knows the
@@ -131,28 +133,53 @@ def measure(
     ends = endings.fit(data, blind.scaler, draws)
     with torch.no_grad():
         other, episodes = Batch.of(held, 1), Batch.of(apart(shown), 1)
-        present = mean(blind.policy.log_prob(blind.scaler(other.obs), other.action), other)
-        memory = -float(recurrent.held_out_loss(other)) - present
-        rivals = take(found.latents, draws.below(found.latents.shape[1], amounts.rivals))
-        known, mistaken = (take(rivals, draws.below(amounts.rivals, amounts.dreams)) for _ in range(2))
-        knower, every = Expert(found.model, found.policy, known), [Batch.of(some, 1) for some in data]
-        dreamt = World(knower, episodes, every, trials.mask.shape[1], trials.mask.shape[2], ends)
-        mistaker, cloned = Expert(found.model, found.policy, mistaken), Clone(recurrent)
-        inferring = Filter(found.model, found.policy, rivals)
-        visits = [dreamt.visit(actor, rngs) for actor in (knower, mistaker, cloned, inferring, knower, knower)]
-        one, zero, *others = (off for off, _ in visits[:4])
-        judged = [float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off in others]
-        home, away, *went, again, anew = (path[0] for _, path in visits)
-        mistake, chance, *astray = (strayed(path, home, again) for path in (away, anew, *went))
-        naive, latent = (back(off, mistake, chance) for off in astray)
-        half = amounts.dreams // 2
-        odd = oddest(*(strange(path[half:], home[:half], again[half:]) for path in (away, home)))
-        shuffled = torch.randperm(episodes.obs.shape[1], generator=torch.Generator().manual_seed(0))
-        unlike = float(strange(home, *ways(episodes)[shuffled].tensor_split(2)).mean())
+        present = blind.policy.log_prob(blind.scaler(other.obs), other.action)
+        memory = -float(recurrent.held_out_loss(other)) - mean(present, other)
+        some = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # logs are ragged
+        every, (_, each, horizon) = [Batch.of(trials, 1) for trials in data], trials.mask.shape
+
+        def world(judge: Expert) -> World:
+            return World(judge, some, every, each, horizon, ends)
+
+        dreamt = _dreamt(found, world, recurrent, ways(some), amounts, rngs)
     tell(1)
-    world = None if found.actions is None else found.actions - present
-    told = (world, found.explored, found.shown, found.acted)
-    return Findings(memory, *told, odd, oddest(mistake, chance), unlike, naive, latent, *judged)
+    tells = None if found.actions is None else found.actions - mean(present, explained.odd(other))
+    return Findings(memory, tells, found.explored, found.shown, found.acted, *dreamt)
+
+
+def _dreamt(
+    found: Explanation,
+    world: Callable[[Expert], World],
+    recurrent: LearnedAgent,
+    went: Tensor,
+    amounts: Amounts,
+    rngs: list[np.random.Generator],
+) -> tuple[float, ...]:
+    """Stakes and what follows in Findings. went: the ways of the data's episodes, [N, T, O]."""
+    draws = Draws(rngs, "cpu")
+    rivals = take(found.latents, draws.below(found.latents.shape[1], amounts.rivals))
+    known = draws.below(amounts.rivals, amounts.dreams)
+    knower, mistaker = (
+        Expert(found.model, found.policy, take(rivals, index)) for index in (known, farther(rivals, known, draws))
+    )
+    actors: Sequence[Actor] = (
+        knower,
+        mistaker,
+        Clone(recurrent),
+        Filter(found.model, found.policy, rivals),
+        *[knower] * 3,
+    )
+    dream, half = world(knower), amounts.dreams // 2
+    visits = [dream.visit(actor, rngs) for actor in actors]
+    one, zero, *others = (off for off, _ in visits[:4])
+    judged = (float(1 - (off - one) / (zero - one).clamp(min=0.05)) for off in others)
+    home, away, cloned, inferred, again, *anew = (path[0] for _, path in visits)
+    mistake, *astray, chance, by_chance = (strayed(path, home, again) for path in (away, cloned, inferred, *anew))
+    stakes = oddest(*(strange(path[half:], home[:half], again[half:]) for path in (away, home)))
+    scores = (back(off - by_chance, mistake - chance) for off in astray)
+    shuffled = went[torch.randperm(len(went), generator=torch.Generator().manual_seed(0))]
+    unlike = float(strange(home, *shuffled.tensor_split(2)).mean())
+    return stakes, oddest(mistake, chance), unlike, *scores, *judged
 
 
 def _by_world(

@@ -41,10 +41,13 @@ def oddest(strangeness: Tensor, chance: Tensor) -> float:
     return float(strangeness.max() / chance.max().clamp(min=1))
 
 
-def back(off: Tensor, mistaken: Tensor, chance: Tensor) -> float:
-    """As a score, how far one strayed [F, O]: 1 is by chance, 0 as far as one who is mistaken, in least squares."""
-    known = (mistaken - chance).clamp(min=0)
-    lost = (known * (off - chance)).sum() / known.square().sum().clamp(min=1e-6)
+def back(off: Tensor, mistaken: Tensor) -> float:
+    """As a score, how far one strayed, beyond chance [F, O]: 1 is not, 0 as far as one who is mistaken; least squares.
+
+    The chance of both is to be measured apart: of one, its noise would be in both, and look like straying.
+    """
+    known = mistaken.clamp(min=0)
+    lost = (known * off).sum() / known.square().sum().clamp(min=1e-6)
     return float(1 - lost.clamp(0, 1))
 
 

@@ -131,6 +131,7 @@ class TestJudge:
             ({"stakes": 1.1, "strayed": 1.4}, "not confounded", 1, diagnose.CLONE),
             ({"stakes": 1.1, "strayed": 1.4, "unlike": 5.0}, "cannot tell", None, diagnose.WIDER),
             ({"stakes": 1.1, "strayed": 1.4, "explained": -0.1}, "cannot tell", None, diagnose.WIDER),
+            ({"shown": -5.0, "explained": -5.0}, "cannot tell", None, diagnose.WIDER),
             ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE),
             ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
@@ -157,6 +158,10 @@ class TestJudge:
         alike = CLEAR._replace(strayed=1.4)
         assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
+
+    def test_what_is_no_number(self) -> None:
+        with pytest.raises(InputError, match="learning failed: unlike is"):
+            diagnose.judge([CLEAR, CLEAR._replace(unlike=float("nan"))])
 
     def test_figures(self) -> None:
         found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4, shown=0.5)]).found

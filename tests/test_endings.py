@@ -60,13 +60,14 @@ class Walker:
     model = SimpleNamespace(dynamics=SimpleNamespace(sample=lambda obs, action, latent, draws: obs + action))
 
     def begin(self, n: int, rngs: Any) -> None:
-        self.went = 0.0
+        self.went, self.met = 0.0, 0.0
 
     def choose(self, obs: torch.Tensor) -> torch.Tensor:
         return torch.ones_like(obs)
 
     def remember(self, step: Batch) -> None:
         self.went += float(step.mask.sum()) / 3
+        self.met = max(self.met, float(step.next_obs.max()))
 
     def point(self, obs: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
         return torch.ones_like(obs)
@@ -95,5 +96,6 @@ def test_dreams_end(limit: float, seen: float, steps: int, last: float, off: flo
     held = trial(*range(6))
     found, path = dream(walker, held, [held, trial(-1, seen)], 1, 20, ends).visit(walker, [np.random.default_rng(0)])
     assert walker.went == steps
+    assert walker.met >= min(last + 1, 6)  # evidence is as drawn, beyond what a sensor shows
     assert found.item() == pytest.approx(off)
     assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]

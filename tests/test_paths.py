@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf.data import Batch
+from deconfounded.deconf.data import Batch, Draws
+from deconfounded.deconf.dream import farther
 from deconfounded.deconf.paths import back, oddest, strange, strayed, ways
 from deconfounded.experts.demos import Trials
 
@@ -42,11 +43,30 @@ def test_of_each_its_own() -> None:
 
 def test_as_score() -> None:
     """Of three figures the mistaken one is off in two, three times as far in the first: it weighs nine times."""
-    chance, mistaken = torch.ones(3), torch.tensor([4.0, 2.0, 1.0])
-    for off, score in (([1, 1, 9], 1), ([4, 2, 1], 0), ([2.5, 1.5, 1], 0.5), ([4, 1, 1], 0.1), ([1, 2, 1], 0.9)):
-        assert back(torch.tensor(off), mistaken, chance) == pytest.approx(score)
-    assert back(torch.tensor([9.0, 9.0, 1.0]), mistaken, chance) == 0
-    assert back(torch.tensor([0.5, 0.5, 1.0]), mistaken, chance) == 1
+    mistaken = torch.tensor([3.0, 1.0, -1.0])
+    for off, score in (([0, 0, 9], 1), ([3, 1, 0], 0), ([1.5, 0.5, 0], 0.5), ([3, 0, 0], 0.1), ([0, 1, 0], 0.9)):
+        assert back(torch.tensor(off), mistaken) == pytest.approx(score)
+    assert back(torch.tensor([9.0, 9.0, 0.0]), mistaken) == 0
+    assert back(torch.tensor([-0.5, -0.5, 0.0]), mistaken) == 1
+
+
+def test_chance_is_no_straying() -> None:
+    """Who goes as by chance scores 1, though others stray hardly further: to .1, of 400 paths."""
+    home, again, one, other, away, mistaken = (walks(400, seed) for seed in range(6))
+    off = strayed(away, home, again) - strayed(one, home, again)
+    mistake = strayed(1.1 * mistaken, home, again) - strayed(other, home, again)
+    assert back(off, mistake) > 0.9
+
+
+def test_the_mistaken_mistake_it() -> None:
+    """Where there are two latents, the other one; both of two far ones, of four in a row."""
+    rivals = torch.tensor([[0.0], [5.0], [0.1], [5.1]])[None]
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    known = torch.arange(4).repeat(20)[None]
+    far = farther(rivals, known, draws)
+    assert set(zip(known[0].tolist(), far[0].tolist(), strict=True)) == {
+        (i, j) for i in range(4) for j in range(4) if (i + j) % 2
+    }
 
 
 def test_ways() -> None:
