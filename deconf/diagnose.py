@@ -33,7 +33,7 @@ class Next(NamedTuple):
 
 
 CLONE = Next(
-    "Clone it: memory does no harm, and without any there is nothing to be deluded by.",
+    "Clone it; memory does no harm here.",
     "naive_rnn.fit(trials, naive_rnn.RecurrentConfig(), np.random.default_rng(0))",
 )
 EXPLORE = Next(
@@ -175,15 +175,15 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             return told("not confounded", 1, why, CLONE)
         why = (
             "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. In the"
-            " circumstances of these trials a clone does as well as the expert; of others they tell nothing."
+            " circumstances of these trials a clone misses nothing; of others they tell nothing."
         )
         return told("cannot tell", None, why, VARY)
     said.append(
-        "The expert acts on something that the present observation does not show. In the learned dynamics, one who"
-        f" mistakes it goes ways {stakes} times as strange as the ways of those who know it, and {strayed} times as far"
-        f" from that one's own as chance does. A naive clone scores {naive} there, one that infers the latent from the"
-        f" world {latent}; by their actions, Eq. (1), it is {found['naive_judged']} and {found['latent_judged']}: 1"
-        " is the expert who knows the latent, 0 one who mistakes it."
+        "The expert acts on something that the present observation does not show. In the learned dynamics, an expert"
+        f" who is told another latent goes other ways: {stakes} times as strange, among those of experts who know"
+        f" theirs, as by chance, and {strayed} times as far from where the one who knows it goes. Between these two, 0"
+        f" and 1, a naive clone scores {naive} by where it goes, and one that infers the latent from the world {latent};"
+        f" by what they do, Eq. (1), {found['naive_judged']} and {found['latent_judged']}."
     )
     if explored is None:
         why = (
@@ -194,8 +194,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     shown, explained = found["shown"], found["explained"]
     said.append(
         f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went; what it"
-        f" tells explains the expert's actions better than the present observation by {explained}. These tell it by"
-        f" {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
+        f" tells explains the expert's actions better than the present observation by {explained}. The actions tell it"
+        f" by {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
         " actions for the expert's."
     )
     if max(-shown.low, shown.high, explained.high) < LITTLE:
@@ -209,7 +209,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     if shown.low <= SILENT:
         return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
     if max(stakes.high, strayed.high) < STAKES and unlike.value < LIKE and explained.low > 0:
-        why = "Who mistakes it comes about like the others, and where they do; and so will a clone."
+        why = "But who mistakes it comes about as the others do, and where they do; and so will a clone."
         return told("not confounded", 1, why, CLONE)
     if not any(one.value >= STAKES and one.low > 1 for one in (stakes, strayed)):
         why = (
@@ -221,4 +221,6 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
     if max(gap.low, judged.low) <= 0 or max(gap.high, judged.high) < GAP:
         return told("cannot tell", None, "The scores hardly differ; more of both would settle it.", MORE)
-    return told("confounded", 2, "A clone would take its own actions for evidence; the world gives better.", EXPLORE)
+    return told(
+        "confounded", 2, "A clone takes its own actions for evidence; what the world answers is better.", EXPLORE
+    )

@@ -49,7 +49,7 @@ def _code(found: Diagnosis, about: dict[str, Any]) -> str:
     if not found.next.fit:
         return ""
     source = about["trials"]["from"]
-    read = f"Trials.{'load' if source.endswith('.npz') else 'from_minari'}(Path({source!r}))"
+    read = f"Trials.{'from_minari' if Path(source).is_dir() else 'load'}(Path({source!r}))"
     method = found.next.fit.partition(".")[0]
     return f"""from pathlib import Path
 import numpy as np
@@ -73,8 +73,9 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
         world = figure["explained"]
         predictors["the world's answers"] = (world, colour("interventional"))
         whence = (
-            f"A latent that is read off the world's answers alone tells {world} of it; what is left is read off the"
-            " expert's own past actions, and those tell a clone that acts by itself nothing new."
+            f"A latent that is read off the world's answers alone tells {world} of it (below 0, less than the present"
+            " observation does). What is left memory reads off the expert's past actions, for the most part, and a"
+            " clone that acts by itself learns nothing from its own."
         )
     sections: list[tuple[str, str, Callable[[Axes], None]]] = [
         (
@@ -102,16 +103,28 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
                 lambda axes: _bars(axes, told, "nats a step", LITTLE),
             )
         )
+    ways: Rows = {
+        "among those who know": (stakes, colour("expert")),
+        "from that very expert's": (strayed, colour("expert")),
+    }
+    sections.append(
+        (
+            "What is at stake?",
+            f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange, among"
+            f" those of experts who know theirs, as by chance, and {strayed} times as far from those of the expert who"
+            f" knows it; below {STAKES} that may be chance. Dreams are {figure['unlike']} times as strange as data.",
+            lambda axes: _bars(axes, ways, "ways of the mistaken one, times chance", STAKES),
+        )
+    )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
     scores: Rows = {who: (figure[key], colour(hue)) for who, key, hue in actors}
     scores |= {f"{who}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for who, key, hue in actors}
     sections.append(
         (
             "What will it cost?",
-            f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange as"
-            f" usual, and {strayed} times as far as usual from those of the expert who knows it; below {STAKES} that"
-            f" may be chance. Between that one, 0, and the expert who knows, 1, a naive clone scores {naive} by where"
-            f" it goes, and one that infers the latent from the world {latent}; Eq. (1) is the same by their actions.",
+            f"Between one who acts on another latent, 0, and the expert who knows it, 1, a naive clone scores {naive}"
+            f" by where it goes, and one that infers the latent from the world {latent}. Eq. (1) is the same by what"
+            " they do, as that expert judges it.",
             lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
         )
     )
