@@ -182,8 +182,8 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         "The expert acts on something that the present observation does not show. In the learned dynamics, an expert"
         f" who is told another latent goes other ways: {stakes} times as strange, among those of experts who know"
         f" theirs, as by chance, and {strayed} times as far from where the one who knows it goes. Between these two, 0"
-        f" and 1, a naive clone scores {naive} by where it goes, and one that infers the latent from the world {latent};"
-        f" by what they do, Eq. (1), {found['naive_judged']} and {found['latent_judged']}."
+        f" and 1, a naive clone scores {naive} by where it goes, and one that infers the latent from the world"
+        f" {latent}; by what they do, Eq. (1), {found['naive_judged']} and {found['latent_judged']}."
     )
     if explored is None:
         why = (
