@@ -125,6 +125,7 @@ def main() -> None:
     from deconfounded.benchmarks.diagnose import run
     from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.output.gap import Gap, picture
+    from deconfounded.deconf.diagnose import VARY
 
     names = args.tasks or list(known)
     tasks, rows = [envs.get(known[name]) for name in names], list[dict[str, Any]]()
@@ -134,7 +135,8 @@ def main() -> None:
         files = data(task, source, folder)
         told, _ = run(*files, 0, folder / "diagnosis", f"deconf validate --tasks {name}")
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
-        gap = told.found["gap"].value if told.verdict == "confounded" and told.tier != 3 else 0.0
+        nothing = told.verdict == "not confounded" or told.tier == 3 or told.next is VARY  # that Tier 2 could save
+        gap = 0.0 if nothing else told.found["gap"].value
         rows.append(
             {
                 "task": task.name,

@@ -198,7 +198,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         f" by {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
         " actions for the expert's."
     )
-    if max(-shown.low, shown.high, explained.high) < LITTLE:
+    if max(-shown.low, shown.value, explained.high) < LITTLE:
         why = (
             "Both are next to nothing, and what the world tells does not explain what the expert does: expert trials do"
             " not say which latent was theirs, and no exploration helps. Ask what the expert would do where the clone"
