@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from deconfounded.deconf import explained, findings
 from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Draws
+from deconfounded.deconf.data import Batch, Draws
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.diagnose import SILENT
 from deconfounded.deconf.findings import Amounts, split
@@ -56,6 +58,25 @@ def test_world_that_says_nothing() -> None:
     found = by_world(0.0)
     assert found.explored == pytest.approx(0, abs=SILENT)
     assert found.shown == pytest.approx(0, abs=SILENT)
+
+
+def test_half_tells_the_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beliefs read as many steps as they were learned on: every other one; what is likely is asked of those between."""
+    read: list[torch.Tensor] = []
+    final = explained.final_belief
+    monkeypatch.setattr(explained, "final_belief", lambda model, batch: read.append(batch.mask) or final(model, batch))
+    rng = np.random.default_rng(0)
+    expert, explored = (split(world(0.2, kind, 32, seed), 0.25, rng) for seed, kind in enumerate((True, False)))
+    few = replace(EXPLORING, inference_updates=5)
+    explained.by_world(expert, explored, 1, few, replace(CLONING, updates=5), Draws([rng], "cpu"), Monitor())
+    assert read
+    for mask in read:
+        assert mask[..., ::2].any()
+        assert not mask[..., 1::2].any()
+    batch = Batch.of(expert[0], 1)
+    between = explained.odd(batch).mask
+    assert between[..., 1::2].eq(batch.mask[..., 1::2]).all()
+    assert not between[..., ::2].any()
 
 
 def test_theta_that_drifts() -> None:
