@@ -17,6 +17,7 @@ from typing import Any
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
@@ -39,8 +40,7 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
         except ValueError:
             raise envs.InputError(f"--range was {text!r}; it must be like {task.latents[0].name}=0.1:0.2") from None
         known = {lat.name: lat for lat in task.latents}
-        if name not in known:
-            raise envs.closest("latent", name, list(known))
+        check_names("latent", [name], list(known))
         inside = known[name].low <= low <= high <= known[name].high
         if known[name].distribution == "categorical" and not inside:
             raise envs.InputError(f"--range was {text!r}; {name} has {known[name].low:g} to {known[name].high:g} alone")

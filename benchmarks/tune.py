@@ -12,7 +12,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
-from deconfounded.envs.files import write_json
+from deconfounded.envs.files import write_atomically, write_json
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
@@ -65,7 +64,7 @@ def share(source: Path, other: Path, but: str = "") -> None:
     other.mkdir(parents=True, exist_ok=True)
     for file in source.glob("*.npz"):
         if not (other / file.name).exists() and file.stem.rpartition("-")[0] != but:
-            shutil.copyfile(file, other / file.name)
+            write_atomically(other / file.name, file.read_bytes())
 
 
 def main() -> None:

@@ -170,7 +170,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     if memory.low <= LITTLE:
         if memory.high > LITTLE:
             return told("cannot tell", None, "That may be nothing, or something: more trials would settle it.", MORE)
-        if "shown" in found and found["shown"].low > SILENT:
+        if explored is not None and found["shown"].low > SILENT:
             why = "The world differs from trial to trial, and the expert acts on nothing that a clone does not see."
             return told("not confounded", 1, why, CLONE)
         why = (
