@@ -261,6 +261,8 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
     """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
     from sb3_contrib import RecurrentPPO
 
+    from deconfounded.deconf.practice import WholePolicy
+
     widths = [config.width, config.width]
     policy = {
         "lstm_hidden_size": config.width,
@@ -270,7 +272,7 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
     }
     with numbers(seed):
         return RecurrentPPO(
-            "MlpLstmPolicy",
+            WholePolicy,
             env,
             learning_rate=config.policy_rate,
             n_steps=config.steps,

@@ -1,4 +1,4 @@
-"""Environments to practise in, as Stable-Baselines3 has them: blind to theta, a whole trial as one episode."""
+"""To practise, with Stable-Baselines3: environments that are blind to theta, a whole trial as one episode; a policy."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from torch import Tensor, nn
 
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.experts.sb3 import Bare
@@ -70,3 +72,21 @@ class Practice(Bare):
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Its seeds are given when it is made."""
         return [None] * self.num_envs
+
+
+class WholePolicy(RecurrentActorCriticPolicy):
+    """sb3-contrib's, whose LSTM reads a sequence at once if an episode starts with it, instead of step by step.
+
+    Its buffer cuts sequences where episodes start, so that this is how all of them are trained.
+    """
+
+    @staticmethod
+    def _process_sequence(
+        features: Tensor, lstm_states: tuple[Tensor, Tensor], episode_starts: Tensor, lstm: nn.LSTM
+    ) -> tuple[Any, Any]:
+        """features [n * T, F], states [1, n, W], starts [n * T] -> outputs [n * T, W], the states after."""
+        hidden, cell = lstm_states
+        starts = episode_starts.reshape(hidden.shape[1], -1).clone()
+        kept = 1 - starts[None, :, :1]
+        starts[:, 0] = 0
+        return RecurrentActorCriticPolicy._process_sequence(features, (kept * hidden, kept * cell), starts, lstm)

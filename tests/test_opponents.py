@@ -27,6 +27,7 @@ from deconfounded.deconf.naive_obs import DroppingAgent, ObsAgent, ObsMemory
 from deconfounded.deconf.naive_transformer import TransformerAgent
 from deconfounded.deconf.nets import Adam, Scaler, scalers
 from deconfounded.deconf.palr import PalrAgent, PalrConfig, hscic
+from deconfounded.deconf.practice import WholePolicy
 from deconfounded.envs.streams import Array
 from deconfounded.experts.demos import Agent, RandomAgent, Trials, run_trials, trial_seeds
 from tests.tools import tiny_preset
@@ -364,6 +365,21 @@ class TestGail:
                 agent.remember(step)
                 encoded = signature.encode_action(step.action)[0].numpy()
                 before = np.concatenate([encoded, np.zeros((4, 1))], -1)
+
+    @pytest.mark.parametrize("begin", [(), (0,), (0, 3), (0, 5, 19)], ids=str)
+    def test_sequences_read_at_once_are_those_read_step_by_step(self, begin: tuple[int, ...]) -> None:
+        """Outputs, the state after and gradients are sb3-contrib's own to 1e-5, wherever episodes start."""
+        draws = torch.Generator().manual_seed(0)
+        features, starts = torch.randn(4 * 7, 3, generator=draws), torch.zeros(4 * 7)
+        starts[list(begin)] = 1
+        lstm, state = torch.nn.LSTM(3, 5), tuple(torch.randn(1, 4, 5, generator=draws) for _ in range(2))
+        found = []
+        for policy in (WholePolicy, WholePolicy.__base__):
+            lstm.zero_grad()
+            out, after = policy._process_sequence(features, state, starts, lstm)
+            (out.sum() + after[1].sum()).backward()
+            found.append([out, *after, *(weight.grad.clone() for weight in lstm.parameters())])
+        torch.testing.assert_close(*found, rtol=0, atol=1e-5)
 
     def test_discriminator_tells_them_apart(self) -> None:
         """A constant against a random action: its logit, the reward, is above 0 for one, below for the other."""
