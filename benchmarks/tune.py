@@ -1,7 +1,7 @@
 """The opponents' tuning: `python benchmarks/tune.py`
 
 Each opponent gets four settings, its present one among them, on two development tasks: the cartpole on a tilted rail
-and the bandit. Their seeds are no others' (`SEEDS`). What came of it is kept in docs/tuning.json.
+and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at once.
 Interrupted, it goes on where it was.
 """
 
@@ -12,6 +12,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,17 @@ def share(source: Path, other: Path, but: str = "") -> None:
             write_atomically(other / file.name, file.read_bytes())
 
 
+def keep(row: dict[str, Any], file: Path) -> None:
+    """Among the file's rows, in place of the one of the same method and setting."""
+    rows = json.loads(file.read_text())["rows"] if file.is_file() else []
+    same = [one for one in rows if (one["method"], one["setting"]) == (row["method"], row["setting"])]
+    if same:
+        rows[rows.index(same[0])] = row
+    else:
+        rows.append(row)
+    write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
+
+
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -81,10 +93,10 @@ def main() -> None:
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    rows = []
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
     for name in args.methods or TRIED:
         for change in ({}, *TRIED[name]):
-            row: dict[str, Any] = {"method": name, "setting": title(change), "scores": {}, "cpu_s": {}}
+            row: dict[str, Any] = {"method": name, "setting": title(change), "scores": {}, "cpu_s": {}, **about}
             for task in (envs.get(one) for one in TASKS):
                 settings, part = preset("default", task, "cpu"), METHODS[name].part
                 settings = replace(settings, **{part: other(getattr(settings, part), change)})
@@ -98,13 +110,10 @@ def main() -> None:
                 found = records.gather(records.of_run(finished, "default", [], task.episodes))["methods"]
                 row["scores"][task.name] = [round(score, 4) for score in last_scores(found)[name].values()]
                 row["cpu_s"][task.name] = found[name]["cpu_s"]
-            rows.append(row)
+            keep(row, DOCS / "tuning.json")
             told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
             print(f"{name}, {row['setting']}: {told}")
-    kept = args.out if args.methods else DOCS
-    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
-    write_json(kept / "tuning.json", {"seeds": SEEDS, **about, "rows": rows})
-    print(f"-> {kept / 'tuning.json'}")
+    print(f"-> {DOCS / 'tuning.json'}")
 
 
 if __name__ == "__main__":

@@ -45,16 +45,17 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = tune.other(mean, {"latent": 0.5, "beta": 2, "model": "evidence"})
     assert (config.latent, config.beta, config.model) == (2, 0.02, "evidence")
     assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
-    rows = [
-        {"method": "gail", "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}}
-        for setting, scores, cpu in (("a", [0.1, 0.3], 5.0), ("b", [0.5, 0.7], 9.0), ("c", [0.59, 0.6], 4.0))
-    ]
-    found = {"rows": rows, "machine": "m", "versions": {"torch": "2"}, "commit": None}
-    (tmp_path / "tuning.json").write_text(json.dumps(found))
+    about = {"machine": "m", "versions": {"torch": "2"}, "commit": None}
+    for method, setting, scores, cpu in (
+        *(("gail", "a", [0.9, 0.9], 5.0), ("gail", "b", [0.5, 0.7], 9.0), ("gail", "c", [0.59, 0.6], 4.0)),
+        *(("palr", "a", [0.2, 0.2], 5.0), ("gail", "a", [0.1, 0.3], 5.0)),
+    ):
+        row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
+        tune.keep(row, tmp_path / "tuning.json")
     monkeypatch.setattr(pages, "DOCS", tmp_path)
     lines = pages.tuning().splitlines()
-    assert [line.endswith("| chosen |") for line in lines[2:5]] == [False, False, True]
-    assert lines[2] == "| gail | a | 0.20 | 5 |  |"
+    assert [line.endswith("| chosen |") for line in lines[2:6]] == [True, False, False, True]
+    assert lines[2:4] == ["| palr | a | 0.20 | 5 | chosen |", "| gail | a | 0.20 | 5 |  |"]
 
 
 class TestStatistics:

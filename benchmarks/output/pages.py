@@ -201,7 +201,8 @@ def tuning() -> str:
             cpu = [f"{row['cpu_s'][task]:.0f}" for task in tasks]
             rows.append((method, row["setting"], *scores, *cpu, "chosen" if i == best else ""))
     head = ("method", "setting", *tasks, *(f"{task}, CPU s a seed" for task in tasks), "")
-    return f"{markdown_table(head, rows)}\n\n{_origin(found)}."
+    origins = dict.fromkeys(map(_origin, found["rows"]))
+    return f"{markdown_table(head, rows)}\n\n{'; '.join(origins)}."
 
 
 def tuned() -> str:
