@@ -121,8 +121,8 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
     }
     known = (seed, config.refits, json.dumps(about), folder)
     refits = [Refit(source, exploration, config.amounts, i, *known) for i in range(config.refits)]
-    with commands.locked(folder):
-        run_jobs([one for one in refits if one.found() is None], "diagnosis", Local().run)
+    with commands.locked(folder), Local() as engine:
+        run_jobs([one for one in refits if one.found() is None], "diagnosis", engine.run)
     found = judge([each for one in refits if (each := one.found()) is not None])
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
     return found, page.write(found, about, folder)

@@ -102,10 +102,10 @@ def main() -> None:
                 settings = replace(settings, **{part: other(getattr(settings, part), change)})
                 own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
                 jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
-                with commands.locked(own):
+                with commands.locked(own), Local() as engine:
                     prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
                     share(args.out / task.name, own / "jobs")
-                    finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", Local())
+                    finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
                     share(own / "jobs", args.out / task.name, but=name)
                 found = records.gather(records.of_run(finished, "default", [], task.episodes))["methods"]
                 row["scores"][task.name] = [round(score, 4) for score in last_scores(found)[name].values()]

@@ -93,7 +93,8 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
         ]
         with commands.locked(folder):
             prepare(folder, commands.about(BenchmarkJob, task, "default", settings, [], source), resume=True)
-            finished, _ = run_all(jobs, "cpu", task.name, Local())
+            with Local() as engine:
+                finished, _ = run_all(jobs, "cpu", task.name, engine)
         kept = records.of_run(finished, "default", [], task.episodes)
     methods = records.gather(kept)["methods"]
     return {name: float(methods[name]["score_last"]) for name in LEARNED if name in methods}

@@ -54,7 +54,8 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
         folder = Path(scratch) / "jobs"
         folder.mkdir()
         job = BenchmarkJob(task.reference, settings, method, (record["seed"],), folder, expert, record["salt"], guest)
-        finished, _ = run_all([job], device, f"{task.name}, {method}", Local())
+        with Local() as engine:
+            finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
         every = records.of_run(finished, record["preset"], record["set"], task.episodes)
         made = [one for one in every if one["method"] == record["method"]]
     if not made:

@@ -26,20 +26,29 @@ def start_worker(ticks: Queue[int]) -> None:
 
 
 class Local(Engine):
-    """Processes that write their jobs' files themselves."""
+    """Processes that write their jobs' files themselves. They are made for the first jobs, and kept for those after."""
+
+    def __init__(self) -> None:
+        self._context = multiprocessing.get_context("spawn")
+        self._ticks: Queue[int] = self._context.Queue()
+        self._executor: ProcessPoolExecutor | None = None
+
+    def __exit__(self, *error: object) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+            self._executor = None
 
     def slots(self, device: str) -> int:
         return cores() if device == "cpu" else 1
 
     def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
-        context = multiprocessing.get_context("spawn")
-        workers = min(cores(), len(jobs))
-        ticks = context.Queue()
-        with ended(ProcessPoolExecutor(workers, context, initializer=start_worker, initargs=(ticks,))) as executor:
+        if self._executor is None:
+            self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, (self._ticks,))
+        with self._ended():
             # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
             heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
             os.environ["OMP_NUM_THREADS"] = "1"
-            futures = {executor.submit(job.run): job for job in jobs}
+            futures = {self._executor.submit(job.run): job for job in jobs}
             signal.signal(signal.SIGINT, heard)
             if threads is None:
                 del os.environ["OMP_NUM_THREADS"]
@@ -47,8 +56,8 @@ class Local(Engine):
                 os.environ["OMP_NUM_THREADS"] = threads
             waiting = set(futures)
             while waiting:
-                while not ticks.empty():
-                    tick(ticks.get())
+                while not self._ticks.empty():
+                    tick(self._ticks.get())
                 for future in [f for f in waiting if f.done()]:
                     waiting.remove(future)
                     try:
@@ -57,17 +66,15 @@ class Local(Engine):
                         say(futures[future], error)
                 time.sleep(0.1)
 
-
-@contextmanager
-def ended(executor: ProcessPoolExecutor) -> Iterator[ProcessPoolExecutor]:
-    """The pool; when the work is over, or ends early by an error or a signal, none of its processes is left."""
-    try:
-        yield executor
-    except BaseException as error:
-        for process in multiprocessing.active_children():
-            process.kill()
-        if isinstance(error, BrokenProcessPool):
-            raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
-        raise
-    finally:
-        executor.shutdown(cancel_futures=True)
+    @contextmanager
+    def _ended(self) -> Iterator[None]:
+        """When the work ends early, by an error or a signal, none of its processes is left."""
+        try:
+            yield
+        except BaseException as error:
+            for process in multiprocessing.active_children():
+                process.kill()
+            self.__exit__()
+            if isinstance(error, BrokenProcessPool):
+                raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+            raise

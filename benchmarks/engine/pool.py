@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
@@ -282,10 +282,11 @@ Run = Callable[[list[Some], Callable[[int], None], Callable[[Some, str | Excepti
 class Engine(ABC):
     """Where jobs run, one core or one GPU each. Use it in a `with`: after that nothing of it is left running."""
 
-    def __enter__(self) -> Engine:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:  # noqa: B027 (processes of this machine need nothing here)
+    @abstractmethod
+    def __exit__(self, *error: object) -> None:
         """Let it go."""
 
     @abstractmethod
