@@ -67,23 +67,33 @@ def main() -> None:
 
     folder = args.out or Path("results") / "table"
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
-    for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds)):
-        for task in tasks:
-            settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
-            for method in methods:
-                job = BenchmarkJob(task.reference, settings, method, seeds_of(method, least, most), own / "jobs")
-                left = missing(job, args.preset, kept)
-                if not left or args.list:
-                    if left:
-                        print(f"{task.name}, {method}: {len(left)} of {len(job.seeds)} seeds are missing")
-                    continue
-                with commands.locked(own), commands.engine(args.cluster) as engine:
-                    prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), resume=True)
-                    label = f"{task.name}, {method}, seeds {left[0]} to {left[-1]}"
-                    finished, _ = run_all([replace(job, seeds=left)], args.device, label, engine)
-                    new = [one for one in finished if one[0] == method and one[1] in left]
-                    for record in records.of_run(new, args.preset, args.set, task.episodes):
-                        records.write(kept, record)
+    jobs = [
+        BenchmarkJob(
+            task.reference,
+            changed(preset(args.preset, task, args.device), args.set),
+            method,
+            seeds_of(method, least, most),
+            folder / task.name / "jobs",
+        )
+        for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
+        for task in tasks
+        for method in methods
+    ]
+    left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, kept))}
+    if args.list:
+        for job, seeds in left.items():
+            print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
+        return
+    with commands.engine(args.cluster) as engine:
+        for job, seeds in left.items():
+            task, own = envs.get(job.task), job.folder.parent
+            with commands.locked(own):
+                prepare(own, commands.about(BenchmarkJob, task, args.preset, job.preset, args.set), resume=True)
+                label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
+                finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
+                new = [one for one in finished if one[0] == job.method and one[1] in seeds]
+                for record in records.of_run(new, args.preset, args.set, task.episodes):
+                    records.write(kept, record)
 
 
 if __name__ == "__main__":
