@@ -16,6 +16,7 @@ from deconfounded.benchmarks import tune
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import browser, index, pages, records, report, score, statistics
+from deconfounded.benchmarks.output.answers import answers
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -56,6 +57,21 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lines = pages.tuning().splitlines()
     assert [line.endswith("| chosen |") for line in lines[2:6]] == [True, False, False, True]
     assert lines[2:4] == ["| palr | a | 0.20 | 5 | chosen |", "| gail | a | 0.20 | 5 |  |"]
+
+
+@pytest.mark.parametrize(("score", "word"), [(0.95, "Yes"), (0.7, "It helps, but it is not enough"), (0.4, "No")])
+def test_answers(score: float, word: str) -> None:
+    """By whether the opponent comes up to the one, or is no better than the other, on the tasks where all were run."""
+    seeds = {0: -0.06, 1: -0.02, 2: 0.0, 3: 0.02, 4: 0.06}
+    runs = {"naive_rnn": 0.4, "deconfounded": 0.95, "naive_transformer": score}
+    of = {name: {seed: mean + noise for seed, noise in seeds.items()} for name, mean in runs.items()}
+    scores = {"a": of, "b": of, "lacking": {name: of[name] for name in ("naive_rnn", "deconfounded")}}
+    (told,) = answers(scores)
+    assert told.startswith(f"Does scale cure the delusion? {word}: naive_transformer {score:.2f} (")
+    assert "naive_rnn 0.40 (" in told
+    assert "deconfounded 0.95 (" in told
+    assert "over 2 tasks" in told
+    assert answers({"lacking": scores["lacking"]}) == []
 
 
 class TestStatistics:

@@ -14,6 +14,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.output import score, statistics
+from deconfounded.benchmarks.output.answers import answers
 from deconfounded.benchmarks.output.colours import colour
 
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
@@ -142,6 +143,7 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
 def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str]) -> dict[str, Any]:
     """All that the page shows, for json."""
     rows, tasks, scores = [], [], {}
+    passed = [name for name, one in certificates.items() if one["verdict"] == "passed"]
     tiers: dict[str, list[str]] = {"": []}
     methods: dict[str, dict[str, str]] = {}
     for task, results in found:
@@ -163,6 +165,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
         "methods": {name: methods[name] for name in order},
         "rows": rows,
         "compared": COMPARED,
+        "answers": answers({name: scores[name] for name in scores if name in passed}),
         "over": {key: over_tasks(scores, names) for key, names in tiers.items()},
         "thresholds": _short(THRESHOLDS),
     }

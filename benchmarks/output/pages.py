@@ -18,6 +18,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import cards, gap, index, records, score
+from deconfounded.benchmarks.output.answers import answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
 
@@ -103,8 +104,16 @@ expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's ow
 theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
 Intervals are 95% bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times
 in four. *After as many again*: the last score in a trial twice as long as those of training."""
-    parts = [head, *(section(*found) for found in _published()), gap.section(_gaps())]
+    parts = [head, in_short(), *(section(*found) for found in _published()), gap.section(_gaps())]
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def in_short() -> str:
+    """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
+    passed = [task.name for task, found in _certified() if found["verdict"] == "passed"]
+    scores = {task.name: index.last_scores(found["methods"]) for task, found in _published() if task.name in passed}
+    told = [f"- {answer}" for answer in answers(scores)]
+    return "\n".join(["## In short", "", *told]) if told else ""
 
 
 def _gaps() -> list[gap.Gap]:
