@@ -32,7 +32,7 @@ class OfflineConfig:
     offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
-    offline_steps: int = 256  # of each, that stand for all of them in Eq. (7)'s likelihood
+    offline_steps: int = 256  # of each, that are read, and stand for all of them in Eq. (7)'s likelihood
     beta: float = 1e-3  # of Eq. (6), a step
     warm_up: float = 0.5  # share of online updates over which this beta rises to its value
     online_updates: int = 2000
@@ -42,7 +42,7 @@ class OfflineConfig:
     refresh: int = 50  # updates between syntheses
     synthetic: int = 128  # trials a synthesis
     random_share: float = 0.1  # of synthetic actions that are uniformly random
-    learning_rate: float = 1e-3
+    learning_rate: float = 4e-3
     drifts: bool = False  # theta changes between the episodes of a trial: see deconf/drift.py
     device: str = "cpu"
 
@@ -63,15 +63,16 @@ def explain(
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
         batch = data.draw_trials(config.offline_batch * times, draws)
-        belief = offline.belief(offline.last(batch))
-        mean, std = belief.chunk(2, -1)
-        index, steps = draws.below(batch.mask.shape[2], config.offline_steps), batch.mask.shape[2]
+        steps = batch.mask.shape[2]
+        index = draws.uniform(steps).argsort(-1)[:, : config.offline_steps]
         some = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
-        theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, config.offline_steps, -1)
+        belief = offline.belief(offline.last(some))
+        mean, std = belief.chunk(2, -1)
+        theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, index.shape[1], -1)
         log_next = offline.dynamics.log_prob(some.obs, some.action, some.next_obs, theta_hat)[..., 0]
         log_policy = policy.log_prob(torch.cat([online.inputs.obs(some.obs), theta_hat], -1), some.action)
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
-        weight = some.mask * (steps / config.offline_steps)  # so that their sum is that of all, on average
+        weight = some.mask * (steps / index.shape[1])  # so that their sum is that of all, on average
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
