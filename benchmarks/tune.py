@@ -42,7 +42,14 @@ TRIED: dict[str, tuple[Change, ...]] = {
     "naive_transformer": ({"learning_rate": 0.3}, {"updates": 2}, {"layers": 2}),
     "gail": ({"policy_rate": 0.3}, {"discriminator_rate": 0.3}, {"rounds": 2}),
 }
-"""Of each opponent, what is tried beside the preset."""
+"""Of each opponent, what is tried beside the preset as it was before."""
+BEFORE: dict[str, Change] = {
+    "naive_obs": {"learning_rate": 1 / 0.3},
+    "palr": {"penalty": 0.1},
+    "rma": {"learning_rate": 1 / 0.3},
+    "deconfounded_mean": {"model": "gru"},
+}
+"""What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
 
 
 def other(config: Any, change: Change) -> Any:
@@ -99,7 +106,8 @@ def main() -> None:
             row: dict[str, Any] = {"method": name, "setting": title(change), "scores": {}, "cpu_s": {}, **about}
             for task in (envs.get(one) for one in TASKS):
                 settings, part = preset("default", task, "cpu"), METHODS[name].part
-                settings = replace(settings, **{part: other(getattr(settings, part), change)})
+                began = other(getattr(settings, part), BEFORE.get(name, {}))
+                settings = replace(settings, **{part: other(began, change)})
                 own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
                 jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
                 with commands.locked(own), Local() as engine:

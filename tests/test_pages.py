@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for method, changes in tune.TRIED.items():
         for task in map(envs.get, tune.TASKS):
             config = getattr(preset("default", task, "cpu"), METHODS[method].part)
+            config = tune.other(config, tune.BEFORE.get(method, {}))
             tried = [config, *(tune.other(config, change) for change in changes)]
             assert len(set(tried)) == 4, f"{method} on {task.name}: the same number of settings each"
     mean = preset("default", envs.get("bandit"), "cpu").mean
@@ -50,13 +52,27 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for method, setting, scores, cpu in (
         *(("gail", "a", [0.9, 0.9], 5.0), ("gail", "b", [0.5, 0.7], 9.0), ("gail", "c", [0.59, 0.6], 4.0)),
         *(("palr", "a", [0.2, 0.2], 5.0), ("gail", "a", [0.1, 0.3], 5.0)),
+        *(("naive_rnn", "the preset", [0.1, 0.1], 5.0), ("naive_rnn", "b", [0.9, 0.9], 5.0)),
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
     monkeypatch.setattr(pages, "DOCS", tmp_path)
     lines = pages.tuning().splitlines()
-    assert [line.endswith("| chosen |") for line in lines[2:6]] == [True, False, False, True]
-    assert lines[2:4] == ["| palr | a | 0.20 | 5 | chosen |", "| gail | a | 0.20 | 5 |  |"]
+    assert [line.rpartition(" | ")[2] for line in lines[2:8]] == ["kept |", " |", "chosen |", " |", " |", "chosen |"]
+    assert lines[4:6] == ["| palr | a | 0.20 | 5 | chosen |", "| gail | a | 0.20 | 5 |  |"]
+
+
+def test_presets_are_what_tuning_chose() -> None:
+    """Today's preset is the setting that docs/tuning.json says, of those that were tried from where tuning began."""
+    rows = json.loads((pages.DOCS / "tuning.json").read_text())["rows"]
+    for method in dict.fromkeys(row["method"] for row in rows):
+        tried, of = tune.TRIED[method], [row for row in rows if row["method"] == method]
+        assert [row["setting"] for row in of] == [tune.title(change) for change in ({}, *tried)]
+        change = next(change for change in ({}, *tried) if tune.title(change) == pages.chosen(of)["setting"])
+        for task in map(envs.get, tune.TASKS):
+            config = getattr(preset("default", task, "cpu"), METHODS[method].part)
+            again = tune.other(tune.other(config, tune.BEFORE.get(method, {})), change)
+            assert asdict(again) == pytest.approx(asdict(config)), f"{method} on {task.name}"
 
 
 @pytest.mark.parametrize(("score", "word"), [(0.95, "Yes"), (0.7, "It helps, but it is not enough"), (0.4, "No")])

@@ -35,6 +35,7 @@ def tiny_preset() -> Preset:
             offline_updates=2, online_updates=2, online_batch=4, offline_batch=4, synthetic=4, online_steps=64
         ),
         naive=RecurrentConfig(updates=2, batch=4),
+        obs=RecurrentConfig(updates=2, batch=4),
         dagger=DaggerConfig(updates=2, rounds=2, batch=4),
         cloning=CloningConfig(updates=3, batch=64),
         mean=MeanConfig(**few, inference_steps=64),

@@ -52,7 +52,7 @@ METHODS = {
     "gail": Method(_EXPLORES, "deconf/gail", "gail", 60, default=False),
     "rma": Method((*_EXPLORES, "theta"), "deconf/rma", "rma", 4, default=False),
     "naive_transformer": Method(module="deconf/naive_transformer", part="transformer", cost=30, default=False),
-    "naive_obs": Method(module="deconf/naive_obs", part="naive", cost=2, default=False),
+    "naive_obs": Method(module="deconf/naive_obs", part="obs", cost=2, default=False),
     "naive_dropout": Method(module="deconf/naive_obs", part="dropout", cost=2, default=False),
     "palr": Method(module="deconf/palr", part="palr", cost=4, default=False),
     "naive_rnn": Method(module="deconf/naive_rnn", part="naive", cost=2),

@@ -133,7 +133,7 @@ MAKERS: dict[str, Callable[[Context | Allowed], dict[str, Agent]]] = {
     "naive_transformer": lambda context: _clone(
         context, "naive_transformer", naive_transformer.fit, context.preset.transformer
     ),
-    "naive_obs": lambda context: _clone(context, "naive_obs", naive_obs.fit, context.preset.naive),
+    "naive_obs": lambda context: _clone(context, "naive_obs", naive_obs.fit, context.preset.obs),
     "naive_dropout": lambda context: _clone(context, "naive_dropout", naive_obs.fit_dropout, context.preset.dropout),
     "palr": lambda context: _clone(context, "palr", palr.fit, context.preset.palr),
     "naive_rnn": _naive_rnn,

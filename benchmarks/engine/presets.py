@@ -48,13 +48,14 @@ class Preset:
     gail: GailConfig
     rma: RmaConfig
     transformer: TransformerConfig
+    obs: RecurrentConfig
     dropout: DropoutConfig
     palr: PalrConfig
 
 
 CONFIGS = (
     *("deconfounded", "discrete", "offline", "naive", "dagger", "cloning"),
-    *("mean", "gail", "rma", "transformer", "dropout", "palr"),
+    *("mean", "gail", "rma", "transformer", "obs", "dropout", "palr"),
 )  # of a preset's fields
 
 _ON_CONTROL = DeconfoundedConfig(
@@ -80,12 +81,13 @@ _CONTROL = Preset(
     naive=RecurrentConfig(),
     dagger=DaggerConfig(),
     cloning=CloningConfig(),
-    mean=MeanConfig(),
+    mean=MeanConfig(model="evidence"),
     gail=GailConfig(),
-    rma=RmaConfig(updates=3000, learning_rate=2e-3),
+    rma=RmaConfig(updates=3000, learning_rate=6e-4),
     transformer=TransformerConfig(),
+    obs=RecurrentConfig(learning_rate=9e-4),
     dropout=DropoutConfig(),
-    palr=PalrConfig(),
+    palr=PalrConfig(penalty=1.0),
 )
 _ON_BANDIT = DeconfoundedConfig(
     rounds=2,
@@ -126,6 +128,7 @@ _BANDIT = Preset(
     dagger=DaggerConfig(batch=64, shortest=1.0, updates=1000),
     cloning=CloningConfig(updates=500),
     mean=MeanConfig(
+        model="evidence",
         latent=5,
         beta=0.01,
         ahead=1,
@@ -140,10 +143,11 @@ _BANDIT = Preset(
         imitation_rate=3e-3,
     ),
     gail=GailConfig(rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9, policy_rate=3e-3),
-    rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=1e-2, teacher_updates=500),
+    rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=3e-3, teacher_updates=500),
     transformer=TransformerConfig(width=32, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
+    obs=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
     dropout=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    palr=PalrConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    palr=PalrConfig(penalty=1.0, updates=2000, batch=128, chunk=50, learning_rate=1e-2),
 )
 
 
@@ -202,6 +206,7 @@ def _smoke(full: Preset) -> Preset:
         gail=replace(full.gail, rounds=20 if bandit else 2),
         rma=replace(full.rma, updates=500 if bandit else 60, rounds=2, teacher_updates=400),
         transformer=replace(full.transformer, updates=200 if bandit else 10),
+        obs=replace(full.obs, updates=500 if bandit else 60),
         dropout=replace(full.dropout, updates=500 if bandit else 60),
         palr=replace(full.palr, updates=500 if bandit else 60),
     )
