@@ -13,7 +13,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,11 +103,13 @@ def main() -> None:
     about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
     for name in args.methods or TRIED:
         for change in ({}, *TRIED[name]):
-            row: dict[str, Any] = {"method": name, "setting": title(change), "scores": {}, "cpu_s": {}, **about}
+            row: dict[str, Any] = {"method": name, "setting": title(change), **about}
+            row |= {"amounts": {}, "scores": {}, "cpu_s": {}}  # by task
             for task in (envs.get(one) for one in TASKS):
                 settings, part = preset("default", task, "cpu"), METHODS[name].part
                 began = other(getattr(settings, part), BEFORE.get(name, {}))
-                settings = replace(settings, **{part: other(began, change)})
+                settings = replace(settings, **{part: (tried := other(began, change))})
+                row["amounts"][task.name] = asdict(tried)
                 own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
                 jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
                 with commands.locked(own), Local() as engine:
