@@ -84,16 +84,16 @@ def main() -> None:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
         return
-    with commands.engine(args.cluster) as engine:
-        for job, seeds in left.items():
-            task, own = envs.get(job.task), job.folder.parent
-            with commands.locked(own):
-                prepare(own, commands.about(BenchmarkJob, task, args.preset, job.preset, args.set), resume=True)
-                label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
-                finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
-                new = [one for one in finished if one[0] == job.method and one[1] in seeds]
-                for record in records.of_run(new, args.preset, args.set, task.episodes):
-                    records.write(kept, record)
+    for job, seeds in left.items():
+        task, own = envs.get(job.task), job.folder.parent
+        # Workers of its own: a record tells the code that is there when it is made, and they have imported it.
+        with commands.locked(own), commands.engine(args.cluster) as engine:
+            prepare(own, commands.about(BenchmarkJob, task, args.preset, job.preset, args.set), resume=True)
+            label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
+            finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
+        new = [one for one in finished if one[0] == job.method and one[1] in seeds]
+        for record in records.of_run(new, args.preset, args.set, task.episodes):
+            records.write(kept, record)
 
 
 if __name__ == "__main__":

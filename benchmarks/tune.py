@@ -15,16 +15,18 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
 from deconfounded.envs.files import write_atomically, write_json
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.presets import Preset
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
@@ -45,6 +47,7 @@ TRIED: dict[str, tuple[Change, ...]] = {
 """Of each opponent, what is tried beside the preset as it was before."""
 BEFORE: dict[str, Change] = {
     "naive_obs": {"learning_rate": 1 / 0.3},
+    "naive_dropout": {"learning_rate": 1 / 0.3},
     "palr": {"penalty": 0.1},
     "rma": {"learning_rate": 1 / 0.3},
     "deconfounded_mean": {"model": "gru"},
@@ -59,6 +62,12 @@ def other(config: Any, change: Change) -> Any:
         now = getattr(config, name)
         values[name] = by if isinstance(by, str) else round(now * by) if isinstance(now, int) else now * by
     return replace(config, **values)
+
+
+def began(today: Preset) -> Preset:
+    """The amounts that the search begins with."""
+    undone = {METHODS[name].part: change for name, change in BEFORE.items()}
+    return replace(today, **{part: other(getattr(today, part), change) for part, change in undone.items()})
 
 
 def title(change: Change) -> str:
@@ -100,15 +109,13 @@ def main() -> None:
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
     for name in args.methods or TRIED:
         for change in ({}, *TRIED[name]):
-            row: dict[str, Any] = {"method": name, "setting": title(change), **about}
-            row |= {"amounts": {}, "scores": {}, "cpu_s": {}}  # by task
+            row: dict[str, Any] = {"method": name, "setting": title(change)}
+            row |= {"amounts": {}, "scores": {}, "loss": {}, "cpu_s": {}}  # by task
             for task in (envs.get(one) for one in TASKS):
-                settings, part = preset("default", task, "cpu"), METHODS[name].part
-                began = other(getattr(settings, part), BEFORE.get(name, {}))
-                settings = replace(settings, **{part: (tried := other(began, change))})
+                settings, part = began(preset("default", task, "cpu")), METHODS[name].part
+                settings = replace(settings, **{part: (tried := other(getattr(settings, part), change))})
                 row["amounts"][task.name] = asdict(tried)
                 own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
                 jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
@@ -117,9 +124,12 @@ def main() -> None:
                     share(args.out / task.name, own / "jobs")
                     finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
                     share(own / "jobs", args.out / task.name, but=name)
-                found = records.gather(records.of_run(finished, "default", [], task.episodes))["methods"]
-                row["scores"][task.name] = [round(score, 4) for score in last_scores(found)[name].values()]
-                row["cpu_s"][task.name] = found[name]["cpu_s"]
+                found = records.gather(records.of_run(finished, "default", [], task.episodes))
+                row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
+                entry = found["methods"][name]
+                row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
+                row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
+                row["cpu_s"][task.name] = entry["cpu_s"]
             keep(row, DOCS / "tuning.json")
             told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
             print(f"{name}, {row['setting']}: {told}")

@@ -1,9 +1,9 @@
 """Tier 1 (appendix C, Algorithm 3): deconfounded imitation from expert demonstrations alone.
 
-An offline encoder reads whole expert trials, actions and all, and a decoder in two factors, dynamics and policy,
-explains both by one latent, Eq. (7). The encoder is deluded by actions, but the dynamics are not: they make synthetic
-trajectories under actions that are blind to the latent, and an online encoder is trained on these, Eq. (6). It is
-deployed as in Tier 2, by Algorithm 2.
+An offline encoder reads whole expert trials, actions and all (in training so many drawn steps of each), and a decoder
+in two factors, dynamics and policy, explains both by one latent, Eq. (7). The encoder is deluded by actions, but the
+dynamics are not: they make synthetic trajectories under actions that are blind to the latent, and an online encoder is
+trained on these, Eq. (6). It is deployed as in Tier 2, by Algorithm 2.
 """
 
 from __future__ import annotations

@@ -204,10 +204,35 @@ class Deadly(pool.Job):
 
 def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        run_command(lambda: pool.run_jobs([job], "deadly", Local().run), "kept")
+    with pytest.raises(SystemExit) as ended, Local() as engine:
+        run_command(lambda: pool.run_jobs([job], "deadly", engine.run), "kept")
     assert (ended.value.code, capsys.readouterr().err) == (143, "interrupted; kept\n")
     assert not multiprocessing.active_children()
+
+
+class Told(pool.Job):
+    """Says who does it."""
+
+    def run(self) -> str:
+        return str(os.getpid())
+
+
+def test_workers_are_kept(tmp_path: Path) -> None:
+    """From one call to the next, until the end; what they inherit is put back, though a call fails."""
+    job, told, heard = Told("bandit", tiny_preset(), "random", (0,), tmp_path), [], signal.getsignal(signal.SIGINT)
+    threads = os.environ.get("OMP_NUM_THREADS")
+    with Local() as engine:
+        for _ in range(2):
+            engine.run([job], lambda ticks: None, lambda job, line: told.append(str(line)))
+        assert engine._executor is not None
+        engine._executor.shutdown()
+        with pytest.raises(RuntimeError):
+            engine.run([job], lambda ticks: None, lambda job, line: None)
+    assert len(told) == 2
+    assert len(set(told)) == 1
+    assert not multiprocessing.active_children()
+    assert signal.getsignal(signal.SIGINT) is heard
+    assert os.environ.get("OMP_NUM_THREADS") == threads
 
 
 def test_every_command_listens_first() -> None:

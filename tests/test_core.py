@@ -19,6 +19,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import cloning, deconfounded, naive_rnn, offline
+from deconfounded.deconf.agents import Monitor
 from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.data import Batch, Draws, Signature
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
@@ -258,6 +259,32 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
     action, wanted = taken[0]
     assert set(action.tolist()) == {0.0, 1.0}  # the policy does read its latent
     assert abs(np.corrcoef(action, wanted)[0, 1]) < 4 / np.sqrt(400)
+
+
+@pytest.mark.parametrize(("asked", "read"), [(4, 4), (50, 10)])
+def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So many different ones of each trial, or all, which stand for the trial; others at each update."""
+    seen: list[Tensor] = []
+    weights: list[Tensor] = []
+
+    def last(self: VariationalModel, batch: Batch) -> Tensor:
+        seen.append(batch.obs[0, 0, :, 0])
+        return self.encoder(batch)[:, :, -1]
+
+    def loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, weight: Tensor) -> Tensor:
+        weights.append(weight)
+        return offline_loss(log_next, log_policy, kl, beta, weight)
+
+    monkeypatch.setattr(VariationalModel, "last", last)
+    monkeypatch.setattr(offline, "offline_loss", loss)
+    step = np.tile(np.arange(11, dtype="f4"), (3, 1, 1))[..., None]
+    trials = Trials(step, np.zeros((3, 1, 10, 1), "f4"), np.ones((3, 1, 10), bool))
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    config = OfflineConfig(width=8, offline_updates=3, offline_batch=2, offline_steps=asked)
+    offline.explain(Batch.of(trials, 1), Signature.of(trials), config, draws, Monitor())
+    assert [len(set(steps.tolist())) for steps in seen] == [read] * 3
+    assert (len({tuple(sorted(steps.tolist())) for steps in seen}) > 1) == (read < 10)
+    assert all(weight.sum(-1).tolist() == [[pytest.approx(10)] * 2] for weight in weights)
 
 
 def test_synthetic_episodes_end_where_no_expert_acted() -> None:

@@ -51,15 +51,17 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     about = {"machine": "m", "versions": {"torch": "2"}, "commit": None}
     for method, setting, scores, cpu in (
         *(("gail", "a", [0.9, 0.9], 5.0), ("gail", "b", [0.5, 0.7], 9.0), ("gail", "c", [0.59, 0.6], 4.0)),
-        *(("palr", "a", [0.2, 0.2], 5.0), ("gail", "a", [0.1, 0.3], 5.0)),
+        *(("gail", "d", [0.2, 0.2], 1.0), ("palr", "a", [0.2, 0.2], 5.0), ("gail", "a", [0.1, 0.3], 5.0)),
         *(("naive_rnn", "the preset", [0.1, 0.1], 5.0), ("naive_rnn", "b", [0.9, 0.9], 5.0)),
+        *(("naive_rnn", "c", [0.2, 0.1], 5.0), ("naive_rnn", "d", [0.3, 0.1], 5.0)),
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
     monkeypatch.setattr(pages, "DOCS", tmp_path)
     lines = pages.tuning().splitlines()
-    assert [line.rpartition(" | ")[2] for line in lines[2:8]] == ["kept |", " |", "chosen |", " |", " |", "chosen |"]
-    assert lines[4:6] == ["| palr | a | 0.20 | 5 | chosen |", "| gail | a | 0.20 | 5 |  |"]
+    words = [line.split(" | ")[-1].strip(" |") for line in lines[2:11]]
+    assert words == ["kept", "", "", "", "", "", "", "chosen", ""], "palr is not through"
+    assert lines[6:8] == ["| palr | a | 0.20 | 5 |  |", "| gail | a | 0.20 | 5 |  |"]
 
 
 def test_presets_are_what_tuning_chose() -> None:
@@ -67,6 +69,7 @@ def test_presets_are_what_tuning_chose() -> None:
     rows = json.loads((pages.DOCS / "tuning.json").read_text())["rows"]
     for method in dict.fromkeys(row["method"] for row in rows):
         tried, of = ({}, *tune.TRIED[method]), [row for row in rows if row["method"] == method]
+        assert len(tried) == pages.BUDGET
         assert [row["setting"] for row in of] == [tune.title(change) for change in tried]
         for task in map(envs.get, tune.TASKS):
             config = getattr(preset("default", task, "cpu"), METHODS[method].part)
@@ -76,19 +79,26 @@ def test_presets_are_what_tuning_chose() -> None:
                 assert asdict(tune.other(began, change)) == pytest.approx(row["amounts"][task.name])
 
 
-@pytest.mark.parametrize(("score", "word"), [(0.95, "Yes"), (0.7, "It helps, but it is not enough"), (0.4, "No")])
-def test_answers(score: float, word: str) -> None:
+@pytest.mark.parametrize(
+    ("score", "naive", "spread", "word"),
+    [
+        *((0.95, 0.4, 1, "Yes"), (0.7, 0.4, 1, "It helps, but it is not enough"), (0.4, 0.4, 1, "No")),
+        *((0.7, 0.4, 20, "It cannot be told yet"), (0.95, 0.95, 1, "It cannot be told yet")),
+    ],
+)
+def test_answers(score: float, naive: float, spread: float, word: str) -> None:
     """By whether the opponent comes up to the one, or is no better than the other, on the tasks where all were run."""
     seeds = {0: -0.06, 1: -0.02, 2: 0.0, 3: 0.02, 4: 0.06}
-    runs = {"naive_rnn": 0.4, "deconfounded": 0.95, "naive_transformer": score}
-    of = {name: {seed: mean + noise for seed, noise in seeds.items()} for name, mean in runs.items()}
+    runs = {"naive_rnn": (naive, 1), "deconfounded": (0.95, 1), "naive_transformer": (score, spread)}
+    of = {name: {seed: mean + by * noise for seed, noise in seeds.items()} for name, (mean, by) in runs.items()}
     scores = {"a": of, "b": of, "lacking": {name: of[name] for name in ("naive_rnn", "deconfounded")}}
     (told,) = answers(scores)
     assert told.startswith(f"Does scale cure the delusion? {word}: naive_transformer {score:.2f} (")
-    assert "naive_rnn 0.40 (" in told
+    assert f"naive_rnn {naive:.2f} (" in told
     assert "deconfounded 0.95 (" in told
     assert "over 2 tasks" in told
     assert answers({"lacking": scores["lacking"]}) == []
+    assert answers({"a": {name: {0: 0.5} for name in runs}}) == [], "a seed alone has no interval"
 
 
 class TestStatistics:

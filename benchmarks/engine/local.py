@@ -25,8 +25,26 @@ def start_worker(ticks: Queue[int]) -> None:
     pool.tell(ticks)
 
 
+@contextmanager
+def inherited() -> Iterator[None]:
+    """Workers that are made meanwhile leave Ctrl-C alone, and have one thread: jobs beat threads within one."""
+    heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
+    os.environ["OMP_NUM_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, heard)
+        if threads is None:
+            del os.environ["OMP_NUM_THREADS"]
+        else:
+            os.environ["OMP_NUM_THREADS"] = threads
+
+
 class Local(Engine):
-    """Processes that write their jobs' files themselves. They are made for the first jobs, and kept for those after."""
+    """Processes that write their jobs' files themselves. They are made for the first jobs, and kept for those after.
+
+    They have the code of when they were made, so that it is not to change while they are in use.
+    """
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("spawn")
@@ -45,15 +63,8 @@ class Local(Engine):
         if self._executor is None:
             self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, (self._ticks,))
         with self._ended():
-            # For workers, which are made now, to inherit; networks are small, so that jobs beat threads within one.
-            heard, threads = signal.signal(signal.SIGINT, signal.SIG_IGN), os.environ.get("OMP_NUM_THREADS")
-            os.environ["OMP_NUM_THREADS"] = "1"
-            futures = {self._executor.submit(job.run): job for job in jobs}
-            signal.signal(signal.SIGINT, heard)
-            if threads is None:
-                del os.environ["OMP_NUM_THREADS"]
-            else:
-                os.environ["OMP_NUM_THREADS"] = threads
+            with inherited():
+                futures = {self._executor.submit(job.run): job for job in jobs}
             waiting = set(futures)
             while waiting:
                 while not self._ticks.empty():

@@ -86,7 +86,7 @@ _CONTROL = Preset(
     rma=RmaConfig(updates=3000, learning_rate=6e-4),
     transformer=TransformerConfig(),
     obs=RecurrentConfig(learning_rate=9e-4),
-    dropout=DropoutConfig(),
+    dropout=DropoutConfig(learning_rate=9e-4),
     palr=PalrConfig(penalty=1.0),
 )
 _ON_BANDIT = DeconfoundedConfig(
@@ -146,7 +146,7 @@ _BANDIT = Preset(
     rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=3e-3, teacher_updates=500),
     transformer=TransformerConfig(width=32, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
     obs=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
-    dropout=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    dropout=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
     palr=PalrConfig(penalty=1.0, updates=2000, batch=128, chunk=50, learning_rate=1e-2),
 )
 
@@ -226,6 +226,7 @@ def preset(name: str, task: envs.Task, device: str) -> Preset:
             told[part] |= {"latent": SPACIOUS}
         updates = round(LONGER * amounts.deconfounded.inference_updates)
         told["deconfounded"] |= {"inference_updates": updates, "inference_rate": GENTLE}
+        told["offline"] |= {"learning_rate": GENTLE}
     for part in ("deconfounded", "discrete", "offline", "dagger"):
         told[part] |= {"drifts": task.drifts}
     return replace(amounts, **{part: replace(getattr(amounts, part), **values) for part, values in told.items()})

@@ -10,6 +10,11 @@ from deconfounded.benchmarks.output import statistics
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.envs.task import Array
 
+NOTE = (
+    "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Opponents were"
+    " tuned on two of these tasks, with other seeds, to score best. naive_rnn was not: trained less it clones less well"
+    " and scores higher, see tuning.md."
+)
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",
     "naive_obs": "Is it enough not to see one's own past actions?",
@@ -22,20 +27,24 @@ Scores = Mapping[str, Mapping[str, Mapping[int, float]]]
 
 
 def answers(scores: Scores) -> list[str]:
-    """A sentence for each of QUESTIONS whose method was run on a task of these, along with PEER and NAIVE."""
+    """A sentence for each of QUESTIONS whose method has several seeds on a task of these, as PEER and NAIVE have."""
     return [told for method, question in QUESTIONS.items() if (told := _answer(scores, method, question))]
 
 
 def _answer(scores: Scores, method: str, question: str) -> str | None:
-    """Yes if its interval of 95% reaches up to that of PEER, no if it reaches down to that of NAIVE."""
+    """By intervals of 95%: does the method's reach up to that of PEER, and does it keep clear of that of NAIVE?"""
     names = (method, NAIVE, PEER)
-    tasks = [task for task, of in scores.items() if all(of.get(name) for name in names)]
+    tasks = [task for task, of in scores.items() if all(len(of.get(name, ())) > 1 for name in names)]
     if not tasks:
         return None
     runs = {name: {task: np.array(list(scores[task][name].values())) for task in tasks} for name in names}
     found = {name: _figure(statistics.iqm, runs[name]) for name in names}
     _, low, high = found[method]
-    word = "Yes" if high >= found[PEER][1] else "No" if low <= found[NAIVE][2] else "It helps, but it is not enough"
+    helps, enough = low > found[NAIVE][2], high >= found[PEER][1]
+    if found[PEER][1] <= found[NAIVE][2] or (enough and not helps):
+        word = "It cannot be told yet"
+    else:
+        word = "Yes" if enough else "It helps, but it is not enough" if helps else "No"
     told = (
         f"{name} {mean} ({low} to {high})" for name in names for mean, low, high in [map(two_decimals, found[name])]
     )
@@ -50,5 +59,6 @@ def _figure(figure: Callable[..., Array], *runs: statistics.Runs) -> tuple[float
     """Over tasks that all have: its value, and from where to where its interval reaches."""
     found = statistics.over_tasks(figure, *runs)
     assert found is not None
-    low, high = found.interval or (found.value, found.value)
+    assert found.interval is not None
+    low, high = found.interval
     return float(found.value), float(low), float(high)

@@ -14,7 +14,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.output import score, statistics
-from deconfounded.benchmarks.output.answers import answers
+from deconfounded.benchmarks.output.answers import NOTE, answers
 from deconfounded.benchmarks.output.colours import colour
 
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
@@ -165,6 +165,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
         "methods": {name: methods[name] for name in order},
         "rows": rows,
         "compared": COMPARED,
+        "note": NOTE,
         "answers": answers({name: scores[name] for name in scores if name in passed}),
         "over": {key: over_tasks(scores, names) for key, names in tiers.items()},
         "thresholds": _short(THRESHOLDS),
