@@ -2,7 +2,7 @@
 
 Each opponent gets four settings, its present one among them, on two development tasks: the cartpole on a tilted rail
 and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at once.
-Interrupted, it goes on where it was.
+Interrupted, it goes on where it was; what is there of today's code and amounts stays.
 """
 
 from __future__ import annotations
@@ -84,15 +84,51 @@ def share(source: Path, other: Path, but: str = "") -> None:
             write_atomically(other / file.name, file.read_bytes())
 
 
+def kept(file: Path) -> list[dict[str, Any]]:
+    """The rows of the file, one a setting."""
+    return json.loads(file.read_text())["rows"] if file.is_file() else []
+
+
 def keep(row: dict[str, Any], file: Path) -> None:
     """Among the file's rows, in place of the one of the same method and setting."""
-    rows = json.loads(file.read_text())["rows"] if file.is_file() else []
+    rows = kept(file)
     same = [one for one in rows if (one["method"], one["setting"]) == (row["method"], row["setting"])]
     if same:
         rows[rows.index(same[0])] = row
     else:
         rows.append(row)
     write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
+
+
+def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
+    """Of a method's setting: what each task's run has of everything, and what its row is known by."""
+    from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.presets import preset
+
+    part, settings, code = METHODS[name].part, {}, {}
+    for task in map(envs.get, TASKS):
+        start = began(preset("default", task, "cpu"))
+        settings[task.name] = replace(start, **{part: other(getattr(start, part), change)})
+        code[task.name] = identity.code(task, METHODS[name].module)
+    amounts = {task: asdict(getattr(one, part)) for task, one in settings.items()}
+    return settings, {"method": name, "setting": title(change), "amounts": amounts, "code": code}
+
+
+def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:
+    """The results of a setting on a task: those of the method and of the references."""
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.output import records
+
+    own = out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
+    jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
+    with commands.locked(own), Local() as engine:
+        prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
+        share(out / task.name, own / "jobs")
+        finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
+        share(own / "jobs", out / task.name, but=name)
+    return records.gather(records.of_run(finished, "default", [], task.episodes))
 
 
 def main() -> None:
@@ -102,38 +138,26 @@ def main() -> None:
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
     args = parser.parse_args()
     check_names("method", args.methods or (), list(TRIED))
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
-    from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
-    from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    for name in args.methods or TRIED:
-        for change in ({}, *TRIED[name]):
-            row: dict[str, Any] = {"method": name, "setting": title(change)}
-            row |= {"amounts": {}, "scores": {}, "loss": {}, "cpu_s": {}}  # by task
-            for task in (envs.get(one) for one in TASKS):
-                settings, part = began(preset("default", task, "cpu")), METHODS[name].part
-                settings = replace(settings, **{part: (tried := other(getattr(settings, part), change))})
-                row["amounts"][task.name] = asdict(tried)
-                own = args.out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
-                jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
-                with commands.locked(own), Local() as engine:
-                    prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
-                    share(args.out / task.name, own / "jobs")
-                    finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
-                    share(own / "jobs", args.out / task.name, but=name)
-                found = records.gather(records.of_run(finished, "default", [], task.episodes))
-                row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
-                entry = found["methods"][name]
-                row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
-                row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
-                row["cpu_s"][task.name] = entry["cpu_s"]
-            keep(row, DOCS / "tuning.json")
-            told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
-            print(f"{name}, {row['setting']}: {told}")
-    print(f"-> {DOCS / 'tuning.json'}")
+    file = DOCS / "tuning.json"
+    for name, change in [(method, one) for method in args.methods or TRIED for one in ({}, *TRIED[method])]:
+        settings, row = plan(name, change)
+        if any(all(one.get(key) == value for key, value in row.items()) for one in kept(file)):
+            print(f"{name}, {row['setting']}: it is in {file.name}")
+            continue
+        row |= {"scores": {}, "loss": {}, "cpu_s": {}}
+        for task in map(envs.get, TASKS):
+            found = run(name, change, settings[task.name], task, args.out)
+            row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
+            entry = found["methods"][name]
+            row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
+            row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
+            row["cpu_s"][task.name] = entry["cpu_s"]
+        keep(row, file)
+        told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
+        print(f"{name}, {row['setting']}: {told}")
+    print(f"-> {file}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ Same data as `deconfounded`; four things differ. The policy is trained and deplo
 theta_hat is sampled nowhere but in the model's own training, and expert actions early in a trial are cloned under what
 was known then, not under what the whole trial tells. The KL divergence is from the belief a step before, not from the
 prior. The latent of a step predicts the next several transitions, not just one. And errors of these are squared errors.
-Their belief is a GRU's (`model`); tuning chose the order-free one for the default preset.
 """
 
 from __future__ import annotations
