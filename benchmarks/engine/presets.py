@@ -184,8 +184,12 @@ _PAPER = replace(  # appendix D and table 1; what they leave open is in docs/pap
 def _smoke(full: Preset) -> Preset:
     """One seed, and little of everything; the bandit's belief gets enough to be ahead of naive cloning."""
     bandit = full is _BANDIT
-    amounts: dict[str, Any] = {"rounds": 1 if bandit else 2, "imitation_updates": 400 if bandit else 100}
-    few: dict[str, Any] = {"inference_updates": 800} if bandit else {"inference_updates": 100, "final_updates": 400}
+    amounts: dict[str, Any] = (
+        {"rounds": 1, "imitation_updates": 400, "final_updates": 800}
+        if bandit
+        else {"rounds": 2, "imitation_updates": 100, "final_updates": 400}
+    )
+    inference = 800 if bandit else 100
     return replace(
         full,
         seeds=1,
@@ -194,15 +198,13 @@ def _smoke(full: Preset) -> Preset:
         eval_trials=1000 if bandit else 16,
         query_trials=500 if bandit else 8,
         grid=9,
-        deconfounded=replace(full.deconfounded, **amounts, **few),
-        discrete=replace(full.discrete, **amounts, **few),
+        deconfounded=replace(full.deconfounded, **amounts, inference_updates=inference),
+        discrete=replace(full.discrete, **amounts, inference_updates=inference),
         offline=replace(full.offline, offline_updates=300, online_updates=300),
         naive=replace(full.naive, updates=500 if bandit else 60),
         dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
         cloning=replace(full.cloning, updates=400),
-        mean=replace(
-            full.mean, **amounts, **({"inference_updates": 400} if bandit else {**few, "inference_updates": 20})
-        ),
+        mean=replace(full.mean, **amounts, inference_updates=400 if bandit else 20),
         gail=replace(full.gail, rounds=20 if bandit else 2),
         rma=replace(full.rma, updates=500 if bandit else 60, rounds=2, teacher_updates=400),
         transformer=replace(full.transformer, updates=200 if bandit else 10),
