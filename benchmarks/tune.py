@@ -51,6 +51,7 @@ BEFORE: dict[str, Change] = {
     "palr": {"penalty": 0.1},
     "rma": {"learning_rate": 1 / 0.3},
     "deconfounded_mean": {"model": "gru"},
+    "naive_transformer": {"layers": 0.5},
 }
 """What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
 
