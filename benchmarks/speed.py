@@ -142,6 +142,8 @@ def picture(found: dict[str, dict[str, dict[str, float]]], file: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    for axes in (left, right):
+        axes.set_prop_cycle(color=matplotlib.color_sequences["tab20"])
     for name, by_size in found.items():
         sizes = [int(n) for n in by_size]
         left.plot(sizes, [row["closed_loop"] / row["open_loop"] for row in by_size.values()], "o-", ms=4, label=name)

@@ -1,8 +1,8 @@
 """The opponents' tuning: `python benchmarks/tune.py`
 
-Each opponent gets four settings, its present one among them, on two development tasks: the cartpole on a tilted rail
-and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at once.
-Interrupted, it goes on where it was; what is there of today's code and amounts stays.
+Each opponent gets four settings, the preset of before among them, on two development tasks: the cartpole on a tilted
+rail and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at
+once. Interrupted, it goes on where it was; what is there of today's code and amounts stays.
 """
 
 from __future__ import annotations

@@ -91,10 +91,9 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
             for name in METHODS
             if name in (*REFERENCES, *LEARNED)
         ]
-        with commands.locked(folder):
+        with commands.locked(folder), Local() as engine:
             prepare(folder, commands.about(BenchmarkJob, task, "default", settings, [], source), resume=True)
-            with Local() as engine:
-                finished, _ = run_all(jobs, "cpu", task.name, engine)
+            finished, _ = run_all(jobs, "cpu", task.name, engine)
         kept = records.of_run(finished, "default", [], task.episodes)
     methods = records.gather(kept)["methods"]
     return {name: float(methods[name]["score_last"]) for name in LEARNED if name in methods}

@@ -189,7 +189,7 @@ def _smoke(full: Preset) -> Preset:
         if bandit
         else {"rounds": 2, "imitation_updates": 100, "final_updates": 400}
     )
-    inference = 800 if bandit else 100
+    inference, updates = (800, 500) if bandit else (100, 60)
     return replace(
         full,
         seeds=1,
@@ -201,16 +201,16 @@ def _smoke(full: Preset) -> Preset:
         deconfounded=replace(full.deconfounded, **amounts, inference_updates=inference),
         discrete=replace(full.discrete, **amounts, inference_updates=inference),
         offline=replace(full.offline, offline_updates=300, online_updates=300),
-        naive=replace(full.naive, updates=500 if bandit else 60),
-        dagger=replace(full.dagger, updates=500 if bandit else 60, rounds=4),
+        naive=replace(full.naive, updates=updates),
+        dagger=replace(full.dagger, updates=updates, rounds=4),
         cloning=replace(full.cloning, updates=400),
         mean=replace(full.mean, **amounts, inference_updates=400 if bandit else 20),
         gail=replace(full.gail, rounds=20 if bandit else 2),
-        rma=replace(full.rma, updates=500 if bandit else 60, rounds=2, teacher_updates=400),
+        rma=replace(full.rma, updates=updates, rounds=2, teacher_updates=400),
         transformer=replace(full.transformer, updates=200 if bandit else 10),
-        obs=replace(full.obs, updates=500 if bandit else 60),
-        dropout=replace(full.dropout, updates=500 if bandit else 60),
-        palr=replace(full.palr, updates=500 if bandit else 60),
+        obs=replace(full.obs, updates=updates),
+        dropout=replace(full.dropout, updates=updates),
+        palr=replace(full.palr, updates=updates),
     )
 
 

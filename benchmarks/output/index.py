@@ -14,11 +14,10 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.output import score, statistics
-from deconfounded.benchmarks.output.answers import NOTE, answers
+from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.colours import colour
 
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
-PEER = "deconfounded"  # all others are compared with it
 COMPARED = (PEER, *EXACT[::-1])  # in paired differences
 Found = Sequence[tuple[envs.Task, dict[str, Any]]]
 
@@ -140,10 +139,15 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
     }
 
 
+def in_short(found: Found, certificates: Mapping[str, Any]) -> list[str]:
+    """What is asked first, answered over the tasks whose certificate is passed."""
+    passed = {name for name, one in certificates.items() if one["verdict"] == "passed"}
+    return answers({task.name: last_scores(results["methods"]) for task, results in found if task.name in passed})
+
+
 def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str]) -> dict[str, Any]:
     """All that the page shows, for json."""
     rows, tasks, scores = [], [], {}
-    passed = [name for name, one in certificates.items() if one["verdict"] == "passed"]
     tiers: dict[str, list[str]] = {"": []}
     methods: dict[str, dict[str, str]] = {}
     for task, results in found:
@@ -166,7 +170,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
         "rows": rows,
         "compared": COMPARED,
         "note": NOTE,
-        "answers": answers({name: scores[name] for name in scores if name in passed}),
+        "answers": in_short(found, certificates),
         "over": {key: over_tasks(scores, names) for key, names in tiers.items()},
         "thresholds": _short(THRESHOLDS),
     }

@@ -18,7 +18,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import cards, gap, index, records, score
-from deconfounded.benchmarks.output.answers import NOTE, answers
+from deconfounded.benchmarks.output.answers import NOTE
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
 
@@ -39,11 +39,9 @@ VALIDATED = ("memory", "explained", "explored", "shown", "ratio", "stakes", "str
 NOT_RUN = "It has not been run yet with today's code."
 
 
-def _certified() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
+def _certified() -> dict[str, dict[str, Any]]:
     """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
-    for name in envs.SUITE:
-        if found := kept(DOCS / "certificates", name):
-            yield envs.get(name), found
+    return {name: found for name in envs.SUITE if (found := kept(DOCS / "certificates", name))}
 
 
 def _published() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
@@ -112,9 +110,7 @@ in four. *After as many again*: the last score in a trial twice as long as those
 
 def in_short() -> str:
     """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
-    passed = [task.name for task, found in _certified() if found["verdict"] == "passed"]
-    scores = {task.name: index.last_scores(found["methods"]) for task, found in _published() if task.name in passed}
-    told = [f"- {answer}" for answer in answers(scores)]
+    told = [f"- {answer}" for answer in index.in_short(list(_published()), _certified())]
     return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
 
 
@@ -150,9 +146,9 @@ def controls() -> str:
 def certificates() -> str:
     """README's table of certificates."""
     rows, asked = [], list[str]()
-    for task, found in _certified():
+    for name, found in _certified().items():
         measured = (f"{check['measured']:.2f}" for check in found["checks"].values())
-        rows.append((task.name, *measured, *nats(found), found["verdict"]))
+        rows.append((name, *measured, *nats(found), found["verdict"]))
         asked = [f"{name} ({check['required']})" for name, check in found["checks"].items()]
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
@@ -172,6 +168,27 @@ def costs() -> str:
         if any(cells):
             rows.append((method, *cells))
     return markdown_table(head, rows)
+
+
+def rates() -> str:
+    """The table of docs/speed.md: control steps a second, of what `speed.py` kept."""
+    shown, grown = ("64", "256", "4096"), ("256", "4096")
+    rows = []
+    for name, by_size in json.loads((DOCS / "speed" / "speed.json").read_text())["tasks"].items():
+        few, many = (by_size[n]["closed_loop"] for n in grown)
+        rows.append(
+            (
+                name,
+                *(f"{by_size[n]['closed_loop']:,.0f}" for n in shown),
+                *(score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in shown),
+                *(f"{by_size[shown[0]][way]:,.0f}" for way in ("mj_step", "sync_vector_env")),
+                score.two_decimals(few / many),
+                f"{by_size[grown[1]]['kib']:.0f}",
+            )
+        )
+    loops = (*(f"closed loop, {n}" for n in shown), *(f"of open loop, {n}" for n in shown))
+    told = ("mj_step x threads", f"SyncVectorEnv, {shown[0]}", "a step, {1} / {0}".format(*grown), "KiB each")
+    return markdown_table(("task", *loops, *told), rows)
 
 
 def _origin(found: dict[str, Any]) -> str:
@@ -235,8 +252,8 @@ def diagnose() -> str:
 
 
 def speed() -> str:
-    """docs/speed.md with its table."""
-    return _filled((DOCS / "speed.md").read_text(), costs)
+    """docs/speed.md with its tables."""
+    return _filled((DOCS / "speed.md").read_text(), costs, rates)
 
 
 def paper() -> str:
@@ -275,9 +292,8 @@ def check_certificate(file: Path, task: envs.Task) -> None:
 
 def index_page() -> str:
     """docs/index.html."""
-    certified = {task.name: found for task, found in _certified()}
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
-    return index.page(DOCS, list(_published()), certified, command, tiers)
+    return index.page(DOCS, list(_published()), _certified(), command, tiers)
 
 
 def write() -> None:
