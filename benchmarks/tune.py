@@ -52,6 +52,7 @@ BEFORE: dict[str, Change] = {
     "rma": {"learning_rate": 1 / 0.3},
     "deconfounded_mean": {"model": "gru"},
     "naive_transformer": {"layers": 0.5},
+    "gail": {"discriminator_rate": 1 / 0.3},
 }
 """What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
 

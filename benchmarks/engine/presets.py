@@ -82,7 +82,7 @@ _CONTROL = Preset(
     dagger=DaggerConfig(),
     cloning=CloningConfig(),
     mean=MeanConfig(model="evidence"),
-    gail=GailConfig(),
+    gail=GailConfig(discriminator_rate=3e-4),
     rma=RmaConfig(updates=3000, learning_rate=6e-4),
     transformer=TransformerConfig(layers=4),
     obs=RecurrentConfig(learning_rate=9e-4),
@@ -142,7 +142,9 @@ _BANDIT = Preset(
         final_updates=3200,
         imitation_rate=3e-3,
     ),
-    gail=GailConfig(rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9, policy_rate=3e-3),
+    gail=GailConfig(
+        rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9, policy_rate=3e-3, discriminator_rate=3e-4
+    ),
     rma=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=3e-3, teacher_updates=500),
     transformer=TransformerConfig(width=32, layers=4, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
     obs=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
