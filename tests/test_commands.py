@@ -440,7 +440,7 @@ def test_pages_are_up_to_date() -> None:
         ((docs / "results.md").read_text(), pages.results_page()),
         ((docs / "index.html").read_text(), pages.index_page()),
         ((docs / "diagnose.md").read_text(), pages.diagnose()),
-        ((docs / "tuning.md").read_text(), pages.tuned()),
+        ((docs / "opponents.md").read_text(), pages.tuned()),
         ((docs / "speed.md").read_text(), pages.speed()),
         ((docs / "paper.md").read_text(), pages.paper()),
         (readme, pages.readme()),

@@ -2,7 +2,7 @@
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
 docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and
-those in docs/diagnose.md (of what `validate.py` kept) and docs/tuning.md (of what `tune.py` kept).
+those in docs/diagnose.md (of what `validate.py` kept) and docs/opponents.md (of what `tune.py` kept).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ AUTHORS = {
     "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
     "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
 }  # returns in the published paper's control tasks, read off its figures, so approximate
-UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/tuning.md says why
+UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
 BUDGET = 4  # settings of each opponent
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
 VALIDATED = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # in docs/diagnose.md
@@ -223,7 +223,7 @@ def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tuning() -> str:
-    """The table of docs/tuning.md: what `tune.py` tried of each opponent, and what was best."""
+    """The table of docs/opponents.md: what `tune.py` tried of each opponent, and what was best."""
     if not (file := DOCS / "tuning.json").is_file():
         return NOT_RUN
     found, rows = json.loads(file.read_text()), []
@@ -242,8 +242,8 @@ def tuning() -> str:
 
 
 def tuned() -> str:
-    """docs/tuning.md with its table."""
-    return _filled((DOCS / "tuning.md").read_text(), tuning)
+    """docs/opponents.md with its table."""
+    return _filled((DOCS / "opponents.md").read_text(), tuning)
 
 
 def diagnose() -> str:
@@ -303,7 +303,7 @@ def write() -> None:
     write_atomically(DOCS / "results.md", results_page())
     gap.picture(_gaps(), DOCS / "gap.png")
     write_atomically(DOCS / "diagnose.md", diagnose())
-    write_atomically(DOCS / "tuning.md", tuned())
+    write_atomically(DOCS / "opponents.md", tuned())
     write_atomically(DOCS / "speed.md", speed())
     write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())
