@@ -139,10 +139,10 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
     }
 
 
-def in_short(found: Found, certificates: Mapping[str, Any]) -> list[str]:
-    """What is asked first, answered over the tasks whose certificate is passed."""
+def certified(found: Found, certificates: Mapping[str, Any]) -> dict[str, dict[str, dict[int, float]]]:
+    """Scores in the last episode, by task, method and seed, of the tasks whose certificate is passed."""
     passed = {name for name, one in certificates.items() if one["verdict"] == "passed"}
-    return answers({task.name: last_scores(results["methods"]) for task, results in found if task.name in passed})
+    return {task.name: last_scores(results["methods"]) for task, results in found if task.name in passed}
 
 
 def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str]) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
         "rows": rows,
         "compared": COMPARED,
         "note": NOTE,
-        "answers": in_short(found, certificates),
+        "answers": answers(certified(found, certificates)),
         "over": {key: over_tasks(scores, names) for key, names in tiers.items()},
         "thresholds": _short(THRESHOLDS),
     }

@@ -17,8 +17,8 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import cards, gap, index, records, score
-from deconfounded.benchmarks.output.answers import NOTE
+from deconfounded.benchmarks.output import cards, gap, index, records, score, statistics
+from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
 
@@ -110,7 +110,7 @@ in four. *After as many again*: the last score in a trial twice as long as those
 
 def in_short() -> str:
     """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
-    told = [f"- {answer}" for answer in index.in_short(list(_published()), _certified())]
+    told = [f"- {answer}" for answer in answers(index.certified(list(_published()), _certified()))]
     return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
 
 
@@ -191,6 +191,33 @@ def rates() -> str:
     return markdown_table(("task", *loops, *told), rows)
 
 
+def fared() -> str:
+    """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
+    scores, made = index.certified(list(_published()), _certified()), list[tuple[float, tuple[str, ...]]]()
+    for name in dict.fromkeys(name for of in scores.values() for name in of if name in METHODS):
+        runs, peers = (
+            {task: np.array([*of[one].values()]) for task, of in scores.items() if one in of} for one in (name, PEER)
+        )
+        over = statistics.over_tasks(statistics.iqm, runs)
+        better = None if name == PEER else statistics.over_tasks(statistics.improvement, peers, runs)
+        assert over is not None
+        least, most = (end(runs, key=lambda task: runs[task].mean()) for end in (min, max))
+        ends = (f"{task}, {score.two_decimals(runs[task].mean())}" for task in (least, most))
+        cells = (_with_interval(over), "" if better is None else _with_interval(better), *ends)
+        made.append((float(over.value), (name, METHODS[name].tier, str(len(runs)), *cells)))
+    told = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
+    return markdown_table(("method", "tier", "tasks", *told), [cells for _, cells in sorted(made, reverse=True)])
+
+
+def _with_interval(figure: statistics.Figure) -> str:
+    """Two decimals, and from where to where."""
+    value = score.two_decimals(float(figure.value))
+    if figure.interval is None:
+        return value
+    low, high = (score.two_decimals(float(end)) for end in figure.interval)
+    return f"{value} ({low} to {high})"
+
+
 def _origin(found: dict[str, Any]) -> str:
     """Where what is kept was made, and of which code."""
     return f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}"
@@ -242,8 +269,8 @@ def tuning() -> str:
 
 
 def tuned() -> str:
-    """docs/opponents.md with its table."""
-    return _filled((DOCS / "opponents.md").read_text(), tuning)
+    """docs/opponents.md with its tables."""
+    return _filled((DOCS / "opponents.md").read_text(), fared, tuning)
 
 
 def diagnose() -> str:
