@@ -214,7 +214,7 @@ function matrix({ tasks, methods, tier }) {
     <tr><th scope="col">method <span class="tier">tier</span></th>${heading("matrix", "", "over tasks", "first")}${tasks.map((t) => heading("matrix", t, breakable(t), first(t))).join("")}</tr></thead><tbody>`;
   for (const m of shown) {
     const o = over[m];
-    out += `<tr><th scope="row"><span class="name">${swatch(m)}<span>${breakable(m)}</span></span><span class="tier">${D.methods[m].tier}</span></th>`;
+    out += `<tr><th scope="row"><span class="name">${swatch(m)}<span>${breakable(m)}<span class="tier">${D.methods[m].tier}</span></span></span></th>`;
     out += o ? `<td class="first${whole(m) ? "" : " soft"}">${two(o.iqm.value)}<small>${whole(m) ? range(o.iqm.interval) : `${o.tasks} of ${D.over[tier].tasks.length} tasks`}</small></td>` : `<td class="first"></td>`;
     for (const t of tasks) {
       const r = where(t, m);
