@@ -392,7 +392,9 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         before = read_sealed(file)
         now = json.loads(json.dumps(settings))
         if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
-            raise envs.InputError(f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it")
+            raise envs.InputError(
+                f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it"
+            )
 
 
 def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:

@@ -24,7 +24,7 @@ from deconfounded.envs.files import write_atomically
 
 README = DOCS.parent / "README.md"
 SUMMARY = (
-    *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "naive_rnn"),
+    *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "rma", "naive_rnn", "naive_obs"),
     *("oracle_bc", "blind_bc", "conditional", "interventional"),
 )  # methods in README's table
 AUTHORS = {
