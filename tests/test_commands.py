@@ -137,7 +137,7 @@ def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
     assert "--resume" in refusal((*args, str(out)), monkeypatch, capsys)
     other = (*args[:-2], "default", "--out", str(out), "--resume")
-    assert "another preset" in refusal(other, monkeypatch, capsys)
+    assert "differs in its preset" in refusal(other, monkeypatch, capsys)
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
     (out / "jobs" / "random-0.npz").write_bytes(b"half a file")
