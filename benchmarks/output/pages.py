@@ -2,7 +2,7 @@
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
 docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and
-those in docs/diagnose.md (of what `validate.py` kept) and docs/opponents.md (of what `tune.py` kept).
+those in docs/diagnose.md (of what `validate.py` kept) and docs/opponents.md (of the records, and what `tune.py` kept).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import cards, gap, index, records, score, statistics
+from deconfounded.benchmarks.output import cards, gap, index, records, score
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
@@ -193,29 +193,24 @@ def rates() -> str:
 
 def fared() -> str:
     """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
-    scores, made = index.certified(list(_published()), _certified()), list[tuple[float, tuple[str, ...]]]()
-    for name in dict.fromkeys(name for of in scores.values() for name in of if name in METHODS):
-        runs, peers = (
-            {task: np.array([*of[one].values()]) for task, of in scores.items() if one in of} for one in (name, PEER)
+    scores, rows = index.certified(list(_published()), _certified()), list[tuple[str, ...]]()
+    over = index.over_tasks(scores, list(scores))["methods"]
+    for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
+        means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
+        ends = (
+            f"{task}, {score.two_decimals(means[task])}"
+            for task in (end(means, key=means.__getitem__) for end in (min, max))
         )
-        over = statistics.over_tasks(statistics.iqm, runs)
-        better = None if name == PEER else statistics.over_tasks(statistics.improvement, peers, runs)
-        assert over is not None
-        least, most = (end(runs, key=lambda task: runs[task].mean()) for end in (min, max))
-        ends = (f"{task}, {score.two_decimals(runs[task].mean())}" for task in (least, most))
-        cells = (_with_interval(over), "" if better is None else _with_interval(better), *ends)
-        made.append((float(over.value), (name, METHODS[name].tier, str(len(runs)), *cells)))
+        figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
+        rows.append((name, METHODS[name].tier, str(len(means)), *figures, *ends))
     told = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
-    return markdown_table(("method", "tier", "tasks", *told), [cells for _, cells in sorted(made, reverse=True)])
+    return markdown_table(("method", "tier", "tasks", *told), rows)
 
 
-def _with_interval(figure: statistics.Figure) -> str:
+def _with_interval(figure: dict[str, Any] | None) -> str:
     """Two decimals, and from where to where."""
-    value = score.two_decimals(float(figure.value))
-    if figure.interval is None:
-        return value
-    low, high = (score.two_decimals(float(end)) for end in figure.interval)
-    return f"{value} ({low} to {high})"
+    value, *ends = map(score.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
+    return f"{value} ({' to '.join(ends)})" if ends else value
 
 
 def _origin(found: dict[str, Any]) -> str:
