@@ -260,6 +260,7 @@ def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monit
 def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
     """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
     from sb3_contrib import RecurrentPPO
+    from stable_baselines3.common.logger import Logger
 
     from deconfounded.deconf.practice import WholePolicy
 
@@ -271,7 +272,7 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
         "log_std_init": -0.5,
     }
     with numbers(seed):
-        return RecurrentPPO(
+        ppo = RecurrentPPO(
             WholePolicy,
             env,
             learning_rate=config.policy_rate,
@@ -282,3 +283,5 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
             policy_kwargs=policy,
             device=config.device,
         )
+    ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
+    return ppo

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 
 from deconfounded import envs
 from deconfounded.experts.sb3 import Sb3VecEnv
@@ -54,6 +55,7 @@ def train(task: envs.Task, steps: int, seed: int, report: Report, n: int = 64) -
         seed=seed,
         device="cpu",
     )
+    model.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one
     model.learn(steps, callback=_Progress(report))
     layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
     weights = {}

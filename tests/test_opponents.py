@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from deconfounded.deconf.palr import PalrAgent, PalrConfig, hscic
 from deconfounded.deconf.practice import WholePolicy
 from deconfounded.envs.streams import Array
 from deconfounded.experts.demos import Agent, RandomAgent, Trials, run_trials, trial_seeds
+from deconfounded.experts.ppo import train
 from tests.tools import tiny_preset
 
 CONTROL = "slippery_cartpole"
@@ -449,6 +451,14 @@ def test_gail_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gail, "find_spec", lambda name: None)
     with pytest.raises(envs.InputError, match=r"^gail needs sb3-contrib; install deconfounded-imitation\[train\]$"):
         made("gail")
+
+
+def test_stable_baselines_leaves_no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Neither in an opponent's rounds nor for an expert."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    made("gail")
+    train(envs.get(CONTROL), 2048, 0, lambda *_: None, n=16)
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("method", ["deconfounded_mean", "gail", "rma"])
