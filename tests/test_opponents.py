@@ -458,7 +458,7 @@ def test_stable_baselines_leaves_no_folders(monkeypatch: pytest.MonkeyPatch, tmp
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     made("gail")
     train(envs.get(CONTROL), 2048, 0, lambda *_: None, n=16)
-    assert not [*tmp_path.iterdir()]
+    assert not [*tmp_path.glob("SB3*")]
 
 
 @pytest.mark.parametrize("method", ["deconfounded_mean", "gail", "rma"])
