@@ -13,8 +13,8 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 import json
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,66 +22,16 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands, noisier
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
-from deconfounded.envs.files import save_figure, write_json
+from deconfounded.benchmarks.output.spectra import KINDS, LEARNED, Point, picture
+from deconfounded.envs.files import write_json
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 
-LEARNED = ("deconfounded", "naive_rnn", "dagger")
-KINDS = {"process": "process noise", "expert": "the expert's action noise"}
 
-
-def variants(base: str, kind: str) -> list[tuple[float, str]]:
-    """The factors of a kind of noise, in order, and the name of the task with it; 1 is process noise's."""
-    named = {factor: noisier.title(base, kind, factor) for factor in noisier.FACTORS[kind]}
-    named[1] = noisier.title(base, "process", 1)
-    return [(factor, f"{noisier.__name__}:{named[factor]}") for factor in sorted(named)]
-
-
-def picture(found: dict[str, Any], file: Path) -> None:
-    """A column for each task and kind of noise: scores above, evidence below."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from deconfounded.benchmarks.output.colours import colour
-
-    columns = [(base, kind) for base in found for kind in KINDS]
-    figure, panels = plt.subplots(
-        2,
-        len(columns),
-        sharex=True,
-        height_ratios=(3, 2),
-        figsize=(4.1 * len(columns), 6.2),
-        layout="constrained",
-        squeeze=False,
-    )
-    for k, (base, kind) in enumerate(columns):
-        above, below = panels[:, k]
-        points = [(factor, found[base][name]) for factor, name in variants(base, kind) if name in found[base]]
-        for method in (*EXACT, *LEARNED):
-            of = [(factor, np.array(point["scores"][method])) for factor, point in points]
-            style = "--" if method in EXACT else "o-"
-            above.plot([f for f, _ in of], [x.mean() for _, x in of], style, color=colour(method), label=method)
-            above.vlines(
-                [f for f, _ in of], [x.min() for _, x in of], [x.max() for _, x in of], color=colour(method), alpha=0.4
-            )
-        for factor, point in points:
-            passed = point["certificate"]["verdict"] == "passed"
-            above.axvspan(factor / 1.2, factor * 1.2, color="tab:green" if passed else "0.5", alpha=0.09, lw=0)
-        for source, hue in (("dynamics", "tab:green"), ("actions", "tab:red")):
-            nats = [point["certificate"]["evidence_nats_per_step"][source] for _, point in points]
-            below.plot([factor for factor, _ in points], nats, "s-", color=hue, label=f"of {source}")
-        above.set(title=f"{base}\n{KINDS[kind]}", ylim=(-0.1, 1.1), xscale="log")
-        below.set(yscale="log", xlabel="times that of the suite")
-        below.set_xticks([factor for factor, _ in points], [f"{factor:g}" for factor, _ in points])
-        below.minorticks_off()
-    panels[0, 0].set_ylabel("score, last episode")
-    panels[1, 0].set_ylabel("evidence of theta, nats a step")
-    panels[0, 0].legend(frameon=False, fontsize=8)
-    panels[1, 0].legend(frameon=False, fontsize=8)
-    save_figure(figure, file, 100)
-    plt.close(figure)
+def variants(base: str) -> list[tuple[str, str, float, str]]:
+    """The task, the kinds of its noise, times which factor each, and the task with that."""
+    points = [(kind, factor) for kind in KINDS for factor in noisier.FACTORS[kind]]
+    return [(base, *one, f"{noisier.__name__}:{noisier.title(base, *one)}") for one in points]
 
 
 def main() -> None:
@@ -98,28 +48,28 @@ def main() -> None:
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    folder, found = args.out or Path("results") / "spectrum", dict[str, Any]()
-    for base in args.tasks:
-        weights, found[base] = str(ASSETS / "experts" / f"{base}.safetensors"), {}
-        for name in dict.fromkeys(name for kind in KINDS for _, name in variants(base, kind)):
-            task = envs.get(name)
-            settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
-            wanted = [*REFERENCES, *EXACT, *(name for name in METHODS if name in methods)]
-            seeds = tuple(range(args.seeds))
-            jobs = [BenchmarkJob(task.reference, settings, one, seeds, own / "jobs", expert=weights) for one in wanted]
-            with commands.locked(own), commands.engine(args.cluster) as engine:
-                prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), resume=True)
-                if not (kept := own / "certificate.json").is_file():
-                    write_json(kept, certify(task, policy.load(task, weights)))
-                finished, _ = run_all(jobs, args.device, task.name, engine)
-            results = records.gather(records.of_run(finished, args.preset, args.set, task.episodes))["methods"]
-            last = {one: [*of.values()] for one, of in last_scores(results).items() if one in wanted}
-            found[base][name] = {"certificate": json.loads(kept.read_text()), "scores": last}
-            told = ", ".join(f"{one} {np.mean(last[one]):.2f}" for one in (*EXACT, *methods))
-            print(f"{task.name}: certificate {found[base][name]['certificate']['verdict']}; {told}")
-    shown = {base: {envs.get(name).name: point for name, point in points.items()} for base, points in found.items()}
-    write_json(folder / "spectrum.json", {"seeds": args.seeds, "preset": args.preset, "tasks": shown})
-    picture(found, folder / "spectrum.png")
+    folder, points = args.out or Path("results") / "spectrum", list[Point]()
+    for base, kind, factor, name in chain(*map(variants, args.tasks)):
+        task, weights = envs.get(name), str(ASSETS / "experts" / f"{base}.safetensors")
+        settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
+        wanted = [*REFERENCES, *EXACT, *(name for name in METHODS if name in methods)]
+        seeds = tuple(range(args.seeds))
+        jobs = [BenchmarkJob(task.reference, settings, one, seeds, own / "jobs", expert=weights) for one in wanted]
+        with commands.locked(own), commands.engine(args.cluster) as engine:
+            prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), resume=True)
+            if not (kept := own / "certificate.json").is_file():
+                write_json(kept, certify(task, policy.load(task, weights)))
+            finished, _ = run_all(jobs, args.device, task.name, engine)
+        results = records.gather(records.of_run(finished, args.preset, args.set, task.episodes))
+        last = {one: [*of.values()] for one, of in last_scores(results["methods"]).items() if one in wanted}
+        certificate = json.loads(kept.read_text())
+        made = {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
+        point = {"task": base, "kind": kind, "factor": factor, **made}
+        points.append({**point, "certificate": certificate, "scores": last})
+        told = ", ".join(f"{one} {np.mean(last[one]):.2f}" for one in (*EXACT, *methods))
+        print(f"{task.name}: certificate {certificate['verdict']}; {told}")
+    write_json(folder / "spectrum.json", {"seeds": args.seeds, "preset": args.preset, "points": points})
+    picture(points, folder / "spectrum.png")
     print(f"-> {folder / 'spectrum.png'}")
 
 

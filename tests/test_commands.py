@@ -441,6 +441,7 @@ def test_pages_are_up_to_date() -> None:
         ((docs / "index.html").read_text(), pages.index_page()),
         ((docs / "diagnose.md").read_text(), pages.diagnose()),
         ((docs / "opponents.md").read_text(), pages.tuned()),
+        ((docs / "spectrum.md").read_text(), pages.spectrum()),
         ((docs / "speed.md").read_text(), pages.speed()),
         ((docs / "paper.md").read_text(), pages.paper()),
         (readme, pages.readme()),

@@ -11,11 +11,12 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import noisier, spectrum
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.output import gap
+from deconfounded.benchmarks.output import gap, spectra
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 
 PNG = b"\x89PNG"
+TIMES = ("0.25", "0.5", "1", "2", "4", "8")
 
 
 @pytest.mark.parametrize("base", noisier.BASES)
@@ -24,36 +25,41 @@ def test_noise_is_scaled_and_nothing_else(base: str) -> None:
     task, weights = envs.get(base), str(ASSETS / "experts" / f"{base}.safetensors")
     assert isinstance(task, envs.MujocoTask)
     names = set[str]()
-    for kind in spectrum.KINDS:
-        for factor, reference in spectrum.variants(base, kind):
-            other = envs.get(reference)
-            assert isinstance(other, envs.MujocoTask)
-            names.add(other.name)
-            by = {"process": 1.0, "expert": 1.0} | {kind: factor}
-            assert other.expert_noise == pytest.approx(by["expert"] * task.expert_noise)
-            for joint, stds in task.process_noise.items():
-                assert other.process_noise[joint] == pytest.approx(tuple(by["process"] * std for std in stds))
-            one, same = envs.BatchEnv(task, 3), envs.BatchEnv(other, 3)
-            np.testing.assert_array_equal(one.reset(1), same.reset(1))
-            action = np.full((3, *task.action_space.shape), 0.3)
-            outcomes = [env.task.outcome(env.state, action, env.theta) for env in (one, same)]
-            np.testing.assert_array_equal(*outcomes)
-            theirs, ours = policy.load(other, weights), policy.load(task)
-            assert isinstance(theirs, policy.BoxExpert)
-            assert isinstance(ours, policy.BoxExpert)
-            np.testing.assert_array_equal(theirs.mean(one.observe(), one.theta), ours.mean(one.observe(), one.theta))
+    for _, kind, factor, reference in spectrum.variants(base):
+        other = envs.get(reference)
+        assert isinstance(other, envs.MujocoTask)
+        names.add(other.name)
+        by = {"process": 1.0, "expert": 1.0} | {kind: factor}
+        assert other.expert_noise == pytest.approx(by["expert"] * task.expert_noise)
+        for joint, stds in task.process_noise.items():
+            assert other.process_noise[joint] == pytest.approx(tuple(by["process"] * std for std in stds))
+        one, same = envs.BatchEnv(task, 3), envs.BatchEnv(other, 3)
+        np.testing.assert_array_equal(one.reset(1), same.reset(1))
+        action = np.full((3, *task.action_space.shape), 0.3)
+        outcomes = [env.task.outcome(env.state, action, env.theta) for env in (one, same)]
+        np.testing.assert_array_equal(*outcomes)
+        theirs, ours = policy.load(other, weights), policy.load(task)
+        assert isinstance(theirs, policy.BoxExpert)
+        assert isinstance(ours, policy.BoxExpert)
+        np.testing.assert_array_equal(theirs.mean(one.observe(), one.theta), ours.mean(one.observe(), one.theta))
     assert len(names) == sum(map(len, noisier.FACTORS.values()))
 
 
-def test_spectrum_is_drawn(tmp_path: Path) -> None:
-    """From what the command keeps, a column for each task and kind of noise."""
-    nats = {"evidence_nats_per_step": {"dynamics": 0.5, "actions": 700.0}, "verdict": "passed"}
-    point = {"certificate": nats, "scores": {name: [0.2, 0.4] for name in (*EXACT, *spectrum.LEARNED)}}
-    found: dict[str, Any] = {
-        base: {name: point for kind in spectrum.KINDS for _, name in spectrum.variants(base, kind)}
-        for base in noisier.BASES
-    }
-    spectrum.picture(found, tmp_path / "spectrum.png")
+def test_spectrum_is_shown(tmp_path: Path) -> None:
+    """A column for each task and kind of noise: its factors in order, with what both kinds have in common in each."""
+    points: list[dict[str, Any]] = []
+    for base in noisier.BASES:
+        for _, kind, factor, _ in spectrum.variants(base):
+            nats = {"evidence_nats_per_step": {"dynamics": 0.5, "actions": 700.0}, "verdict": "passed"}
+            scores = {name: [factor, factor + 0.2] for name in (*EXACT, *spectra.LEARNED)}
+            points.append({"task": base, "kind": kind, "factor": factor, "certificate": nats, "scores": scores})
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in spectra.table(points).splitlines()[2:]]
+    head = [[base, kind, times] for base in noisier.BASES for kind in spectra.KINDS.values() for times in TIMES]
+    assert [row[:3] for row in rows] == head
+    for row in rows:
+        assert row[3:6] == ["0.50", "700", "passed"]
+        assert [float(cell) for cell in row[6:]] == pytest.approx([float(row[2]) + 0.1] * 5, abs=0.0051)
+    spectra.picture(points, tmp_path / "spectrum.png")
     assert (tmp_path / "spectrum.png").read_bytes().startswith(PNG)
 
 

@@ -2,7 +2,8 @@
 
 Writes docs/tasks.md (the card of every task, read off its class and its certificate), docs/results.md and
 docs/index.html (of the records that `publish.py` kept), the tables in README, docs/paper.md and docs/speed.md, and
-those in docs/diagnose.md (of what `validate.py` kept) and docs/opponents.md (of the records, and what `tune.py` kept).
+those in docs/diagnose.md (of what `validate.py` kept), docs/opponents.md (of the records, and what `tune.py` kept) and
+docs/spectrum.md (of spectrum.json, which is `spectrum.py`'s).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import cards, gap, index, records, score
+from deconfounded.benchmarks.output import cards, gap, index, records, score, spectra
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
@@ -218,6 +219,11 @@ def _origin(found: dict[str, Any]) -> str:
     return f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}"
 
 
+def _origins(found: list[dict[str, Any]]) -> str:
+    """Each once."""
+    return "; ".join(dict.fromkeys(map(_origin, found)))
+
+
 def validation() -> str:
     """The table of docs/diagnose.md: what `validate.py` found where the truth is known."""
     if not (file := DOCS / "diagnose" / "validation.json").is_file():
@@ -233,6 +239,18 @@ def validation() -> str:
     text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
 measured gaps is {score.two_decimals(found["rank_correlation"])} ({_origin(found)})."""
     return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
+
+
+def noises() -> str:
+    """The table of docs/spectrum.md: scores and certificates under more and less noise."""
+    found = _spectrum()
+    return f"{spectra.table(found['points'])}\n\nMeans over {found['seeds']} seeds; {_origins(found['points'])}."
+
+
+def _spectrum() -> dict[str, Any]:
+    """What `spectrum.py` found."""
+    found: dict[str, Any] = json.loads((DOCS / "spectrum.json").read_text())
+    return found
 
 
 def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -259,13 +277,17 @@ def tuning() -> str:
             word = "" if row is not best else "kept" if method == UNTUNED else "chosen"
             rows.append((method, row["setting"], *scores, *cpu, word))
     head = ("method", "setting", *tasks, *(f"{task}, CPU s a seed" for task in tasks), "")
-    origins = dict.fromkeys(map(_origin, found["rows"]))
-    return f"{markdown_table(head, rows)}\n\n{'; '.join(origins)}."
+    return f"{markdown_table(head, rows)}\n\n{_origins(found['rows'])}."
 
 
 def tuned() -> str:
     """docs/opponents.md with its tables."""
     return _filled((DOCS / "opponents.md").read_text(), fared, tuning)
+
+
+def spectrum() -> str:
+    """docs/spectrum.md with its table."""
+    return _filled((DOCS / "spectrum.md").read_text(), noises)
 
 
 def diagnose() -> str:
@@ -326,6 +348,8 @@ def write() -> None:
     gap.picture(_gaps(), DOCS / "gap.png")
     write_atomically(DOCS / "diagnose.md", diagnose())
     write_atomically(DOCS / "opponents.md", tuned())
+    write_atomically(DOCS / "spectrum.md", spectrum())
+    spectra.picture(_spectrum()["points"], DOCS / "spectrum.png")
     write_atomically(DOCS / "speed.md", speed())
     write_atomically(DOCS / "paper.md", paper())
     write_atomically(README, readme())
