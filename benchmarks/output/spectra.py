@@ -17,7 +17,7 @@ LEARNED = ("deconfounded", "naive_rnn", "dagger")
 KINDS = {"process": "process noise", "expert": "the expert's action noise"}
 
 Point = dict[str, Any]
-"""The task, the kind of its noise, times which factor, and where it was made; its certificate; each method's last scores."""
+"""The task, the kind of its noise, times which factor, made where; its certificate; the last scores of each method."""
 
 
 def _columns(points: list[Point]) -> list[tuple[str, str, list[Point]]]:
