@@ -244,7 +244,9 @@ measured gaps is {score.two_decimals(found["rank_correlation"])} ({_origin(found
 def noises() -> str:
     """The table of docs/spectrum.md: scores and certificates under more and less noise."""
     found = _spectrum()
-    return f"{spectra.table(found['points'])}\n\nMeans over {found['seeds']} seeds; {_origins(found['points'])}."
+    points = found["points"]
+    about = f"Means over {found['seeds']} seeds; {_origins(points)}."
+    return "\n\n".join([spectra.foretold(points), spectra.table(points), about])
 
 
 def _spectrum() -> dict[str, Any]:

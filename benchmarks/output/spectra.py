@@ -30,6 +30,17 @@ def _columns(points: list[Point]) -> list[tuple[str, str, list[Point]]]:
     return found
 
 
+def foretold(points: list[Point]) -> str:
+    """By how much deconfounded is ahead of naive_rnn, where the certificate is passed and where it is failed."""
+    parts = []
+    for verdict in ("passed", "failed"):
+        of = [point["scores"] for point in points if point["certificate"]["verdict"] == verdict]
+        ahead = [np.mean(scores["deconfounded"]) - np.mean(scores["naive_rnn"]) for scores in of]
+        ends = " to ".join(two_decimals(end(ahead)) for end in (min, max)) if ahead else "(none)"
+        parts.append(f"where it is {verdict}, on {len(ahead)}, by {ends}")
+    return f"The certificate said so beforehand: {'; '.join(parts)} is `deconfounded` ahead of `naive_rnn`."
+
+
 def table(points: list[Point]) -> str:
     """A row for each point of each column, in markdown."""
     rows = [
