@@ -91,7 +91,7 @@ def picture(points: list[Point], file: Path) -> None:
         below.set(yscale="log", xlabel="times that of the suite")
         below.set_xticks(factors, [f"{factor:g}" for factor in factors])
         below.minorticks_off()
-    panels[0, 0].set_ylabel("score, last episode")
+    panels[0, 0].set(ylabel="score, last episode", ylim=(0, None))
     panels[1, 0].set_ylabel("evidence of theta, nats a step")
     panels[0, 0].legend(frameon=False, fontsize=8)
     panels[1, 0].legend(frameon=False, fontsize=8)
