@@ -98,5 +98,5 @@ def test_predicted_and_measured_gap(tmp_path: Path) -> None:
     assert "it is -0.78 over 4 tasks" in text
     assert "| forked_path | 0.90 | -0.60 |" in text
     assert gap.section(found[:2]) == ""
-    gap.picture(found, tmp_path / "gap.png")
+    gap.picture([(one.task.name, *one[1:]) for one in found], tmp_path / "gap.png")
     assert (tmp_path / "gap.png").read_bytes().startswith(PNG)

@@ -53,8 +53,14 @@ With those of Tier 3, whose gap only queries of the expert can close, it is {_co
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
 
 
-def picture(gaps: Sequence[Gap], file: Path, foretold: str = FORETOLD, hues: Sequence[str] | None = None) -> None:
-    """A dot for each task; foretold: what predicts; hues: the dots' colours, if they differ."""
+def picture(
+    points: Sequence[tuple[str, float, float]],
+    file: Path,
+    foretold: str = FORETOLD,
+    hues: Sequence[str] | None = None,
+    hollow: Sequence[bool] | None = None,
+) -> None:
+    """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -62,11 +68,10 @@ def picture(gaps: Sequence[Gap], file: Path, foretold: str = FORETOLD, hues: Seq
 
     figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
     axes.axline((0, 0), slope=1, color="0.8", lw=1)
-    for one, hue in zip(gaps, hues or ["tab:blue"] * len(gaps), strict=True):
-        axes.plot(one.predicted, one.measured, "o", color=hue)
-        axes.annotate(
-            one.task.name, (one.predicted, one.measured), xytext=(4, 4), textcoords="offset points", fontsize=8
-        )
+    some = zip(points, hues or ["tab:blue"] * len(points), hollow or [False] * len(points), strict=True)
+    for (name, *at), hue, empty in some:
+        axes.plot(*at, "o", color=hue, fillstyle="none" if empty else "full")
+        axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
     axes.margins(0.14, 0.08)
     axes.set_title("what cloning loses, score in the last episode", fontsize=11)

@@ -18,7 +18,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import cards, gap, index, records, score, spectra
+from deconfounded.benchmarks.output import cards, gap, index, records, score, spectra, validated
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
 from deconfounded.envs.files import write_atomically
@@ -36,7 +36,6 @@ AUTHORS = {
 UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
 BUDGET = 4  # settings of each opponent
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
-VALIDATED = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # in docs/diagnose.md
 NOT_RUN = "It has not been run yet with today's code."
 
 
@@ -226,19 +225,13 @@ def _origins(found: list[dict[str, Any]]) -> str:
 
 def validation() -> str:
     """The table of docs/diagnose.md: what `validate.py` found where the truth is known."""
-    if not (file := DOCS / "diagnose" / "validation.json").is_file():
-        return NOT_RUN
-    found, rows = json.loads(file.read_text()), []
-    for row in found["rows"]:
-        told = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
-        figures = (row["found"][key]["value"] if key in row["found"] else None for key in VALIDATED)
-        cells = ("" if value is None else score.two_decimals(value) for value in (*figures, row["predicted"]))
-        measured, certified = score.two_decimals(row["measured"]), "passed" if row["certified"] else "failed"
-        rows.append((row["task"], certified, told, "" if row["right"] else "wrong", *cells, measured))
-    head = ("task", "certificate", "diagnosis", "", *VALIDATED, "predicted gap", "measured")
-    text = f"""{found["right"]:.0%} of the verdicts are right; the rank correlation of predicted and
-measured gaps is {score.two_decimals(found["rank_correlation"])} ({_origin(found)})."""
-    return f"{text}\n\n{markdown_table(head, rows)}\n\n![predicted and measured gap](diagnose/validation.png)"
+    rows = _validated()
+    parts = [f"{validated.told(rows)} ({_origins(rows)})", validated.table(rows)]
+    return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"]) if rows else NOT_RUN
+
+
+def _validated() -> list[dict[str, Any]]:
+    return validated.rows(DOCS / "diagnose" / "validation.json")
 
 
 def noises() -> str:
@@ -347,8 +340,9 @@ def write() -> None:
     write_atomically(DOCS / "index.html", index_page())
     write_atomically(DOCS / "tasks.md", cards.tasks_page())
     write_atomically(DOCS / "results.md", results_page())
-    gap.picture(_gaps(), DOCS / "gap.png")
+    gap.picture([(one.task.name, *one[1:]) for one in _gaps()], DOCS / "gap.png")
     write_atomically(DOCS / "diagnose.md", diagnose())
+    validated.picture(_validated(), DOCS / "diagnose" / "validation.png")
     write_atomically(DOCS / "opponents.md", tuned())
     write_atomically(DOCS / "spectrum.md", spectrum())
     spectra.picture(_spectrum()["points"], DOCS / "spectrum.png")
