@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import noisier, spectrum
+from deconfounded.benchmarks import noisier, spectrum, validate
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.output import gap, spectra
+from deconfounded.benchmarks.output import gap, spectra, validated
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 
@@ -100,3 +100,36 @@ def test_predicted_and_measured_gap(tmp_path: Path) -> None:
     assert gap.section(found[:2]) == ""
     gap.picture([(one.task.name, *one[1:]) for one in found], tmp_path / "gap.png")
     assert (tmp_path / "gap.png").read_bytes().startswith(PNG)
+
+
+def test_validation_has_what_the_spectrum_found() -> None:
+    """Every case is a task with an expert; those under other noise have their own certificate and scores."""
+    unseen = 0
+    for case, source in validate.CASES.items():
+        task = envs.get(case)
+        policy.load(task, source)
+        if point := validate.point(task):
+            unseen += 1
+            assert task.name == f"{point['task']}_process_{point['factor']:g}".replace(".", "_")
+            assert validate.certificate(task, source, Path()) is (point["certificate"]["verdict"] == "passed")
+            scores = validate.measured(task, source, Path())
+            assert scores["naive_rnn"] == np.mean(point["scores"]["naive_rnn"])
+    assert unseen == sum(factor != 1 for factor in noisier.FACTORS["process"]) * len(noisier.BASES)
+
+
+def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
+    def row(case: str, right: bool, predicted: float, measured: float) -> dict[str, Any]:
+        told = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
+        found = {"stakes": {"value": 2 * predicted}}
+        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "found": found}
+
+    seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
+    ranked = "verdicts are right; predicted and measured gaps rank alike by"
+    assert validated.told(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
+    other = [row(noisier.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
+    assert validated.told([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
+    table = validated.table([*seen, *other]).splitlines()
+    assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
+    assert table[-1].endswith("| 16.00 |  |  | 8.00 | -8.00 |")
+    validated.picture([*seen, *other], tmp_path / "validation.png")
+    assert (tmp_path / "validation.png").read_bytes().startswith(PNG)

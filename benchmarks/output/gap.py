@@ -69,7 +69,8 @@ def picture(
     figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
     axes.axline((0, 0), slope=1, color="0.8", lw=1)
     some = zip(points, hues or ["tab:blue"] * len(points), hollow or [False] * len(points), strict=True)
-    for (name, *at), hue, empty in some:
+    for (name, predicted, measured), hue, empty in some:
+        at = predicted, measured
         axes.plot(*at, "o", color=hue, fillstyle="none" if empty else "full")
         axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
