@@ -60,7 +60,10 @@ def picture(
     hues: Sequence[str] | None = None,
     hollow: Sequence[bool] | None = None,
 ) -> None:
-    """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ."""
+    """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ.
+
+    Dots within 0.05 of the origin, where there is nothing to tell, bear no name: they hide each other's.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -72,7 +75,8 @@ def picture(
     for (name, predicted, measured), hue, empty in some:
         at = predicted, measured
         axes.plot(*at, "o", color=hue, fillstyle="none" if empty else "full")
-        axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
+        if np.hypot(*at) > 0.05:
+            axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
     axes.margins(0.14, 0.08)
     axes.set_title("what cloning loses, score in the last episode", fontsize=11)
