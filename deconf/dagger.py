@@ -8,7 +8,7 @@ histories are the imitator's, and so no evidence of theta: at its optimum this i
 al., 2021), whatever the dynamics tell. Expert roll-outs are not used: their actions would be evidence.
 
 What such a policy has to remember is the evidence of theta, a sum over transitions whatever their order (see
-EvidenceBelief). A GRU in its place took 1.6 times the time, and did not learn it everywhere: `swapped_lander` .11, not .9.
+EvidenceBelief). A GRU in its place took 1.6 times the time, and had .11 on `swapped_lander`, not .9.
 """
 
 from __future__ import annotations

@@ -72,6 +72,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
     seeds, machine = len(results["seeds"]), results["machine"]
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
+    commits = ", ".join(dict.fromkeys(one[:7] for one in results["commits"]))
     rows = []
     for row in score.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
@@ -80,7 +81,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"## {task.name}",
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {machine}; {versions}"
-        f" ([records](records/{task.name}-v{task.version}), of {', '.join(dict.fromkeys(map(_short, results['commits'])))}).",
+        f" ([records](records/{task.name}-v{task.version}), of {commits}).",
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
@@ -213,14 +214,9 @@ def _with_interval(figure: dict[str, Any] | None) -> str:
     return f"{value} ({' to '.join(ends)})" if ends else value
 
 
-def _short(commit: str) -> str:
-    """Its first seven digits."""
-    return commit[:7]
-
-
 def _origin(found: dict[str, Any]) -> str:
     """Where what is kept was made, and of which code."""
-    return f"{found['machine']}, torch {found['versions']['torch']}, of {_short(found['commit'] or 'unknown')}"
+    return f"{found['machine']}, torch {found['versions']['torch']}, of {(found['commit'] or 'unknown')[:7]}"
 
 
 def _origins(found: list[dict[str, Any]]) -> str:
