@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -156,6 +157,16 @@ def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 class TestSignals:
     """One line, 128 + n, and nothing is left running."""
+
+    @pytest.fixture(autouse=True)
+    def heard(self, name: str) -> Iterator[None]:
+        """Though the tests themselves run under nohup, or in the background."""
+        number = getattr(signal, name)
+        before = signal.getsignal(number)
+        if before is signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)
+        yield
+        signal.signal(number, before)
 
     def test_while_a_command_is_imported(self, name: str, tmp_path: Path) -> None:
         """By a mujoco that sends the signal in its own import."""
