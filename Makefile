@@ -10,7 +10,7 @@ demo: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
 
 test: lint
-	$(VENV)/bin/python -m pytest -n auto
+	$(VENV)/bin/python -m pytest -n auto --dist worksteal
 
 lint: $(VENV)/installed
 	$(VENV)/bin/ruff check .
