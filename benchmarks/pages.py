@@ -21,12 +21,13 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")
     still = parser.parse_args().still
-    pages.write()
+    found = pages.published()
+    pages.write(found)
     if still:
         with Browser(1280, 960) as browser:
             browser.open(pages.DOCS / "index.html")
             write_atomically(pages.DOCS / "index.png", browser.picture())
-    print(pages.summary())
+    print(pages.summary(found))
 
 
 if __name__ == "__main__":

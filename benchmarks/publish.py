@@ -76,8 +76,9 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("run", type=Path, help="output folder of a finished run")
     keep(parser.parse_args().run)
-    pages.write()
-    print(pages.summary())
+    found = pages.published()
+    pages.write(found)
+    print(pages.summary(found))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ docs/spectrum.md (of spectrum.json, which is `spectrum.py`'s).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +43,11 @@ def _certified() -> dict[str, dict[str, Any]]:
     return {name: found for name in envs.SUITE if (found := kept(DOCS / "certificates", name))}
 
 
-def _published() -> Iterator[tuple[envs.Task, dict[str, Any]]]:
-    """In the registry's order, the tasks that have records in docs/, and what these come to."""
-    for name in envs.SUITE:
-        task = envs.get(name)
-        if found := records.of_task(DOCS / "records", name, task.version):
-            yield task, records.gather(found, list(METHODS))
+def published() -> index.Found:
+    """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
+    tasks = [envs.get(name) for name in envs.SUITE]
+    kept_of = ((task, records.of_task(DOCS / "records", task.name, task.version)) for task in tasks)
+    return [(task, records.gather(found, list(METHODS))) for task, found in kept_of if found]
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
@@ -70,7 +68,8 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
 
 def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
-    seeds, machine = len(results["seeds"]), results["machine"]
+    fewest, most = (end(len(entry["seeds"]) for entry in results["methods"].values()) for end in (min, max))
+    seeds, machine = f"{fewest} to {most}" if fewest < most else str(most), results["machine"]
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
     commits = ", ".join(dict.fromkeys(one[:7] for one in results["commits"]))
     rows = []
@@ -96,34 +95,34 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def results_page() -> str:
+def results_page(found: index.Found) -> str:
     """docs/results.md."""
     head = """# Results
 
 Made by `python benchmarks/pages.py` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
 expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
 theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-Intervals are 95% bootstrap intervals over seeds; of three seeds that is their range, which holds the mean three times
-in four. *After as many again*: the last score in a trial twice as long as those of training."""
-    parts = [head, in_short(), *(section(*found) for found in _published()), gap.section(_gaps())]
+Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the mean
+five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as those of training."""
+    parts = [head, in_short(found), *(section(*one) for one in found), gap.section(_gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def in_short() -> str:
+def in_short(found: index.Found) -> str:
     """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
-    told = [f"- {answer}" for answer in answers(index.certified(list(_published()), _certified()))]
+    told = [f"- {answer}" for answer in answers(index.certified(found, _certified()))]
     return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
 
 
-def _gaps() -> list[gap.Gap]:
+def _gaps(found: index.Found) -> list[gap.Gap]:
     """Of all tasks that have the records for it."""
-    return [one for task, results in _published() if (one := gap.gap(task, results["methods"]))]
+    return [one for task, results in found if (one := gap.gap(task, results["methods"]))]
 
 
-def summary() -> str:
+def summary(found: index.Found) -> str:
     """README's table: scores in the last episode."""
     rows, column = [], score.COLUMNS.index("last")
-    for task, results in _published():
+    for task, results in found:
         last = {row[0]: row[column] for row in score.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
@@ -131,14 +130,16 @@ def summary() -> str:
     return markdown_table(("task", "tier", *methods, "seconds"), rows)
 
 
-def controls() -> str:
+def controls(found: index.Found) -> str:
     """The table of docs/paper.md: the paper's control tasks, its returns beside ours."""
     methods, rows = list(AUTHORS["ant_goal"]), []
-    ours = {task.name: results["methods"] for task, results in _published() if task.name in AUTHORS}
+    ours = {task.name: results["methods"] for task, results in found if task.name in AUTHORS}
     for task, theirs in AUTHORS.items():
-        found = ours.get(task, {})
         rows.append((task, "the authors' return", *(f"{theirs[method]:,}" for method in methods)))
-        last = {method: (np.mean(found[method]["return"], 0)[-1], found[method]["score_last"]) for method in found}
+        last = {
+            method: (np.mean(entry["return"], 0)[-1], entry["score_last"])
+            for method, entry in ours.get(task, {}).items()
+        }
         for i, what in enumerate(("the return here", "the score here")):
             rows.append(("", what, *(score.two_decimals(last[name][i]) if name in last else "" for name in methods)))
     return markdown_table(("task", "in the last episode", *methods), rows)
@@ -154,10 +155,10 @@ def certificates() -> str:
     return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
 
 
-def costs() -> str:
+def costs(found: index.Found) -> str:
     """The table of docs/speed.md: CPU seconds a seed, before and now, of the tasks that were timed before."""
     before = json.loads((DOCS / "speed" / "before.json").read_text())
-    shown = [(task.name, results["methods"]) for task, results in _published() if task.name in before]
+    shown = [(task.name, results["methods"]) for task, results in found if task.name in before]
     head, rows = ["method"], []
     for name, _ in shown:
         head += [f"{name}, before", "now"]
@@ -192,9 +193,9 @@ def rates() -> str:
     return markdown_table(("task", *loops, *told), rows)
 
 
-def fared() -> str:
+def fared(found: index.Found) -> str:
     """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
-    scores, rows = index.certified(list(_published()), _certified()), list[tuple[str, ...]]()
+    scores, rows = index.certified(found, _certified()), list[tuple[str, ...]]()
     over = index.over_tasks(scores, list(scores))["methods"]
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
@@ -276,44 +277,15 @@ def tuning() -> str:
     return f"{markdown_table(head, rows)}\n\n{_origins(found['rows'])}."
 
 
-def tuned() -> str:
-    """docs/opponents.md with its tables."""
-    return _filled((DOCS / "opponents.md").read_text(), fared, tuning)
-
-
-def spectrum() -> str:
-    """docs/spectrum.md with its table."""
-    return _filled((DOCS / "spectrum.md").read_text(), noises)
-
-
-def diagnose() -> str:
-    """docs/diagnose.md with its table."""
-    return _filled((DOCS / "diagnose.md").read_text(), validation)
-
-
-def speed() -> str:
-    """docs/speed.md with its tables."""
-    return _filled((DOCS / "speed.md").read_text(), costs, rates)
-
-
-def paper() -> str:
-    """docs/paper.md with its table of control tasks."""
-    return _filled((DOCS / "paper.md").read_text(), controls)
-
-
-def readme() -> str:
-    """README with its tables, as docs/ has them."""
-    return _filled(README.read_text(), summary, certificates)
-
-
-def _filled(text: str, *tables: Callable[[], str]) -> str:
-    """The text with each table between `<!-- name -->` and `<!-- /name -->`."""
-    for table in tables:
-        marks = [f"<!-- {slash}{table.__name__} -->" for slash in ("", "/")]
+def _filled(file: Path, **tables: str) -> str:
+    """The page with each table between `<!-- its name -->` and `<!-- /its name -->`."""
+    text = file.read_text()
+    for name, table in tables.items():
+        marks = [f"<!-- {slash}{name} -->" for slash in ("", "/")]
         if [text.count(mark) for mark in marks] != [1, 1]:
-            raise envs.InputError(f"a page lacks its marks {' and '.join(marks)}, each once; put them back")
+            raise envs.InputError(f"{file.name} lacks its marks {' and '.join(marks)}, each once; put them back")
         before, rest = text.split(marks[0])
-        text = "\n".join([before + marks[0], table(), marks[1] + rest.split(marks[1])[1]])
+        text = "\n".join([before + marks[0], table, marks[1] + rest.split(marks[1])[1]])
     return text
 
 
@@ -330,23 +302,26 @@ def check_certificate(file: Path, task: envs.Task) -> None:
         raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
 
 
-def index_page() -> str:
-    """docs/index.html."""
+def texts(found: index.Found) -> dict[Path, str]:
+    """By its file, what each page is to say. found: what `published` gives."""
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
-    return index.page(DOCS, list(_published()), _certified(), command, tiers)
+    return {
+        DOCS / "index.html": index.page(DOCS, found, _certified(), command, tiers),
+        DOCS / "tasks.md": cards.tasks_page(),
+        DOCS / "results.md": results_page(found),
+        DOCS / "diagnose.md": _filled(DOCS / "diagnose.md", validation=validation()),
+        DOCS / "opponents.md": _filled(DOCS / "opponents.md", fared=fared(found), tuning=tuning()),
+        DOCS / "spectrum.md": _filled(DOCS / "spectrum.md", noises=noises()),
+        DOCS / "speed.md": _filled(DOCS / "speed.md", costs=costs(found), rates=rates()),
+        DOCS / "paper.md": _filled(DOCS / "paper.md", controls=controls(found)),
+        README: _filled(README, summary=summary(found), certificates=certificates()),
+    }
 
 
-def write() -> None:
-    """Bring all of them up to date."""
-    write_atomically(DOCS / "index.html", index_page())
-    write_atomically(DOCS / "tasks.md", cards.tasks_page())
-    write_atomically(DOCS / "results.md", results_page())
-    gap.picture([(one.task.name, *one[1:]) for one in _gaps()], DOCS / "gap.png")
-    write_atomically(DOCS / "diagnose.md", diagnose())
+def write(found: index.Found) -> None:
+    """Bring all of them up to date, and their pictures."""
+    for file, text in texts(found).items():
+        write_atomically(file, text)
+    gap.picture([(one.task.name, *one[1:]) for one in _gaps(found)], DOCS / "gap.png")
     validated.picture(_validated(), DOCS / "diagnose" / "validation.png")
-    write_atomically(DOCS / "opponents.md", tuned())
-    write_atomically(DOCS / "spectrum.md", spectrum())
     spectra.picture(_spectrum()["points"], DOCS / "spectrum.png")
-    write_atomically(DOCS / "speed.md", speed())
-    write_atomically(DOCS / "paper.md", paper())
-    write_atomically(README, readme())

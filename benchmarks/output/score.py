@@ -23,7 +23,7 @@ def normalise(returns: Array, random: float, expert: float) -> Array:
 def bootstrap(values: Array) -> Array | None:
     """95% percentile-bootstrap intervals [..., 2] of means over seeds, of values [S, ...]; None for a single seed.
 
-    Of few seeds they are too narrow: of three they are just the range, which holds the mean three times in four.
+    Of few seeds they are too narrow: normal scores of 3, 5 and 10 seeds hold the mean in .75, .84 and .89 of cases.
     """
     if len(values) < 2:
         return None
