@@ -102,8 +102,9 @@ def results_page(found: index.Found) -> str:
 Made by `python benchmarks/pages.py` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
 expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
 theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the mean
-five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as those of training."""
+Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
+mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
+those of training."""
     parts = [head, in_short(found), *(section(*one) for one in found), gap.section(_gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
