@@ -21,13 +21,12 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")
     still = parser.parse_args().still
-    found = pages.published()
-    pages.write(found)
+    table = pages.write()
     if still:
         with Browser(1280, 960) as browser:
             browser.open(pages.DOCS / "index.html")
             write_atomically(pages.DOCS / "index.png", browser.picture())
-    print(pages.summary(found))
+    print(table)
 
 
 if __name__ == "__main__":

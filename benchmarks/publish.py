@@ -76,9 +76,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("run", type=Path, help="output folder of a finished run")
     keep(parser.parse_args().run)
-    found = pages.published()
-    pages.write(found)
-    print(pages.summary(found))
+    print(pages.write())
 
 
 if __name__ == "__main__":

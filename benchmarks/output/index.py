@@ -183,7 +183,6 @@ def page(
     made = data(docs, found, certificates, command)
     counted = sum(entry["n"] for entry in made["rows"])
     opened = next((task["name"] for task in made["tasks"] if task["episodes"] > 1), "")
-    fewest, most = (end(entry["n"] for entry in made["rows"]) for end in (min, max))
-    seeds = f"{fewest} to {most}" if fewest < most else str(most)
+    seeds = score.fewest_to_most([entry["n"] for entry in made["rows"]])
     shown = {"tiers": tiers, "records": counted, "seeds": seeds, "peer": PEER, "opened": opened}
     return template("index.html.jinja").render(data=made, **shown) + "\n"

@@ -45,9 +45,12 @@ def _certified() -> dict[str, dict[str, Any]]:
 
 def published() -> index.Found:
     """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
-    tasks = [envs.get(name) for name in envs.SUITE]
-    kept_of = ((task, records.of_task(DOCS / "records", task.name, task.version)) for task in tasks)
-    return [(task, records.gather(found, list(METHODS))) for task, found in kept_of if found]
+    found = []
+    for name in envs.SUITE:
+        task = envs.get(name)
+        if of_task := records.of_task(DOCS / "records", name, task.version):
+            found.append((task, records.gather(of_task, list(METHODS))))
+    return found
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
@@ -68,8 +71,7 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
 
 def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
-    fewest, most = (end(len(entry["seeds"]) for entry in results["methods"].values()) for end in (min, max))
-    seeds, machine = f"{fewest} to {most}" if fewest < most else str(most), results["machine"]
+    seeds = score.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
     commits = ", ".join(dict.fromkeys(one[:7] for one in results["commits"]))
     rows = []
@@ -79,8 +81,8 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     parts = [
         f"## {task.name}",
         f"`{command(task, results)}`",
-        f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {machine}; {versions}"
-        f" ([records](records/{task.name}-v{task.version}), of {commits}).",
+        f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
+        f" {versions} ([records](records/{task.name}-v{task.version}), of {commits}).",
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
@@ -95,7 +97,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def results_page(found: index.Found) -> str:
+def results_page(found: index.Found, certified: dict[str, Any]) -> str:
     """docs/results.md."""
     head = """# Results
 
@@ -105,13 +107,13 @@ theta (more is better), are of the last episode; theta R2 is of a linear probe o
 Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
 mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
 those of training."""
-    parts = [head, in_short(found), *(section(*one) for one in found), gap.section(_gaps(found))]
+    parts = [head, in_short(found, certified), *(section(*one) for one in found), gap.section(_gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def in_short(found: index.Found) -> str:
+def in_short(found: index.Found, certified: dict[str, Any]) -> str:
     """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
-    told = [f"- {answer}" for answer in answers(index.certified(found, _certified()))]
+    told = [f"- {answer}" for answer in answers(index.certified(found, certified))]
     return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
 
 
@@ -146,10 +148,10 @@ def controls(found: index.Found) -> str:
     return markdown_table(("task", "in the last episode", *methods), rows)
 
 
-def certificates() -> str:
+def certificates(certified: dict[str, Any]) -> str:
     """README's table of certificates."""
     rows, asked = [], list[str]()
-    for name, found in _certified().items():
+    for name, found in certified.items():
         measured = (f"{check['measured']:.2f}" for check in found["checks"].values())
         rows.append((name, *measured, *nats(found), found["verdict"]))
         asked = [f"{name} ({check['required']})" for name, check in found["checks"].items()]
@@ -194,9 +196,9 @@ def rates() -> str:
     return markdown_table(("task", *loops, *told), rows)
 
 
-def fared(found: index.Found) -> str:
+def fared(found: index.Found, certified: dict[str, Any]) -> str:
     """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
-    scores, rows = index.certified(found, _certified()), list[tuple[str, ...]]()
+    scores, rows = index.certified(found, certified), list[tuple[str, ...]]()
     over = index.over_tasks(scores, list(scores))["methods"]
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
@@ -305,24 +307,27 @@ def check_certificate(file: Path, task: envs.Task) -> None:
 
 def texts(found: index.Found) -> dict[Path, str]:
     """By its file, what each page is to say. found: what `published` gives."""
+    certified = _certified()
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
     return {
-        DOCS / "index.html": index.page(DOCS, found, _certified(), command, tiers),
+        DOCS / "index.html": index.page(DOCS, found, certified, command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
-        DOCS / "results.md": results_page(found),
+        DOCS / "results.md": results_page(found, certified),
         DOCS / "diagnose.md": _filled(DOCS / "diagnose.md", validation=validation()),
-        DOCS / "opponents.md": _filled(DOCS / "opponents.md", fared=fared(found), tuning=tuning()),
+        DOCS / "opponents.md": _filled(DOCS / "opponents.md", fared=fared(found, certified), tuning=tuning()),
         DOCS / "spectrum.md": _filled(DOCS / "spectrum.md", noises=noises()),
         DOCS / "speed.md": _filled(DOCS / "speed.md", costs=costs(found), rates=rates()),
         DOCS / "paper.md": _filled(DOCS / "paper.md", controls=controls(found)),
-        README: _filled(README, summary=summary(found), certificates=certificates()),
+        README: _filled(README, summary=summary(found), certificates=certificates(certified)),
     }
 
 
-def write(found: index.Found) -> None:
-    """Bring all of them up to date, and their pictures."""
+def write() -> str:
+    """Bring all of them up to date, and their pictures. Returns README's table of results."""
+    found = published()
     for file, text in texts(found).items():
         write_atomically(file, text)
     gap.picture([(one.task.name, *one[1:]) for one in _gaps(found)], DOCS / "gap.png")
     validated.picture(_validated(), DOCS / "diagnose" / "validation.png")
     spectra.picture(_spectrum()["points"], DOCS / "spectrum.png")
+    return summary(found)

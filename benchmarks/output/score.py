@@ -31,6 +31,12 @@ def bootstrap(values: Array) -> Array | None:
     return np.stack([interval.low, interval.high], -1)
 
 
+def fewest_to_most(counts: Sequence[int]) -> str:
+    """Of how many seeds several figures are: `5 to 10`, or `5` where all are of as many."""
+    fewest, most = min(counts), max(counts)
+    return f"{fewest} to {most}" if fewest < most else str(most)
+
+
 def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, dict[str, list[Any]]]:
     """The mean over seeds of training curves, by kind of loss; of those that were noted at the same updates.
 
