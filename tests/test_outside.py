@@ -97,7 +97,11 @@ def test_run_play_score(folder: Path) -> None:
     assert wrong.stderr.startswith("error: the agent in ")
 
     with (folder / "linear.py").open("a") as file:
-        file.write("# another\n")
+        file.write("# a comment\n")
+    same = deconf(folder, "run", *mine, "--methods", "blind_bc", *small, "--resume")
+    assert same.returncode == 0, same.stderr
+    with (folder / "linear.py").open("a") as file:
+        file.write("ANOTHER = 1\n")
     changed = deconf(folder, "run", *mine, "--methods", "blind_bc", *small, "--resume")
     assert "holds a run that differs in its expert" in changed.stderr
     assert not list((ROOT / "assets").rglob("bent_cartpole*"))
