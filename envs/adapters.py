@@ -122,6 +122,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         obs = self.batch.reset(seed, options)
+        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
         return obs, {}
 
