@@ -129,13 +129,13 @@ def test_a_fork_steps_on() -> None:
     """As a worker of torch's DataLoader does; its pool is gone with its threads. Both go on, and come to their ends."""
     code = """
 import os, signal, sys
+os.register_at_fork(after_in_child=lambda: signal.alarm(50))  # nobody waits for a child for ever
 import numpy as np
 from deconfounded import envs
 vec = envs.make_vec("slippery_cartpole", 64)
 vec.reset(seed=0)
 vec.step(np.ones((64, 1)))
 child = os.fork()
-signal.alarm(50)
 told = vec.step(np.ones((64, 1)))[0].tobytes().hex()
 if not child:
     del vec
@@ -155,12 +155,12 @@ def test_a_fork_does_not_draw() -> None:
     """The GL library would wait for threads that it left behind: one line in place of that."""
     code = """
 import os, signal
+os.register_at_fork(after_in_child=lambda: signal.alarm(50))
 from deconfounded import envs
 env = envs.make("slippery_cartpole", render_mode="rgb_array")
 env.reset(seed=0)
 env.render()
 child = os.fork()
-signal.alarm(50)
 try:
     env.render()
 except envs.InputError as error:
