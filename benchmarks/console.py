@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -58,6 +59,12 @@ def stop_at_once() -> None:
     _heed(stop)
 
 
+def escape_output() -> None:
+    """Characters that the output's encoding lacks (of a file's name, in the C locale) are escaped from now on."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # as Python's own for standard error
+
+
 class Stoppable:
     """Meanwhile signals raise Stopped; those that come while it is being cleaned up do nothing."""
 
@@ -82,6 +89,7 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
     """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
     from deconfounded.envs.task import InputError
 
+    escape_output()
     signals = Stoppable()
     try:
         with signals:

@@ -96,7 +96,7 @@ def main() -> None:
             found[method][f"{share:g}"] = {"cpu_s": results[method]["cpu_s"], "scores": last.round(4).tolist()}
             print(f"{method:22} {share:5g} of the updates: {results[method]['cpu_s']:6.1f} CPU s, {last.mean():.3f}")
     write_json(folder / "cost.json", {"task": task.name, "seeds": args.seeds, "methods": found})
-    before = json.loads(BEFORE.read_text()).get(task.name, {}) if BEFORE.is_file() else {}
+    before = json.loads(BEFORE.read_bytes()).get(task.name, {}) if BEFORE.is_file() else {}
     picture(task.name, found, before, folder / "cost.png")
     print(f"-> {folder / 'cost.png'}")
 

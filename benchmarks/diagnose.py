@@ -70,7 +70,7 @@ class Refit:
         from deconfounded.deconf.findings import Findings
 
         try:
-            kept = json.loads(self.file.read_text())
+            kept = json.loads(self.file.read_bytes())
             return Findings(**kept["found"]) if kept["made_of"] == self.made_of else None
         except (OSError, ValueError, KeyError, TypeError):
             return None

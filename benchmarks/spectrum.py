@@ -62,7 +62,7 @@ def main() -> None:
             finished, _ = run_all(jobs, args.device, task.name, engine)
         results = records.gather(records.of_run(finished, args.preset, args.set, task.episodes))
         last = {one: [*of.values()] for one, of in last_scores(results["methods"]).items() if one in wanted}
-        certificate = json.loads(kept.read_text())
+        certificate = json.loads(kept.read_bytes())
         made = {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
         point = {"task": base, "kind": kind, "factor": factor, **made}
         points.append({**point, "certificate": certificate, "scores": last})

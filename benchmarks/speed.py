@@ -50,7 +50,7 @@ def rates(ways: dict[str, tuple[int, Callable[[], object]]]) -> dict[str, float]
 
 def resident() -> int:
     """Bytes of memory that this process holds."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return int(Path("/proc/self/statm").read_text("utf-8").split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:

@@ -88,7 +88,7 @@ def share(source: Path, other: Path, but: str = "") -> None:
 
 def kept(file: Path) -> list[dict[str, Any]]:
     """The rows of the file, one a setting."""
-    return json.loads(file.read_text())["rows"] if file.is_file() else []
+    return json.loads(file.read_bytes())["rows"] if file.is_file() else []
 
 
 def keep(row: dict[str, Any], file: Path) -> None:

@@ -95,7 +95,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
 
 def point(task: envs.Task) -> dict[str, Any] | None:
     """What `spectrum.py` found of a task of noisier.py; None of others."""
-    points = json.loads((DOCS / "spectrum.json").read_text())["points"]
+    points = json.loads((DOCS / "spectrum.json").read_bytes())["points"]
     titles = (noisier.title(one["task"], one["kind"], one["factor"]) for one in points)
     return dict(zip(titles, points, strict=True)).get(type(task).__name__)
 
@@ -134,12 +134,12 @@ def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
 
     if task.name in envs.SUITE:
         file = DOCS / "certificates" / f"{task.name}.json"
-        return file.is_file() and json.loads(file.read_text())["verdict"] == "passed"
+        return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
     if of := point(task):
         return bool(of["certificate"]["verdict"] == "passed")
     if not (kept := folder / "certificate.json").is_file():
         write_json(kept, certify(task, policy.load(task, source)))
-    return bool(json.loads(kept.read_text())["verdict"] == "passed")
+    return bool(json.loads(kept.read_bytes())["verdict"] == "passed")
 
 
 def main() -> None:

@@ -42,6 +42,9 @@ class _Pictures:
         self._action = np.zeros((batch.n, *(batch.task.action_space.shape or (1,))))
         self._painters: dict[int, tuple[NDArray[Any], Painter]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_painters": {}}  # a copy makes its own
+
     def act(self, action: NDArray[Any], alive: NDArray[np.bool_]) -> None:
         """Remember the actions [N, A] that led to the next pictures: of environments that went on, `alive` [N]."""
         self._action = np.where(alive[:, None], action, self._action)
@@ -119,6 +122,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         obs = self.batch.reset(seed, options)
+        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
         return obs, {}
 

@@ -137,8 +137,8 @@ class BatchEnv:
     def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
-        Environments whose episode is over are not stepped. Actions out of [-1, 1] are clipped. Raises InputError for a
-        wrong shape or NaN, and before the first reset.
+        Environments whose episode is over are not stepped, whatever their action. Actions out of [-1, 1] are clipped.
+        Raises InputError for a wrong shape or NaN, and before the first reset.
         """
         ended = self.advance(action)
         return self.observe(), *ended
@@ -147,7 +147,8 @@ class BatchEnv:
         """`step` without its observation, for who resets what has ended before looking."""
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")
-        task, checked, over = self.task, self.task.check_action(action, self.n), ~self.alive
+        task, over = self.task, ~self.alive
+        checked = task.check_action(action, self.n, over)
         rows = np.flatnonzero(self.alive) if over.any() else None
         on = slice(None) if rows is None else rows
         before, taken, noise = self.state[on], checked[on], self._noise[self._every[on], self._steps[on]]

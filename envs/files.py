@@ -37,7 +37,7 @@ def write_atomically(file: Path, data: str | bytes) -> None:
     """The file holds all of data, or what it held before."""
     partial = file.with_name(f".{file.name}.{os.getpid()}{PARTIAL}")
     try:
-        partial.write_bytes(data.encode() if isinstance(data, str) else data)
+        partial.write_bytes(data.encode("utf-8", "surrogateescape") if isinstance(data, str) else data)
         os.replace(partial, file)
     except BaseException as error:
         with contextlib.suppress(OSError):

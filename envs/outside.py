@@ -17,6 +17,8 @@ from deconfounded.envs.task import InputError
 
 SENT = "DECONFOUNDED_OUTSIDE"  # in the environment of a worker elsewhere: the folder that such files were sent to
 
+RUN = "outside_"  # the beginning of the name of a module that was a file
+
 
 def is_outside(reference: str) -> bool:
     """Whether it names something by where it is, and not a registered one."""
@@ -63,6 +65,15 @@ def absolute(reference: str) -> str:
     return f"{Path(where).resolve()}:{name}" if where.endswith(".py") else f"{where}{colon}{name}"
 
 
+def reference(cls: type) -> str:
+    """What `find` takes for a class in another process, whatever that has imported; "" if it cannot be named so."""
+    if cls.__qualname__ != cls.__name__:
+        return ""
+    if cls.__module__ in ("__main__", "__mp_main__") or cls.__module__.startswith(RUN):
+        return f"{file}:{cls.__name__}" if (file := source(cls)) else ""
+    return f"{cls.__module__}:{cls.__name__}"
+
+
 def file(reference: str) -> Path | None:
     """Where it is defined, without running it; None for a module that has no file."""
     where, _, _ = reference.rpartition(":")
@@ -88,7 +99,7 @@ def source(of: Any) -> Path | None:
 
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
-    name = f"outside_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    name = f"{RUN}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None

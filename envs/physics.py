@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import os
 from abc import abstractmethod
-from functools import cached_property
-from typing import ClassVar, Protocol
+from functools import cached_property, partial
+from typing import Any, ClassVar, Protocol
 
 import mujoco
 import numpy as np
@@ -15,6 +15,7 @@ from mujoco import rollout
 from numpy.typing import ArrayLike, NDArray
 
 from deconfounded.envs import render
+from deconfounded.envs.handles import Handle
 from deconfounded.envs.noise import ProcessNoise, columns
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array, Painter, Simulator, Task
@@ -166,14 +167,26 @@ class Physics(Simulator):
         super().__init__(task, n)
         self._mujoco_task = task
         self.models = [copy.copy(task.model) for _ in range(n)]
-        threads = cores()
-        self._threads = threads if threads > 1 else 0
-        self._pools: dict[int, rollout.Rollout] = {}
-        self._datas = [mujoco.MjData(task.model) for _ in range(max(threads, 1))]
-        self._edits = [ModelEdit(model, task.model, self._datas[0]) for model in self.models]
-        self._buffer: Array = np.empty(0)
+        self._furnish()
         for i in range(n):
             self.set_theta(i, self.theta[i])
+
+    def _furnish(self) -> None:
+        """Make what is of this machine and process, and no part of the state."""
+        model, threads = self._mujoco_task.model, cores()
+        self._threads = threads if threads > 1 else 0
+        self._pools = {size: Handle(partial(rollout.Rollout, nthread=size)) for size in {0, self._threads}}
+        self._datas = [mujoco.MjData(model) for _ in range(max(threads, 1))]
+        self._edits = [ModelEdit(one, model, self._datas[0]) for one in self.models]
+        self._buffer: Array = np.empty(0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        furniture = ("_threads", "_pools", "_datas", "_edits", "_buffer")
+        return {name: value for name, value in vars(self).items() if name not in furniture}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._furnish()
 
     def set_theta(self, i: int, theta: Array) -> None:
         self.theta[i] = theta
@@ -200,11 +213,9 @@ class Physics(Simulator):
         control = np.repeat(self._mujoco_task.control(action), self._mujoco_task.substeps, axis=1)
         models = self.models if rows is None else [self.models[i] for i in rows.tolist()]
         threads = self._threads if n > 1 else 0
-        if threads not in self._pools:
-            self._pools[threads] = rollout.Rollout(nthread=threads)
         # Arrays are float64 and contiguous already; without a warm start, the solver starts from scratch in every
         # control step, so that the next state is a function of this state alone.
-        self._pools[threads].rollout(
+        self._pools[threads]().rollout(
             models,
             self._datas[: max(threads, 1)],
             np.ascontiguousarray(state),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 import re
 from importlib.metadata import entry_points
@@ -32,7 +33,10 @@ def register(cls: type[Task]) -> type[Task]:
     if TASKS.get(name, cls) is not cls:
         raise InputError(f"task name {name!r} of {where} is taken by {_where(TASKS[name])}; give it another name")
     if "reference" not in vars(cls):
-        cls.reference = name
+        ours = cls.__module__.startswith(f"{__package__}.")
+        cls.reference = name if ours else outside.reference(cls) or name
+    if outside.is_outside(cls.reference):
+        copyreg.pickle(cls, _parts)
     TASKS[name] = cls
     gymnasium.registry.pop(cls().gym_id, None)
     gymnasium.register(
@@ -40,9 +44,14 @@ def register(cls: type[Task]) -> type[Task]:
         entry_point="deconfounded.envs:make",
         vector_entry_point="deconfounded.envs:make_registered_vec",
         max_episode_steps=cls.horizon,
-        kwargs={"name": cls.name},
+        kwargs={"name": cls.reference},
     )
     return cls
+
+
+def _parts(task: Task) -> tuple[Any, ...]:
+    """A task from outside for `pickle`: its module has no name that another process could import."""
+    return get, (task.reference,), vars(task) or None
 
 
 def _where(cls: type[Task]) -> str:
@@ -75,10 +84,14 @@ def get(name: str) -> Task:
             name = point.value
     if not outside.is_outside(name):
         raise closest("task", name, names(), "; your own is path/file.py:Class")
+    reference = outside.absolute(name)
+    for known in TASKS.values():
+        if known.reference == reference:
+            return known()
     cls = outside.find("task", name)
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
-    cls.reference = outside.absolute(name)
+    cls.reference = reference
     return register(cls)()
 
 
@@ -98,10 +111,10 @@ def make_registered_vec(
     name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kwargs: Any
 ) -> GymVectorEnv:
     """`make_vec` as gymnasium.make_vec calls it, with the registered time limit. Raises InputError for another one."""
-    horizon = get(name).horizon
-    if max_episode_steps not in (None, horizon):
+    task = get(name)
+    if max_episode_steps not in (None, task.horizon):
         raise InputError(
-            f"max_episode_steps of {name} was {max_episode_steps}; it must be {horizon} here, or left out:"
+            f"max_episode_steps of {task.name} was {max_episode_steps}; it must be {task.horizon} here, or left out:"
             " vectorization_mode='sync' takes shorter ones"
         )
     return make_vec(name, num_envs, **kwargs)

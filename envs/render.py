@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import atexit
 import importlib
 import os
 import subprocess
 import sys
-import weakref
-from functools import cache
+from functools import cache, partial
 
 import mujoco
 import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
+from deconfounded.envs.handles import Handle
 from deconfounded.envs.task import Array, InputError
 
 _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
@@ -30,6 +29,17 @@ def backend() -> str:
         if subprocess.run([sys.executable, "-c", _PROBE], env=environ, capture_output=True).returncode == 0:
             return name
     raise InputError(f"no GL for pictures: tried {wanted or 'egl and osmesa'}; install libegl1 or libosmesa6")
+
+
+_DRAWING: set[int] = set()
+"""Processes that have made a GL context: this one, and those that it was forked from."""
+
+
+def _renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    if _DRAWING - {os.getpid()}:  # the GL library would wait for threads that stayed behind
+        raise InputError("pictures cannot be made in a fork of a process that has made some; start it by `spawn`")
+    _DRAWING.add(os.getpid())
+    return mujoco.Renderer(model, height, width)
 
 
 def _close(renderer: mujoco.Renderer) -> None:
@@ -86,14 +96,14 @@ class Painter:
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
-        self._renderer = mujoco.Renderer(model, height, width)
-        # With this painter, and before the GL library is gone: finalize's own place at exit can be after that.
-        atexit.register(weakref.finalize(self, _close, self._renderer))
+        self._renderer = Handle(partial(_renderer, model, height, width), _close)
+        self._renderer()
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
         """State [S], whatever follows the full physics state in it -> picture [H, W, 3]."""
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         mujoco.mj_setState(self._model, self._data, state[: mujoco.mj_stateSize(self._model, kind)], kind)
         mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, "view")
-        return self._renderer.render()
+        renderer = self._renderer()
+        renderer.update_scene(self._data, "view")
+        return renderer.render()

@@ -299,8 +299,11 @@ class Task(ABC):
                 )
         return array
 
-    def check_action(self, action: object, n: int) -> Array:
-        """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist."""
+    def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
+        """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist.
+
+        ignored [N]: rows that nothing will come of, and that may hold any number.
+        """
         width = 1 if isinstance(self.action_space, spaces.Discrete) else self.action_space.shape[0]
         try:
             array = np.asarray(action)
@@ -311,6 +314,8 @@ class Task(ABC):
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
         if array.shape != (n, width):
             raise InputError(f"action of {self.name} had shape {array.shape}; it must be ({n}, {width})")
+        if ignored is not None:
+            array[ignored] = 0
         if not np.isfinite(array).all():
             raise InputError(f"action of {self.name} held NaN or infinity; every entry must be a finite number")
         if isinstance(self.action_space, spaces.Discrete):

@@ -163,7 +163,7 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:
-        told = json.loads(file.with_suffix(".json").read_text()).get("sha256")
+        told = json.loads(file.with_suffix(".json").read_bytes()).get("sha256")
     except (OSError, ValueError, AttributeError):  # weights of one's own may go without a card
         told = None
     try:
@@ -201,6 +201,6 @@ def version(task: Task, source: str | Path | None = None) -> int:
         return task.version
     card = (path(task) if source is None else Path(source)).with_suffix(".json")
     try:
-        return int(json.loads(card.read_text()).get("version", 0))
+        return int(json.loads(card.read_bytes()).get("version", 0))
     except (OSError, ValueError, TypeError, AttributeError):  # weights of one's own may go without a card
         return 0

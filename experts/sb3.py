@@ -37,10 +37,10 @@ class Sb3VecEnv(Bare):
         self.env = envs.GymVectorEnv(task, n, privileged=True)
         super().__init__(n, self.env.single_observation_space, self.env.single_action_space)
         self.env.batch.seed(seed)
-        self._returns = np.zeros(n)
-        self._lengths = np.zeros(n, int)
+        self._returns, self._lengths = np.zeros(n), np.zeros(n, int)
 
     def reset(self) -> Any:
+        self._returns[:], self._lengths[:] = 0, 0
         return self.env.reset()[0]
 
     def step_async(self, actions: Any) -> None:

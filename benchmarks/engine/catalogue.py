@@ -80,7 +80,7 @@ def add(reference: str) -> str:
     check_uses(fit.uses)
     where, _, function = reference.rpartition(":")
     stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
-    name = re.sub(r"\W", "_", stem if function == "fit" else f"{stem}_{function}")
+    name = re.sub(r"[^A-Za-z0-9_]", "_", stem if function == "fit" else f"{stem}_{function}")
     made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference), version=0)
     taken = {"all", "demonstrations", *(f"{known}_episode" for known in METHODS)}
     if name in taken or METHODS.setdefault(name, made) != made:

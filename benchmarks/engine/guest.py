@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
+from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs import outside
@@ -45,6 +46,7 @@ def die_with_parent() -> None:
 def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     """The guest's process: fit, then be the agent until the channel is closed."""
     die_with_parent()
+    escape_output()
     from deconfounded.deconf.given import Given, serve
     from deconfounded.deconf.wire import pack
     from deconfounded.experts.saved import save

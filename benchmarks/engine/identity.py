@@ -93,11 +93,14 @@ def machine(device: str) -> str:
 @cache
 def commit() -> str | None:
     """Of this checkout, with a + if files differ from it; None outside of one."""
+
+    def run(*what: str) -> str:
+        return os.fsdecode(subprocess.run(["git", *what], cwd=ROOT, capture_output=True, check=True).stdout)
+
     try:
-        run = lambda *what: subprocess.run(["git", *what], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: E731
-        top = run("rev-parse", "--show-toplevel").stdout.strip()
+        top = run("rev-parse", "--show-toplevel").strip()
         if Path(top).resolve() != ROOT:
             return None
-        return run("rev-parse", "HEAD").stdout.strip() + ("+" if run("status", "--porcelain", "-uno").stdout else "")
+        return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno") else "")
     except (OSError, subprocess.CalledProcessError):
         return None

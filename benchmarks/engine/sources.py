@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import inspect
+import os
 import sysconfig
 from collections.abc import Iterable, Iterator
 from functools import cache
@@ -127,7 +128,7 @@ def digest(files: Iterable[Path], name: str = "") -> str:
     """
     total = hashlib.sha256(name.encode())
     for one in sorted((file.name, content(file)) for file in files):
-        total.update(one[0].encode() + b"\0" + one[1])
+        total.update(os.fsencode(one[0]) + b"\0" + one[1])
     return total.hexdigest()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import fcntl
 import json
 import os
 import select
@@ -36,6 +35,8 @@ class Browser:
             raise InputError(f"no browser was found; install one of {', '.join(NAMES)}")
         self.size, self.dark, self.errors, self._asked, self._rest = (width, height), dark, list[str](), 0, b""
         self._home = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        import fcntl  # which Windows lacks: pages are written there, and not opened
+
         hears, self._to = os.pipe()
         self._from, says = os.pipe()
         # Chromium reads from 3 and writes to 4, whatever numbers these pipes have here.

@@ -28,7 +28,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def kept(folder: Path, name: str) -> dict[str, Any] | None:
     """What the folder's file of a task holds, if there is one."""
     file = folder / f"{name}.json"
-    return json.loads(file.read_text()) if file.is_file() else None
+    return json.loads(file.read_bytes()) if file.is_file() else None
 
 
 def nats(certificate: dict[str, Any]) -> list[str]:

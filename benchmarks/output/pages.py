@@ -169,7 +169,7 @@ def certificates(certified: dict[str, Any]) -> str:
 
 def costs(found: index.Found) -> str:
     """The table of docs/speed.md: CPU seconds a seed, before and now, of the tasks that were timed before."""
-    before = json.loads((DOCS / "speed" / "before.json").read_text())
+    before = json.loads((DOCS / "speed" / "before.json").read_bytes())
     shown = [(task.name, results["methods"]) for task, results in found if task.name in before]
     head, rows = ["method"], []
     for name, _ in shown:
@@ -188,7 +188,7 @@ def rates() -> str:
     """The table of docs/speed.md: control steps a second, of what `speed.py` kept."""
     shown, grown = ("64", "256", "4096"), ("256", "4096")
     rows = []
-    for name, by_size in json.loads((DOCS / "speed" / "speed.json").read_text())["tasks"].items():
+    for name, by_size in json.loads((DOCS / "speed" / "speed.json").read_bytes())["tasks"].items():
         few, many = (by_size[n]["closed_loop"] for n in grown)
         rows.append(
             (
@@ -258,7 +258,7 @@ def noises() -> str:
 
 def _spectrum() -> dict[str, Any]:
     """What `spectrum.py` found."""
-    found: dict[str, Any] = json.loads((DOCS / "spectrum.json").read_text())
+    found: dict[str, Any] = json.loads((DOCS / "spectrum.json").read_bytes())
     return found
 
 
@@ -275,7 +275,7 @@ def tuning() -> str:
     """The table of docs/opponents.md: what `tune.py` tried of each opponent, and what was best."""
     if not (file := DOCS / "tuning.json").is_file():
         return NOT_RUN
-    found, rows = json.loads(file.read_text()), []
+    found, rows = json.loads(file.read_bytes()), []
     tasks = list(found["rows"][0]["scores"])
     for method in dict.fromkeys(row["method"] for row in found["rows"]):
         of = [row for row in found["rows"] if row["method"] == method]
@@ -291,7 +291,7 @@ def tuning() -> str:
 
 def _filled(file: Path, **tables: str) -> str:
     """The page with each table between `<!-- its name -->` and `<!-- /its name -->`."""
-    text = file.read_text()
+    text = file.read_text("utf-8")
     for name, table in tables.items():
         marks = [f"<!-- {slash}{name} -->" for slash in ("", "/")]
         if [text.count(mark) for mark in marks] != [1, 1]:

@@ -154,7 +154,7 @@ def certificate(task: str, version: int, run: Path) -> Path | None:
         Path(__file__).resolve().parents[2] / "docs" / "certificates",
     ):
         try:
-            found = json.loads((folder / f"{task}.json").read_text())
+            found = json.loads((folder / f"{task}.json").read_bytes())
             if (found["task"], found["task_version"]) == (task, version) and (folder / f"{task}.png").is_file():
                 return folder / f"{task}.png"
         except (OSError, ValueError, KeyError, TypeError):

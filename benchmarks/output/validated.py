@@ -18,7 +18,7 @@ FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "stray
 
 def rows(file: Path) -> list[dict[str, Any]]:
     """One a case; none if none was diagnosed yet."""
-    found: list[dict[str, Any]] = json.loads(file.read_text()) if file.is_file() else []
+    found: list[dict[str, Any]] = json.loads(file.read_bytes()) if file.is_file() else []
     return found
 
 
