@@ -22,4 +22,5 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install -q -c constraints.txt torch
 	$(VENV)/bin/pip install -q -c constraints.txt -e .[dev]
+	$(VENV)/bin/pip install -q -c constraints.txt --no-deps dm_control
 	touch $@
