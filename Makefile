@@ -1,4 +1,4 @@
-# Everything from nothing but Python >= 3.11: `make setup`, `make demo` and `make test`.
+# Everything from nothing but Python 3.11, 3.12 or 3.13: `make setup`, `make demo` and `make test`.
 PYTHON ?= python3
 VENV := .venv
 
@@ -22,4 +22,5 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install -q -c constraints.txt torch
 	$(VENV)/bin/pip install -q -c constraints.txt -e .[dev]
+	$(VENV)/bin/pip install -q -c constraints.txt --no-deps dm_control  # for its MJCF; from 3.13 on the line above leaves it out
 	touch $@

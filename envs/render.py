@@ -42,6 +42,29 @@ def _renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer
     return mujoco.Renderer(model, height, width)
 
 
+def _load_triton() -> None:
+    """Import triton, if it is installed, before a GL is loaded, or apart from it."""
+    # Mesa's software renderers and triton each bring an LLVM. Mesa's is visible to the whole process (RTLD_GLOBAL): a
+    # triton that is loaded after it binds to the wrong one and dies of a segmentation fault, one that is loaded before
+    # it has bound to its own. torch imports triton with its first optimizer, which is after the first picture of
+    # whoever renders, then trains. Where somebody else has loaded a GL before us, RTLD_DEEPBIND makes triton look in
+    # itself first; not elsewhere, as that also goes past a malloc that is preloaded. It costs .1 s and 90 MB, once, and
+    # imports no torch.
+    if "triton" in sys.modules:
+        return
+    apart = getattr(os, "RTLD_DEEPBIND", 0) if "OpenGL" in sys.modules else 0
+    if apart:
+        flags = sys.getdlopenflags()
+        sys.setdlopenflags(flags | apart)
+    try:
+        importlib.import_module("triton")
+    except ImportError:
+        pass
+    finally:
+        if apart:
+            sys.setdlopenflags(flags)
+
+
 def _close(renderer: mujoco.Renderer) -> None:
     # In its own context: Renderer.close frees buffers by number in whichever is current, be it another painter's.
     if renderer._gl_context is not None and renderer._mjr_context is not None:
@@ -92,6 +115,7 @@ class Painter:
     """Draws states of one model, which it keeps, by its camera `view`. Raises InputError where no GL works."""
 
     def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
+        _load_triton()
         if (name := backend()) in ("egl", "osmesa"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)

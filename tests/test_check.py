@@ -19,6 +19,7 @@ from deconfounded.envs.contract import CONTRACT
 from deconfounded.envs.physics import Edit, ModelEdit
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
+from deconfounded.envs.tasks import slippery_walker
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
 
@@ -156,6 +157,19 @@ def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(envs.InputError, match=r"^the model \(.*/nowhere\.xml, .*\) of nowhere: XML") as caught:
         envs.check_task(MissingFile())
     assert "\n" not in str(caught.value)
+
+
+def test_without_dm_control(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """The walker says in one line what is missing; listing the tasks needs it not."""
+    monkeypatch.setattr(slippery_walker, "find_spec", lambda name: None)
+    line = "^slippery_walker needs .* dm_control, which is not installed; `pip install --no-deps dm_control` brings it$"
+    for ask in (envs.make, lambda name: envs.check_task(envs.get(name))):
+        with pytest.raises(envs.InputError, match=line) as caught:
+            ask("slippery_walker")
+        assert "\n" not in str(caught.value)
+    monkeypatch.setattr("sys.argv", ["run", "--list"])
+    run.main()
+    assert "slippery_walker" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", envs.names())

@@ -19,6 +19,7 @@ ends with the torso below 1 m or pitched by more than .6 rad.
 from __future__ import annotations
 
 from importlib.resources import files
+from importlib.util import find_spec
 
 import mujoco
 import numpy as np
@@ -28,7 +29,7 @@ from numpy.typing import NDArray
 from deconfounded.envs import render
 from deconfounded.envs.physics import Edit, MujocoTask
 from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.task import Array, InputError, Latent
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s
@@ -58,6 +59,9 @@ class SlipperyWalker(MujocoTask):
 
     def spec(self) -> mujoco.MjSpec:
         """The suite's walker, on a floor whose friction counts, without what is there only to be looked at."""
+        if find_spec("dm_control") is None:
+            remedy = "`pip install --no-deps dm_control` brings it"
+            raise InputError(f"{self.name} needs an MJCF of dm_control, which is not installed; {remedy}")
         spec = mujoco.MjSpec.from_file(str(files("dm_control") / "suite" / "walker.xml"))
         spec.option.timestep = 1 / 120
         spec.geom("floor").priority = 1
