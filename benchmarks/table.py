@@ -9,9 +9,10 @@ on where it was. The first five seeds of everything come first.
 from __future__ import annotations
 
 if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
+    from deconfounded.benchmarks.console import need_checkout, stop_at_once
 
     stop_at_once()
+    need_checkout()
 
 import json
 from dataclasses import replace

@@ -60,26 +60,35 @@ def save_figure(figure: Any, file: Path, dpi: int) -> None:
     write_atomically(file, buffer.getvalue())
 
 
-def write_json(file: Path, data: Any) -> None:
-    """JSON, atomically. Raises InputError for NaN or infinity, which JSON does not have."""
+def as_json(file: Path, data: Any) -> str:
+    """What `write_json` writes. Raises InputError for NaN or infinity, which JSON does not have."""
     try:
-        text = json.dumps(data, indent=2, allow_nan=False)
+        return json.dumps(data, indent=2, allow_nan=False) + "\n"
     except ValueError:
         raise InputError(f"{file} would hold NaN or infinity; nothing was written") from None
-    write_atomically(file, text + "\n")
+
+
+def write_json(file: Path, data: Any) -> None:
+    """JSON, atomically. Raises InputError for NaN or infinity, which JSON does not have."""
+    write_atomically(file, as_json(file, data))
 
 
 def _digest(data: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
+def sealed(data: dict[str, Any]) -> dict[str, Any]:
+    """The data with the sha256 of it, which tells, when it is read, whether it is as it was written."""
+    return {**data, "sha256": _digest(data)}
+
+
 def write_sealed(file: Path, data: dict[str, Any]) -> None:
-    """JSON that tells, when it is read, whether it is as it was written: with the sha256 of the rest."""
-    write_json(file, {**data, "sha256": _digest(data)})
+    """JSON of `sealed` data."""
+    write_json(file, sealed(data))
 
 
 def unsealed(data: dict[str, Any]) -> dict[str, Any]:
-    """What `write_sealed` was given, out of the json that it wrote. Raises ValueError if it is not as it was."""
+    """What `sealed` was given, out of what it made. Raises ValueError if it is not as it was."""
     rest = {key: value for key, value in data.items() if key != "sha256"}
     if data.get("sha256") != _digest(rest):
         raise ValueError("it is not as it was written")
