@@ -21,7 +21,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
-from deconfounded.benchmarks import certify, commands, cost, publish
+from deconfounded.benchmarks import certify, commands, cost, data, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.local import Local
@@ -102,6 +102,16 @@ def test_bad_input_is_one_line(
     told = refusal(args, monkeypatch, capsys)
     assert says in told
     assert len(told.strip().splitlines()) == 1
+
+
+def test_what_is_not_installed_is_said_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before trials are made, which takes minutes."""
+    monkeypatch.setattr(data, "find_spec", lambda name: None)
+    monkeypatch.setattr(data, "run_trials", None)
+    told = refusal(("benchmarks/data.py", "--task", "bandit", "--out", str(tmp_path)), monkeypatch, capsys)
+    assert "`pip install deconfounded-imitation[data]` brings it" in told
 
 
 def test_bad_input_from_the_shell() -> None:
