@@ -92,7 +92,7 @@ def about(
         "set": list(changes),
         "settings": asdict(settings),
         "versions": identity.versions(),
-        "expert": identity.expert(task, expert),
+        **identity.expert(task, expert),
         "salt": salt,
         "episodes": task.episodes,
     }

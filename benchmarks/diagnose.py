@@ -107,7 +107,7 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
     from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.pool import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
-    from deconfounded.deconf.diagnose import DiagnoseConfig, check, judge
+    from deconfounded.deconf.diagnose import VERSION, DiagnoseConfig, check, judge
 
     config, start = DiagnoseConfig(), time.time()
     check(trials, explore, config)
@@ -117,7 +117,7 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
         "config": asdict(config),
         "seed": seed,
         "versions": identity.versions(),
-        "code": identity.module("deconf/findings"),
+        "version": VERSION,
     }
     known = (seed, config.refits, json.dumps(about), folder)
     refits = [Refit(source, exploration, config.amounts, i, *known) for i in range(config.refits)]

@@ -35,12 +35,12 @@ def clip(video: Path, file: Path) -> None:
 
 def keep(run: Path) -> None:
     """Copy what is worth keeping of a finished run. Raises InputError, and changes nothing, if something is amiss."""
-    files, beside = sorted((run / "records").glob("*/*/*.json")), [run / "adaptation.png", run / "video.mp4"]
+    files, beside = sorted((run / "records").glob("*.jsonl")), [run / "adaptation.png", run / "video.mp4"]
     if links := [file for file in (*files, *beside) if file.is_symlink()]:
         raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
-    if not files or not (run / "adaptation.png").is_file():
+    if len(files) != 1 or not (run / "adaptation.png").is_file():
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
-    found = [records.read(file) for file in files]
+    found = records.read(files[0])
     results = records.gather(found, list(METHODS))
     if results["preset"] != "default" or {"set", "salt"} & set(results):
         raise envs.InputError(
@@ -62,8 +62,7 @@ def keep(run: Path) -> None:
                 clip(run / "video.mp4", small)
             except Exception as error:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
-        for record in found:
-            records.write(DOCS / "records", record)
+        records.write(DOCS / "records", found)
         shutil.copy(run / "adaptation.png", DOCS / f"{task.name}.png")
         (DOCS / f"{task.name}.webp").unlink(missing_ok=True)
         if small.exists():

@@ -1,9 +1,8 @@
 """Make the records that are missing, method by method and task by task: `deconf table`
 
 Every method on every task of the suite: ten seeds of those that a default run makes, the paper's comparison and the
-exact policies, and five of all others. A record that is there, and would come out the same today (its code, settings,
-expert and versions are those of now), stays; the others are made, and kept as soon as they are done. Stopped, it goes
-on where it was. The first five seeds of everything come first.
+exact policies, and five of all others. A record of today's versions, settings and expert stays; the others are made,
+and kept as soon as they are done. Stopped, it goes on where it was. The first five seeds of everything come first.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
     need_checkout()
 
-import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,9 +25,9 @@ from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCE
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.pool import Job
+    from deconfounded.benchmarks.output.records import Record
 
 SEEDS, FEWER = 10, 5
-SAME = ("settings", "expert", "code", "versions", "salt")
 
 
 def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
@@ -36,18 +35,17 @@ def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
     return tuple(range(least, most if method in (*DEFAULT, *REFERENCES) else min(most, FEWER)))
 
 
-def missing(job: Job, preset: str, kept: Path) -> tuple[int, ...]:
-    """The job's seeds of which the folder `kept` has no record, or one that would come out otherwise today."""
+def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
+    """The job's seeds of which there is no record among those kept of its task, or one that is stale today."""
     from deconfounded.benchmarks.engine.identity import identity
     from deconfounded.benchmarks.output import records
 
-    expected = json.loads(json.dumps(identity(job)))
-    place, there = kept / f"{expected['task']}-v{expected['task_version']}" / preset, set()
-    for seed in job.seeds:
-        for file in place.glob(f"{job.method}*-{seed}.json"):
-            record = records.read(file)
-            if record["job"] == job.method and all(record[key] == expected[key] for key in SAME):
-                there.add(seed)
+    today = identity(job)
+    there = {
+        record["seed"]
+        for record in kept
+        if (record["job"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
+    }
     return tuple(seed for seed in job.seeds if seed not in there)
 
 
@@ -80,7 +78,9 @@ def main() -> None:
         for task in tasks
         for method in methods
     ]
-    left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, kept))}
+    files = {task.reference: kept / records.place(task.name) for task in tasks}
+    there = {name: records.read(file) if file.exists() else [] for name, file in files.items()}
+    left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}
     if args.list:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
@@ -93,8 +93,7 @@ def main() -> None:
             label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
             finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
         new = [one for one in finished if one[0] == job.method and one[1] in seeds]
-        for record in records.of_run(new, args.preset, args.set, task.episodes):
-            records.write(kept, record)
+        records.write(kept, records.of_run(new, args.preset, args.set, task.episodes))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 Each opponent gets four settings, the preset of before among them, on two development tasks: the cartpole on a tilted
 rail and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at
-once. Interrupted, it goes on where it was; what is there of today's code and amounts stays.
+once. Interrupted, it goes on where it was; what is there of today's versions and amounts stays.
 """
 
 from __future__ import annotations
@@ -105,16 +105,16 @@ def keep(row: dict[str, Any], file: Path) -> None:
 
 def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
     """Of a method's setting: what each task's run has of everything, and what its row is known by."""
-    from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.engine.presets import preset
 
-    part, settings, code = METHODS[name].part, {}, {}
+    part, settings, versions = METHODS[name].part, {}, {}
     for task in map(envs.get, TASKS):
         start = began(preset("default", task, "cpu"))
         settings[task.name] = replace(start, **{part: other(getattr(start, part), change)})
-        code[task.name] = identity.code(task, METHODS[name].module)
+        versions[task.name] = task.version
     amounts = {task: asdict(getattr(one, part)) for task, one in settings.items()}
-    return settings, {"method": name, "setting": title(change), "amounts": amounts, "code": code}
+    of = {"method_version": METHODS[name].version, "task_versions": versions}
+    return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
 
 
 def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:

@@ -84,7 +84,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     settings = replace(preset("default", task, "cpu"), expert_trials=count, explore_trials=count // 4)
     context = Context(task, settings, (SEED,), folder=folder, expert=source)
     shown, file = context.demonstrations, folder / "explored.npz"
-    made_of = f"{shown.sha256} {settings.explore_trials} {identity.module('deconf/wander')}"
+    made_of = f"{shown.sha256} {settings.explore_trials} {identity.PROTOCOL}"
     try:
         Trials.load(file, made_of)
     except envs.InputError:
@@ -112,7 +112,7 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
 
     if of := point(task):
         return {name: float(np.mean(of["scores"][name])) for name in LEARNED}
-    kept = records.of_task(DOCS / "records", task.name, task.version)
+    kept = records.of_task(DOCS / "records", task.name)
     if not kept:
         settings, seeds = preset("default", task, "cpu"), (0, 1, 2)
         jobs = [

@@ -1,7 +1,7 @@
-"""Run the seed of a record again, and compare: `deconf verify docs/records/bandit-v0/default/blind_bc-0.json`
+"""Run the seed of a record again, and compare: `deconf verify slippery_cartpole deconfounded 0`
 
 Says `same bits`, `inside the interval` (the mean return of every episode within three standard errors of the trials) or
-`not the same`, and what differs in version, machine and code. Exit code 1 for `not the same`.
+`not the same`, and what differs in how they were made. Exit code 1 for `not the same`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,10 @@ from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.output.cards import DOCS
+from deconfounded.envs import outside
 
-COMPARED = ("commit", "machine", "expert", "code")
+COMPARED = ("commit", "machine", "expert", "outside", "protocol", "task_version", "method_version", "expert_version")
 
 
 def verdict(record: records.Record, again: records.Record) -> tuple[str, list[str]]:
@@ -63,27 +65,47 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     return made[0]
 
 
+def pick(file: Path, method: str, seed: int) -> records.Record:
+    """The record of a method and seed in a file. Raises InputError if there is none, or if there are several."""
+    every = records.read(file)
+    fitting = [record for record in every if (record["method"], record["seed"]) == (method, seed)]
+    if not fitting:
+        methods = dict.fromkeys(record["method"] for record in every)
+        if method not in methods:
+            raise envs.closest("method", method, list(methods), f" in {file}")
+        seeds = sorted(record["seed"] for record in every if record["method"] == method)
+        raise envs.InputError(f"seed of {method} was {seed}; {file} has {', '.join(map(str, seeds))}")
+    if len(fitting) > 1:  # of another preset, or other thetas
+        raise envs.InputError(
+            f"{file} has {len(fitting)} records of {method} with seed {seed}; give one with one of them"
+        )
+    return fitting[0]
+
+
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
-    parser.add_argument("record", type=Path)
-    parser.add_argument("--task", help="where the task is, if it is not ours: path/file.py:Class")
-    parser.add_argument("--method", help="where the method is, if it is not ours: path/file.py:fit")
+    parser.add_argument("task", help="its name, or path/file.py:Class")
+    parser.add_argument("method", help="its name, or path/file.py:fit")
+    parser.add_argument("seed", type=int)
+    parser.add_argument("--records", type=Path, help="folder or file of records; default: docs/records")
     parser.add_argument("--expert", help="the expert, if it is not the task's own")
     parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     args = parser.parse_args()
-    record = records.read(args.record)
-    task = envs.get(args.task or record["task"])
+    task = envs.get(args.task)
+    method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
+    file = args.records or DOCS / "records"
+    file = file / records.place(task.name) if file.is_dir() else file
+    record = pick(file, method, args.seed)
+    if record["job"] not in METHODS:
+        raise envs.InputError(f"method {record['job']} is not ours; give it as path/file.py:fit")
     if (task.name, task.version) != (record["task"], record["task_version"]):
         raise envs.InputError(
-            f"{args.record} is of {record['task']} v{record['task_version']}; here is {task.name} v{task.version}"
+            f"the record is of {record['task']} v{record['task_version']}; here is {task.name} v{task.version}"
         )
-    method = catalogue.add(args.method) if args.method else record["job"]
-    if method != record["job"] or method not in METHODS:
-        raise envs.InputError(f"{args.record} is of method {record['job']}; give its file as --method path/file.py:fit")
     commands.check_device(args.device)
-    said, differs = verdict(record, rerun(record, task, method, args.expert, args.device))
-    print(f"{args.record}: {said}" + "".join(f"\n    {line}" for line in differs))
+    said, differs = verdict(record, rerun(record, task, record["job"], args.expert, args.device))
+    print(f"{task.name} {method} {args.seed}: {said}" + "".join(f"\n    {line}" for line in differs))
     if said == "not the same":
         raise SystemExit(1)
 

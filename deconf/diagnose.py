@@ -18,6 +18,7 @@ from deconfounded.envs.task import InputError
 from deconfounded.experts.demos import Trials
 
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
+VERSION = 1  # raised when the same trials come to other figures
 LITTLE, SILENT = 0.1, 0.01  # nats a step: of memory, of the world
 WORSE = 0.2  # nats a step by which a clone may be worse for its memory
 FINE, GAP = 0.8, 0.15  # scores

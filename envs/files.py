@@ -78,17 +78,17 @@ def _digest(data: dict[str, Any]) -> str:
 
 
 def sealed(data: dict[str, Any]) -> dict[str, Any]:
-    """The data with the sha256 of it, which tells, when it is read, whether it is as it was written."""
+    """The data with a checksum of its own: `sha256`, of the rest."""
     return {**data, "sha256": _digest(data)}
 
 
 def write_sealed(file: Path, data: dict[str, Any]) -> None:
-    """JSON of `sealed` data."""
+    """JSON that tells, when it is read, whether it is as it was written: with the sha256 of the rest."""
     write_json(file, sealed(data))
 
 
 def unsealed(data: dict[str, Any]) -> dict[str, Any]:
-    """What `sealed` was given, out of what it made. Raises ValueError if it is not as it was."""
+    """What `sealed` was given, out of what it returned. Raises ValueError if it is not as it was."""
     rest = {key: value for key, value in data.items() if key != "sha256"}
     if data.get("sha256") != _digest(rest):
         raise ValueError("it is not as it was written")

@@ -190,3 +190,17 @@ def fingerprint(task: Task, source: str | Path | None = None) -> str:
     """SHA-256 of a file of weights, by default the task's own; or `closed form`."""
     file = path(task) if source is None else Path(source)
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "closed form"
+
+
+def version(task: Task, source: str | Path | None = None) -> int:
+    """The version of an expert, raised by hand when its actions change: of weights the one in their card, else 0.
+
+    That of a closed form is its task's.
+    """
+    if isinstance(task.action_space, spaces.Discrete):
+        return task.version
+    card = (path(task) if source is None else Path(source)).with_suffix(".json")
+    try:
+        return int(json.loads(card.read_text()).get("version", 0))
+    except (OSError, ValueError, TypeError, AttributeError):  # weights of one's own may go without a card
+        return 0

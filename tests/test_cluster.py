@@ -15,7 +15,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.engine import catalogue, identity, pool
+from deconfounded.benchmarks.engine import catalogue, identity, pool, sources
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.engine.pool import DemonstrationJob, Job
@@ -215,7 +215,7 @@ def test_what_a_job_needs_travels(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def test_another_version_over_there_is_told() -> None:
     job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), Path("jobs"))
-    here = identity.identity(job)
+    here = {**identity.identity(job), "code": sources.package()}
     worker.check(here, dict(here))
     versions = here["versions"]
     for change, says in (

@@ -78,7 +78,10 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
         (("benchmarks/play.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
         (("benchmarks/rescore.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
-        (("benchmarks/verify.py", "nowhere.json"), "record nowhere.json cannot be read: No such file"),
+        (
+            ("benchmarks/verify.py", "bandit", "random", "0", "--records", "nowhere.jsonl"),
+            "records nowhere.jsonl cannot be read: No such file",
+        ),
         (("benchmarks/report.py", "nowhere"), "nowhere holds no settings.json of a run"),
         (
             ("benchmarks/data.py", "--task", "bandit", "--out", "x", "--trials", "0"),
@@ -398,7 +401,7 @@ class TestScore:
             by_method[name] = [
                 {
                     **{"seed": seed, "returns": [value] * 2, "objective": [-value] * 2, "theta_r2": [1.0] * 2},
-                    **{"budget": {}, "cpu_s": 1.5, "tier": "1"},
+                    **{"budget": {}, "cpu_s": 1.5, "tier": "1", "method_version": 1},
                 }
                 for seed, value in enumerate(by_seed)
             ]
@@ -441,9 +444,10 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     run, docs = tmp_path / "results" / "bandit-default", tmp_path / "docs"
     for folder in (run, docs / "certificates", run.parent / "certificates"):
         folder.mkdir(parents=True)
-    shown = records.of_task(ROOT / "docs" / "records", "bandit", 0)
-    for record in shown:
-        records.write(run / "records", record)
+    shown = records.of_task(ROOT / "docs" / "records", "bandit")
+    file = run / "records" / "bandit.jsonl"
+    records.write(file.parent, shown)
+    whole = file.read_text()
     (run / "adaptation.png").write_bytes(b"a picture")
     certificate = run.parent / "certificates" / "bandit.json"
     certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
@@ -454,13 +458,12 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def kept() -> list[str]:
         return sorted(str(file.relative_to(docs)) for file in docs.rglob("*") if file.is_file())
 
-    for says, record in (("is no video", shown[0]), ("is not json", {**shown[0], "returns": [float("nan")]})):
-        file = run / "records" / records.place(shown[0])
-        file.write_text(json.dumps(record))
+    for says, text in (("is no video", whole), ("is not json", whole.replace('"returns":[', '"returns":[NaN,', 1))):
+        file.write_text(text)
         with pytest.raises(envs.InputError, match=says):
             publish.keep(run)
         assert kept() == ["bandit.webp"]
-    file.write_text(json.dumps(shown[0]))
+    file.write_text(whole)
     (run / "video.mp4").unlink()
     for text in ("{}", "[", '{"task": "bandit"}', certificate.read_text().replace('"passed"', '"<script>"', 1)):
         certificate.write_text(text)
@@ -471,29 +474,31 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(envs.InputError, match=r"video.mp4 is a link"):
         publish.keep(run)
     (run / "video.mp4").unlink()
-    randoms = [run / "records" / records.place(record) for record in shown if record["method"] == "random"]
-    for one in randoms:
-        one.rename(one.with_suffix(".aside"))
+    file.write_text("".join(line for line in whole.splitlines(keepends=True) if '"method":"random"' not in line))
     with pytest.raises(envs.InputError, match="are without those of random"):
         publish.keep(run)
-    for one in randoms:
-        one.with_suffix(".aside").rename(one)
+    file.write_text(whole)
     assert kept() == ["bandit.webp"]
     publish.keep(run)
-    assert kept() == sorted(
-        [*(f"records/{records.place(one)}" for one in shown), "bandit.png", "certificates/bandit.json"]
-    )
+    assert kept() == ["bandit.png", "certificates/bandit.json", "records/.lock", "records/bandit.jsonl"]
+    assert (docs / "records" / "bandit.jsonl").read_text() == whole
     with pytest.raises(envs.InputError, match="holds no records"):
         publish.keep(tmp_path)
 
 
-@pytest.mark.parametrize("folder", sorted((ROOT / "docs" / "records").iterdir()), ids=lambda folder: folder.name)
-def test_records_hold_the_schema(folder: Path) -> None:
-    """And lie where they belong."""
-    files = list(folder.rglob("*.json"))
-    assert files
-    for file in files:
-        assert file == folder.parent / records.place(records.read(file))
+@pytest.mark.parametrize("task", envs.SUITE)
+def test_records_hold_the_schema(task: str) -> None:
+    """Each line of the file; and none is of a setting that pages do not show."""
+    every = records.read(ROOT / "docs" / "records" / records.place(task))
+    assert {(one["preset"], *one["set"], one["salt"]) for one in every} == {("default", "")}
+    assert len(every) == len(records.of_task(ROOT / "docs" / "records", task))
+
+
+def test_records_are_few_and_small() -> None:
+    """Files and bytes that everybody who clones gets."""
+    files = list((ROOT / "docs" / "records").rglob("*.jsonl"))
+    assert {file.stem for file in files} <= set(envs.SUITE)
+    assert sum(file.stat().st_size for file in files) <= 6e6
 
 
 def test_pages_are_up_to_date() -> None:
@@ -502,7 +507,7 @@ def test_pages_are_up_to_date() -> None:
         assert file.read_text() == text, f"{file}: run `python benchmarks/pages.py`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)
-    tasks = {file.parents[1].name.rpartition("-v")[0] for file in (docs / "records").rglob("*.json")}
+    tasks = {file.stem for file in (docs / "records").glob("*.jsonl")}
     kept = [*tasks, *(file.stem for file in (docs / "certificates").glob("*.json"))]
     assert sorted(name for name in rows if name != "task") == sorted(kept)
 

@@ -23,7 +23,7 @@ import pytest
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
-from deconfounded.benchmarks.engine import catalogue, identity, pool, presets
+from deconfounded.benchmarks.engine import catalogue, identity, pool, presets, sources
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
@@ -77,8 +77,7 @@ def test_run_play_score(folder: Path) -> None:
     run = folder / "results" / "bent_cartpole-smoke"
     results = json.loads((run / "results.json").read_text())
     assert results["set"] == ["eval_trials=4", "expert_trials=8", "cloning.updates=5"]
-    made = b"control" + (folder / "linear.py").read_bytes()
-    assert results["expert"] == hashlib.sha256(made).hexdigest()
+    assert results["expert"] == sources.digest([folder / "linear.py"], "control")
     assert results["methods"]["my_rnn"]["tier"] == "1"
     assert results["methods"]["my_rnn"]["budget"] == {"expert_trials": 8}
     assert "Clone cannot be saved" in done.stdout
@@ -199,10 +198,9 @@ def test_an_expert_is_its_function_and_its_files(tmp_path: Path) -> None:
     text = "import gain\ndef strong(obs, theta): return obs[:, :1]\ndef weak(obs, theta): return 0 * obs[:, :1]\n"
     (tmp_path / "two.py").write_text(text)
     task = envs.get(CONTROL)
-    seen = {identity.expert(task, f"{tmp_path}/two.py:{name}") for name in ("strong", "weak")}
+    seen = {identity.expert(task, f"{tmp_path}/two.py:{name}")["expert"] for name in ("strong", "weak")}
     (tmp_path / "gain.py").write_text("GAIN = 2")
-    identity._imports.cache_clear()
-    seen.add(identity.expert(task, f"{tmp_path}/two.py:strong"))
+    seen.add(identity.expert(task, f"{tmp_path}/two.py:strong")["expert"])
     assert len(seen) == 3
 
 

@@ -189,7 +189,7 @@ class TestCurves:
 
     def test_records(self) -> None:
         """A record has a curve of its training, and needs none."""
-        record = records.read(DOCS / "records" / "bandit-v0" / "default" / "naive_rnn-0.json")
+        record = next(one for one in records.of_task(DOCS / "records", "bandit") if one["method"] == "naive_rnn")
         assert record["curve"]["imitation"]["update"]
         records.check({key: value for key, value in record.items() if key != "curve"}, "it")
         for curve in ({"a": {"update": [1], "loss": []}}, {"a": {"update": [1], "loss": ["<b>"]}}, [1]):
@@ -244,16 +244,17 @@ def made() -> dict[str, Any]:
 class TestIndex:
     def test_rows_are_the_records(self, made: dict[str, Any]) -> None:
         """Each cell has as many seeds as records, and the last episode's score; differences are of these scores."""
+        lines = {
+            file.stem: [json.loads(line) for line in file.read_text().splitlines()]
+            for file in (DOCS / "records").glob("*.jsonl")
+        }
         for row in made["rows"]:
-            (folder,) = (DOCS / "records").glob(f"{row['task']}-v{envs.get(row['task']).version}")
-            found = {
-                name: list(folder.glob(f"default/{name}-[0-9]*.json")) for name in (row["method"], "random", "expert")
+            returns = {
+                name: [one["returns"] for one in lines[row["task"]] if one["method"] == name]
+                for name in (row["method"], "random", "expert")
             }
-            assert row["n"] == len(found[row["method"]])
-            means = {
-                name: np.array([json.loads(file.read_text())["returns"][: row["trained"]] for file in files])
-                for name, files in found.items()
-            }
+            assert row["n"] == len(returns[row["method"]])
+            means = {name: np.array(seeds)[:, : row["trained"]] for name, seeds in returns.items()}
             zero, one = means["random"].mean(), means["expert"].mean()
             last = (means[row["method"]][:, -1].mean() - zero) / (one - zero)
             assert row["value"] == pytest.approx(last, abs=1e-4)
@@ -393,7 +394,7 @@ class TestInABrowser:
 
 def test_report_in_a_browser(seen: browser.Browser, tmp_path: Path) -> None:
     """A run's report fits as well; its table scrolls, and each method has its curves."""
-    results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole", 1), list(METHODS))
+    results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
     report.adaptation(results, tmp_path / "adaptation.png")
     report.learning(results, tmp_path / "learning.png")
     (tmp_path / "report.html").write_text(report.page(results, tmp_path))
@@ -439,7 +440,7 @@ def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_commands_of_numbers() -> None:
     """Another way to deploy an agent is of its method's job; a method from outside is named by its file."""
     task = envs.get("bandit")
-    found = records.of_task(DOCS / "records", "bandit", 0)
+    found = records.of_task(DOCS / "records", "bandit")
     outside = [{**one, "method": "mine", "job": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
     results = records.gather([*found, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"

@@ -16,7 +16,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
 from deconfounded.benchmarks import table as table_command
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import identity, pool
+from deconfounded.benchmarks.engine import identity, pool, sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.output import records
@@ -37,48 +37,74 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkJob:
 
 
 class TestIdentity:
-    @pytest.mark.parametrize(
-        ("file", "changes"),
-        [
-            ("deconf/naive_rnn.py", {"naive_rnn"}),
-            ("deconf/dagger.py", {"dagger"}),
-            ("deconf/exact.py", {"conditional", "interventional"}),
-            ("deconf/recurrent.py", {"naive_rnn", "naive_obs", "naive_dropout", "naive_transformer", "palr"}),
-            ("envs/tasks/icy_road.py", set()),
-            ("envs/tasks/slippery_cartpole.py", set(METHODS)),
-            ("envs/render.py", set()),
-            ("benchmarks/output/pages.py", set()),
-            ("benchmarks/engine/jobs.py", set(METHODS)),
-        ],
-    )
-    def test_a_comment_changes_its_own_results_alone(
-        self, file: str, changes: set[str], monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        task = envs.get("slippery_cartpole")
-        before = {name: identity.code(task, method.module) for name, method in METHODS.items()}
+    """Versions, not the text of this package, decide what is made again; of what is from outside, its text."""
+
+    @pytest.mark.parametrize("name", ["envs/task.py", "envs/physics.py", "experts/demos.py", "deconf/nets.py"])
+    def test_the_text_of_the_package_is_in_no_identity(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A file with more in it than a comment: nothing is stale."""
         read = Path.read_bytes
+        job = BenchmarkJob("slippery_cartpole", tiny_preset(), "naive_rnn", (0,), Path())
 
-        def commented(self: Path) -> bytes:
-            return read(self) + (b"# a comment\n" if self == identity.ROOT / file else b"")
+        def changed(self: Path) -> bytes:
+            return read(self) + (b"x = 1\n" if self == sources.ROOT / name else b"")
 
-        monkeypatch.setattr(Path, "read_bytes", commented)
-        after = {name: identity.code(task, method.module) for name, method in METHODS.items()}
-        assert {name for name in METHODS if before[name] != after[name]} == changes
+        before = identity.identity(job)
+        monkeypatch.setattr(Path, "read_bytes", changed)
+        assert identity.identity(job) == before
 
-    def test_an_outside_task_is_noticed(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Its file, that of a class it stands on, and its MJCF."""
-        monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
-        (tmp_path / "base_body.py").write_text(
-            "from deconfounded.envs.tasks.bandit import Bandit\nclass Base(Bandit): pass\n"
+    def test_versions(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A new one of a task, a method, an expert or the protocol makes its results stale, and no others."""
+        jobs = [
+            BenchmarkJob(task, tiny_preset(), method, (0,), Path())
+            for task in ("curling", "icy_stop")
+            for method in ("naive_rnn", "dagger")
+        ]
+        before = [identity.identity(job) for job in jobs]
+
+        def stale() -> list[bool]:
+            return [identity.identity(job) != was for job, was in zip(jobs, before, strict=True)]
+
+        monkeypatch.setattr(type(envs.get("curling")), "version", 7)
+        assert stale() == [True, True, False, False]
+        monkeypatch.undo()
+        monkeypatch.setitem(METHODS, "dagger", replace(METHODS["dagger"], version=7))
+        assert stale() == [False, True, False, True]
+        monkeypatch.undo()
+        monkeypatch.setattr(identity, "PROTOCOL", 7)
+        assert stale() == [True] * 4
+        monkeypatch.undo()
+        version = policy.version
+        monkeypatch.setattr(
+            policy, "version", lambda task, *rest: 7 if task.name == "curling" else version(task, *rest)
         )
-        (tmp_path / "mine.py").write_text("from base_body import Base\nclass Mine(Base):\n    name = 'mine'\n")
+        assert stale() == [True, True, False, False]
+
+    def test_an_outside_task_is_its_text(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of its file, modules and packages beside it, its MJCF and what that includes; comments are no matter."""
+        monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
+        texts = {
+            "base_body.py": "from deconfounded.envs.tasks.bandit import Bandit\nclass Base(Bandit): pass\n",
+            "parts/__init__.py": "",
+            "parts/more.py": "from .again import ONE\n",
+            "parts/again.py": "ONE = 1\n",
+            "mine.py": "from base_body import Base\nfrom parts.more import ONE\nclass Mine(Base):\n    name = 'mine'\n",
+            "mine.xml": '<mujoco><include file="world.xml"/></mujoco>',
+            "world.xml": "<mujoco/>",
+        }
+        for name, text in texts.items():
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).write_text(text)
         task = envs.get(f"{tmp_path}/mine.py:Mine")
-        seen = {identity.code(task, "")}
-        for name, more in (("mine.py", "# more"), ("base_body.py", "# more"), ("mine.xml", "<mujoco/>")):
-            with (tmp_path / name).open("a") as file:
-                file.write(more)
-            seen.add(identity.code(task, ""))
-        assert len(seen) == 4
+        assert {str(file.relative_to(tmp_path)) for file in sources.of_task(task)} == set(texts)
+        first = sources.digest(sources.of_task(task))
+        for name in texts:
+            if name.endswith(".py"):
+                (tmp_path / name).write_text(f'"""A docstring."""\n# A comment.\n{texts[name]}')
+                assert sources.digest(sources.of_task(task)) == first, name
+            (tmp_path / name).write_text(texts[name] + ("x = 2\n" if name.endswith(".py") else "<!-- -->"))
+            assert sources.digest(sources.of_task(task)) != first, name
+            (tmp_path / name).write_text(texts[name])
+        assert sources.of_task(envs.get("bandit")) == set()
 
     def test_settings_are_the_methods_own(self) -> None:
         """Another amount of dagger's training is none of naive_rnn's business."""
@@ -223,12 +249,63 @@ def kept(job: BenchmarkJob) -> list[records.Record]:
 class TestRecords:
     def test_there_and_back(self, job: BenchmarkJob, tmp_path: Path) -> None:
         made = kept(job)
-        for record in made:
-            records.write(tmp_path / "records", record)
-        assert records.of_task(tmp_path / "records", "bandit", 0, "smoke") == made
-        assert records.of_task(tmp_path / "records", "bandit", 1, "smoke") == []
+        records.write(tmp_path, made)
+        assert records.of_task(tmp_path, "bandit", "smoke") == made
+        assert records.of_task(tmp_path, "bandit") == []
         assert made[0]["tier"] == "1"
         assert made[0]["budget"] == {"expert_trials": 4}
+
+    def test_one_in_a_slot(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        """A newer record takes the place of an older one, which is kept apart if it was made of something else."""
+        one, two = kept(job)
+        records.write(tmp_path, [one, two])
+        records.write(tmp_path, [{**one, "cpu_s": 9.0}])
+        assert records.read(tmp_path / "bandit.jsonl") == [two, {**one, "cpu_s": 9.0}]
+        assert not (tmp_path / "superseded").exists()
+        newer = {**two, "method_version": 7}
+        records.write(tmp_path, [newer])
+        assert records.read(tmp_path / "bandit.jsonl") == [{**one, "cpu_s": 9.0}, newer]
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two]
+        assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
+
+    def test_nothing_is_written_of_what_is_none(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        one, two = kept(job)
+        records.write(tmp_path, [one])
+        before = (tmp_path / "bandit.jsonl").read_bytes()
+        with pytest.raises(envs.InputError, match="blind_bc, seed 1 is no record"):
+            records.write(tmp_path, [one, {**two, "returns": []}])
+        assert (tmp_path / "bandit.jsonl").read_bytes() == before
+
+    @pytest.mark.parametrize(
+        ("spoil", "says"),
+        [
+            (lambda text: text.replace('"seed":1', '"seed":2', 1), "line 2 of .* is damaged, or was changed by hand"),
+            (
+                lambda text: text + text.splitlines()[0] + "\n",
+                "line 3 of .* is a second record of blind_bc with seed 0",
+            ),
+            (lambda text: text[:-40], "line 2 of .* is not json"),
+            (lambda text: text.replace('"cpu_s":', '"cpu_s":NaN,"x":', 1), "line 1 of .* is not json"),
+        ],
+    )
+    def test_a_damaged_line(self, job: BenchmarkJob, tmp_path: Path, spoil: Any, says: str) -> None:
+        records.write(tmp_path, kept(job))
+        file = tmp_path / "bandit.jsonl"
+        file.write_text(spoil(file.read_text()))
+        with pytest.raises(envs.InputError, match=says):
+            records.read(file)
+
+    def test_of_another_task(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        records.write(tmp_path, kept(job))
+        (tmp_path / "bandit.jsonl").rename(tmp_path / "curling.jsonl")
+        with pytest.raises(envs.InputError, match=r"line 1 of .*curling\.jsonl is of bandit, which belongs in bandit"):
+            records.read(tmp_path / "curling.jsonl")
+
+    def test_stale(self, job: BenchmarkJob) -> None:
+        record, today = kept(job)[0], identity.identity(job)
+        assert records.stale(record, today) == []
+        for key in records.MADE_OF:
+            assert records.stale({**record, key: "other"}, today) == [key]
 
     @pytest.mark.parametrize(
         ("change", "says"),
@@ -273,15 +350,28 @@ class TestVerify:
         data = made.load(3)
         assert data is not None
         (record,) = records.of_job(data, "smoke", small, 1)
-        records.write(tmp_path, record)
-        monkeypatch.setattr("sys.argv", ["verify", str(tmp_path / records.place(record))])
+        records.write(tmp_path, [record])
+        monkeypatch.setattr("sys.argv", ["verify", "bandit", "blind_bc", "3", "--records", str(tmp_path)])
         verify.main()
-        assert "blind_bc-3.json: same bits\n" in capsys.readouterr().out
-        records.write(tmp_path, {**record, "returns": [99.0], "bits": "0" * 64, "commit": None})
+        assert capsys.readouterr().out.endswith("bandit blind_bc 3: same bits\n")
+        records.write(tmp_path, [{**record, "returns": [99.0], "bits": "0" * 64, "commit": "0" * 40}])
         with pytest.raises(SystemExit) as ended:
             verify.main()
         assert ended.value.code == 1
-        assert "not the same\n    commit: None, now " in capsys.readouterr().out
+        assert "not the same\n    commit: 0000" in capsys.readouterr().out
+
+    def test_which_record(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        one, two = kept(job)
+        file = tmp_path / "bandit.jsonl"
+        records.write(tmp_path, [one, two, {**two, "salt": "salt"}])
+        assert verify.pick(file, "blind_bc", 0) == one
+        for method, seed, says in (
+            ("blind", 0, "method 'blind' is unknown; did you mean 'blind_bc'"),
+            ("blind_bc", 4, r"seed of blind_bc was 4; .* has 0, 1, 1"),
+            ("blind_bc", 1, "has 2 records of blind_bc with seed 1"),
+        ):
+            with pytest.raises(envs.InputError, match=says):
+                verify.pick(file, method, seed)
 
     def test_verdict(self, job: BenchmarkJob) -> None:
         record = {**kept(job)[0], "eval_trials": 100, "returns": [20.0], "returns_sd": [4.0]}
@@ -305,7 +395,7 @@ def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.Mon
     report.main()
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results["methods"]) == {"random", "expert", "blind_bc"}
-    for file in ("rows.csv", "report.html", "adaptation.png", "records/bandit-v0/smoke/expert-1.json"):
+    for file in ("rows.csv", "report.html", "adaptation.png", "records/bandit.jsonl"):
         assert (tmp_path / file).stat().st_size > 0
 
 
@@ -332,7 +422,7 @@ def test_broken_pictures_leave_the_numbers(
 def test_table_makes_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All of it at first; then nothing, but for a record that is gone, or of other code."""
+    """All of it at first; then nothing, but for a record that is gone, or of another version."""
 
     def table(*more: str) -> str:
         line = ["table", "--tasks", "bandit", "--methods", "random", "--preset", "smoke", "--seeds", "2", *more]
@@ -342,11 +432,9 @@ def test_table_makes_what_is_missing(
 
     assert "bandit, random: 2 of 2 seeds are missing" in table("--list")
     table()
-    place = tmp_path / "records" / "bandit-v0" / "smoke"
-    assert sorted(file.name for file in place.iterdir()) == [
-        f"{m}-{i}.json" for m in ("expert", "random") for i in (0, 1)
-    ]
+    made = records.read(tmp_path / "records" / "bandit.jsonl")
+    assert [(one["method"], one["seed"]) for one in made] == [(m, i) for m in ("expert", "random") for i in (0, 1)]
     assert table() == table("--list") == ""
-    (place / "expert-1.json").unlink()
-    records.write(tmp_path / "records", {**records.read(place / "random-0.json"), "code": "0" * 64})
+    (tmp_path / "records" / "bandit.jsonl").unlink()
+    records.write(tmp_path / "records", [made[0], made[2], {**made[3], "method_version": 0}])
     assert table("--list").splitlines() == [f"bandit, {m}: 1 of 2 seeds are missing" for m in ("expert", "random")]

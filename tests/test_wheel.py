@@ -17,7 +17,7 @@ from filelock import FileLock
 
 from deconfounded import envs
 from deconfounded.__main__ import CHECKOUT, COMMANDS
-from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine import identity, sources
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("assets", "benchmarks", "deconf", "envs", "experts")
@@ -112,16 +112,17 @@ def test_what_needs_a_checkout_says_so(built: Path, empty: Path) -> None:
 
 
 def test_commands_work_as_installed(built: Path, empty: Path) -> None:
-    """They read and write nothing but the folder they are in; a result is of the same code as a checkout's."""
+    """They read and write nothing but the folder they are in; data there and in a checkout are known to be the same."""
     before = files(built / "site")
     small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "cloning.updates=5")
     deconf(built, empty, "run", "--task", "bandit", "--methods", "blind_bc", *small)
     agent = ("--agent", "results/bandit-smoke/agents/blind_bc-0", "--task", "bandit")
     assert "returns" in deconf(built, empty, "play", *agent)
     deconf(built, empty, "data", "--task", "bandit", "--trials", "2", "--out", "data sets")
-    code = "from deconfounded import envs; from deconfounded.benchmarks.engine import identity as of;"
-    code += "print(of.code(envs.get('icy_road'), 'deconf/naive_rnn'))"
-    assert run(built, empty, "-c", code).stdout.strip() == identity.code(envs.get("icy_road"), "deconf/naive_rnn")
+    code = "from deconfounded import envs; from deconfounded.benchmarks.engine import identity, sources;"
+    code += "print(identity.demonstrations(envs.get('icy_road'), None, 8, 0), sources.package())"
+    expected = f"{identity.demonstrations(envs.get('icy_road'), None, 8, 0)} {sources.package()}\n"
+    assert run(built, empty, "-c", code).stdout == expected
     assert {name.partition("/")[0] for name in files(empty.parent)} == {"at work"}
     assert {name.partition("/")[0] for name in files(empty)} == {"results", "data sets"}
     assert files(built / "site") == before

@@ -14,17 +14,18 @@ from deconfounded.envs import outside
 class Method:
     """uses: what it is handed (`deconf.given.USES`); references are handed the environment.
 
-    module: where its code is, under the root. part: of a preset, that has its configuration. cost: about, where blind
+    part: of a preset, that has its configuration. cost: about, where blind
     BC is 1, for the ETA alone. default: whether it runs if nobody asks for it. reference: where one from outside is.
+    version: raised by hand when its numbers change; 0 for one from outside, which has none.
     """
 
     uses: tuple[str, ...] = ("demonstrations",)
-    module: str = ""
     part: str = ""
     cost: int = 1
     default: bool = True
     exact: bool = False
     reference: str = ""
+    version: int = 1
 
     @property
     def learned(self) -> bool:
@@ -43,23 +44,23 @@ class Method:
 
 _EXPLORES = ("demonstrations", "exploration")
 METHODS = {
-    "deconfounded": Method(_EXPLORES, "deconf/deconfounded", "deconfounded", 4),
-    "deconfounded_gru": Method(_EXPLORES, "deconf/deconfounded", "deconfounded", 14, default=False),
-    "deconfounded_discrete": Method(_EXPLORES, "deconf/deconfounded", "discrete", 7, default=False),
-    "deconfounded_offline": Method(module="deconf/offline", part="offline", cost=7, default=False),
-    "deconfounded_mean": Method(_EXPLORES, "deconf/deconfounded_mean", "mean", 8, default=False),
-    "dagger": Method(("queries",), "deconf/dagger", "dagger", 4, default=False),
-    "gail": Method(_EXPLORES, "deconf/gail", "gail", 60, default=False),
-    "rma": Method((*_EXPLORES, "theta"), "deconf/rma", "rma", 4, default=False),
-    "naive_transformer": Method(module="deconf/naive_transformer", part="transformer", cost=30, default=False),
-    "naive_obs": Method(module="deconf/naive_obs", part="obs", cost=2, default=False),
-    "naive_dropout": Method(module="deconf/naive_obs", part="dropout", cost=2, default=False),
-    "palr": Method(module="deconf/palr", part="palr", cost=4, default=False),
-    "naive_rnn": Method(module="deconf/naive_rnn", part="naive", cost=2),
-    "oracle_bc": Method(("demonstrations", "theta"), "deconf/cloning", "cloning"),
-    "blind_bc": Method(module="deconf/cloning", part="cloning"),
-    "conditional": Method(("environment",), "deconf/exact", exact=True),
-    "interventional": Method(("environment",), "deconf/exact", exact=True),
+    "deconfounded": Method(_EXPLORES, "deconfounded", 4),
+    "deconfounded_gru": Method(_EXPLORES, "deconfounded", 14, default=False),
+    "deconfounded_discrete": Method(_EXPLORES, "discrete", 7, default=False),
+    "deconfounded_offline": Method(part="offline", cost=7, default=False),
+    "deconfounded_mean": Method(_EXPLORES, "mean", 8, default=False),
+    "dagger": Method(("queries",), "dagger", 4, default=False),
+    "gail": Method(_EXPLORES, "gail", 60, default=False),
+    "rma": Method((*_EXPLORES, "theta"), "rma", 4, default=False),
+    "naive_transformer": Method(part="transformer", cost=30, default=False),
+    "naive_obs": Method(part="obs", cost=2, default=False),
+    "naive_dropout": Method(part="dropout", cost=2, default=False),
+    "palr": Method(part="palr", cost=4, default=False),
+    "naive_rnn": Method(part="naive", cost=2),
+    "oracle_bc": Method(("demonstrations", "theta"), "cloning"),
+    "blind_bc": Method(part="cloning"),
+    "conditional": Method(("environment",), exact=True),
+    "interventional": Method(("environment",), exact=True),
     "expert": Method(("environment",)),
     "random": Method(()),
 }
@@ -80,7 +81,7 @@ def add(reference: str) -> str:
     where, _, function = reference.rpartition(":")
     stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
     name = re.sub(r"\W", "_", stem if function == "fit" else f"{stem}_{function}")
-    made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference))
+    made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference), version=0)
     taken = {"all", "demonstrations", *(f"{known}_episode" for known in METHODS)}
     if name in taken or METHODS.setdefault(name, made) != made:
         raise envs.InputError(f"method {reference!r} would be called {name}, which there is already; rename its file")

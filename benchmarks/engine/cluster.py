@@ -16,7 +16,7 @@ from ray.exceptions import RayError, RayTaskError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine import identity, sources
 from deconfounded.benchmarks.engine.pool import Engine, Job
 from deconfounded.benchmarks.engine.worker import Files, Unlike, work
 from deconfounded.envs import outside
@@ -71,7 +71,7 @@ class Cluster(Engine):
             task = ray.remote(work).options(num_cpus=1, num_gpus=gpus, max_retries=0, scheduling_strategy="SPREAD")
             about = (
                 replace(job, expert=absolute(job.expert)),
-                identity.identity(job),
+                {**identity.identity(job), "code": sources.package()},
                 number,
                 self.mailbox,
                 list(files),
@@ -169,17 +169,16 @@ def given(job: Job) -> dict[str, Path]:
 
 
 def from_outside(job: Job) -> set[Path]:
-    """The files of a task, method and expert from outside, what these import beside them, the MJCF and the weights."""
-    task = envs.get(job.task)
-    named = [one for one in (job.task, job.about.reference, job.expert) if one and ".py:" in one]
-    found = identity.closure(file for one in named if (file := outside.file(one)))
-    weights = [Path(job.expert).resolve()] if job.expert and not policy.names_callable(job.expert) else []
-    if ".py:" in job.task:
-        found.add(task.home / f"{task.name}.xml")
-        weights.append(policy.path(task))
-    found |= {file.with_suffix(suffix) for file in weights for suffix in (file.suffix, ".json")}
-    ours = [identity.ROOT / name for name in ("envs", "experts", "deconf", "benchmarks")]
-    return {file for file in found if not any(file.is_relative_to(folder) for folder in ours)}
+    """The files of a task, method and expert from outside, with what these import and name; weights and their card."""
+    task, named = envs.get(job.task), [job.about.reference]
+    weights = [policy.path(task)] if sources.of_task(task) else []
+    if job.expert and policy.names_callable(job.expert):
+        named.append(job.expert)
+    elif job.expert:
+        weights.append(Path(job.expert).resolve())
+    files = sources.of_task(task).union(*(sources.of_reference(one) for one in named if ".py:" in one))
+    files |= {file.with_suffix(suffix) for file in weights for suffix in (file.suffix, ".json")}
+    return {file for file in files if not sources.is_ours(file)}
 
 
 def absolute(expert: str | None) -> str | None:

@@ -18,7 +18,7 @@ from typing import Any
 from ray.exceptions import RayError
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import identity, pool
+from deconfounded.benchmarks.engine import identity, pool, sources
 from deconfounded.benchmarks.engine.pool import Job
 from deconfounded.envs import outside
 from deconfounded.envs.files import write_atomically
@@ -47,7 +47,7 @@ def work(
         job = replace(job, folder=folder / "jobs")
         if job.expert and not policy.names_callable(job.expert):
             job = replace(job, expert=str(outside.here(Path(job.expert))))
-        check(expected, identity.identity(job))
+        check(expected, {**identity.identity(job), "code": sources.package()})
         courier = Courier(folder, number, mailbox)
         pool.tell(courier)
         try:

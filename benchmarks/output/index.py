@@ -133,7 +133,7 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
         "outcome": score.outcome(results["methods"]),
         "clip": {"file": clip.name, "size": Image.open(clip).size} if clip.exists() else None,
         "certificate": certificate(docs, task, certified),
-        "records": f"records/{task.name}-v{task.version}",
+        "records": f"records/{task.name}.jsonl",
         "made": f"{results['wall_s']:,.0f} s; {results['machine']}; "
         + ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch")),
     }

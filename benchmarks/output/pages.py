@@ -48,7 +48,7 @@ def published() -> index.Found:
     found = []
     for name in envs.SUITE:
         task = envs.get(name)
-        if of_task := records.of_task(DOCS / "records", name, task.version):
+        if of_task := records.of_task(DOCS / "records", name):
             found.append((task, records.gather(of_task, list(METHODS))))
     return found
 
@@ -82,19 +82,28 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"## {task.name}",
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
-        f" {versions} ([records](records/{task.name}-v{task.version}), of {commits}).",
+        f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
         markdown_table((*score.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
-    if old := sorted(
-        folder.name
-        for folder in (DOCS / "records").glob(f"{task.name}-v*")
-        if folder.name != f"{task.name}-v{task.version}"
-    ):
-        parts.append(f"Superseded, and not to be compared: the records of {', '.join(old)}.")
+    if older := outdated(task, results):
+        parts.append(f"Of an older version, and not yet made again: {', '.join(older)}.")
+    if (DOCS / "records" / "superseded" / records.place(task.name)).exists():
+        link = f"records/superseded/{records.place(task.name)}"
+        parts.append(f"Superseded, and not to be compared: [the records of earlier versions]({link}).")
     if (DOCS / f"{task.name}.webp").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
     return "\n\n".join(parts)
+
+
+def outdated(task: envs.Task, results: dict[str, Any]) -> list[str]:
+    """What of a task's results is of an older version than today's of the task or a method, and of which."""
+    older = [f"the task, v{results['task_version']} of v{task.version}"] * (results["task_version"] != task.version)
+    for name, entry in results["methods"].items():
+        method = METHODS.get(name.removesuffix("_episode"))
+        if method is not None and entry["version"] != method.version:
+            older.append(f"{name}, v{entry['version']} of v{method.version}")
+    return older
 
 
 def results_page(found: index.Found, certified: dict[str, Any]) -> str:

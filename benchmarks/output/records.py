@@ -1,14 +1,14 @@
-"""One record for each (task, version, preset, method, seed): a small json that says what came out, and of what.
+"""Records: what came of one seed of one method on one task, and of what it was made. All pages are made of them alone.
 
-All pages and tables are made of records alone. Those of another version of a task, or under another preset, are never
-mixed with others.
+A file `<task>.jsonl` holds a record a line, each with its own checksum; `read` and `write` are the only ones that open
+it. Records of different versions of a task or a method, or of different presets, never stand in one table.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,17 @@ import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.output import score
-from deconfounded.envs.files import check_folder, unsealed, write_sealed
+from deconfounded.envs.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]
 SCHEMA = Path(__file__).with_name("record.schema.json")
 COMMON = ("task", "task_version", "preset", "set", "salt", "eval_trials", "episodes", "expert")  # of a table's records
+MADE_OF = (  # what makes a record stale when it changes
+    *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
+    *("salt", "versions", "outside"),
+)
+SLOT = ("preset", "set", "salt", "method", "seed")  # of which a task's file holds one record
 
 
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
@@ -35,10 +40,11 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
         curve = {"curve": thinned(meta["curve"])} if meta["curve"] else {}
         found.append(
             {
-                "schema": 1,
+                "schema": 2,
                 "task": made["task"],
                 "task_version": made["task_version"],
                 "method": name,
+                "method_version": made["method_version"],
                 "job": made["method"],
                 "seed": meta["seed"],
                 "preset": preset,
@@ -57,7 +63,9 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
                 "spans": [[round(at, 1) for at in span] for span in meta["spans"]],
                 "settings": made["settings"],
                 "expert": made["expert"],
-                "code": made["code"],
+                "expert_version": made["expert_version"],
+                "protocol": made["protocol"],
+                "outside": made["outside"],
                 "commit": meta["commit"],
                 "versions": made["versions"],
                 "machine": meta["machine"],
@@ -89,15 +97,15 @@ def bits(returns: np.ndarray) -> str:
 
 
 @cache
-def _schema() -> dict[str, Any]:
-    return json.loads(SCHEMA.read_text())
+def _validator() -> Any:
+    from jsonschema import Draft202012Validator
+
+    return Draft202012Validator(json.loads(SCHEMA.read_text(encoding="utf-8")))
 
 
 def check(record: Any, where: str) -> Record:
     """The record, if it is one. Raises InputError that names what does not fit the schema."""
-    from jsonschema import Draft202012Validator
-
-    for error in Draft202012Validator(_schema()).iter_errors(record):
+    for error in _validator().iter_errors(record):
         at = ".".join(map(str, error.absolute_path)) or "it"
         raise InputError(f"{where} is no record: {at} {error.message[:120]}")
     if any(end < begin for begin, end in record["spans"]):
@@ -109,44 +117,113 @@ def check(record: Any, where: str) -> Record:
     return record
 
 
-def place(record: Record) -> Path:
-    """Where it is kept, under a folder of records."""
-    return Path(
-        f"{record['task']}-v{record['task_version']}", record["preset"], f"{record['method']}-{record['seed']}.json"
-    )
+def stale(record: Record, identity: Mapping[str, Any]) -> list[str]:
+    """What a record was made of that is no longer so, of `MADE_OF`; identity: of the job that would make it today."""
+    today = json.loads(json.dumps(identity))
+    return [key for key in MADE_OF if record[key] != today[key]]
+
+
+def place(task: str) -> str:
+    """The name of a task's file in a folder of records."""
+    return f"{task}.jsonl"
 
 
 def _no_number(text: str) -> None:
     raise ValueError(text)  # NaN and Infinity, which Python's reader takes though JSON does not have them
 
 
-def read(file: Path) -> Record:
-    """A record from a file. Raises InputError if it is missing, damaged or none."""
+def _parse(line: bytes, where: str) -> Record:
+    """The record in a line of a file. Raises InputError if it is damaged or none."""
     try:
-        record = check(json.loads(file.read_bytes(), parse_constant=_no_number), str(file))
-    except OSError as error:
-        raise InputError(f"record {file} cannot be read: {error.strerror}") from None
+        record = check(json.loads(line, parse_constant=_no_number), where)
     except InputError:
         raise
     except (ValueError, RecursionError):
-        raise InputError(f"record {file} is not json") from None
+        raise InputError(f"{where} is not json") from None
     try:  # a note is written by hand
         note = {"note": record.pop("note")} if "note" in record else {}
-        return {**(unsealed(record) if "sha256" in record else record), **note}
+        return {**unsealed(record), **note}
     except ValueError:
-        raise InputError(f"record {file} is damaged, or was changed by hand: its sha256 is of something else") from None
+        raise InputError(f"{where} is damaged, or was changed by hand: its sha256 is of something else") from None
 
 
-def write(folder: Path, record: Record) -> None:
-    """Keep a record in its place."""
-    file = folder / place(record)
+def read(file: Path) -> list[Record]:
+    """The records of a file, in its order.
+
+    Raises InputError if it is missing, or if a line is damaged, no record, of another task than the file's name says,
+    or a second one of the same preset, method and seed.
+    """
+    try:
+        lines = file.read_bytes().splitlines()
+    except OSError as error:
+        raise InputError(f"records {file} cannot be read: {error.strerror}") from None
+    records: dict[str, Record] = {}
+    for number, line in enumerate(lines, 1):
+        record = _parse(line, where := f"line {number} of {file}")
+        if place(record["task"]) != file.name:
+            raise InputError(f"{where} is of {record['task']}, which belongs in {place(record['task'])}")
+        if (slot := _slot(record)) in records:
+            raise InputError(f"{where} is a second record of {record['method']} with seed {record['seed']}")
+        records[slot] = record
+    return list(records.values())
+
+
+def _slot(record: Record) -> str:
+    return json.dumps([record[key] for key in SLOT])
+
+
+def write(folder: Path, records: Sequence[Record]) -> None:
+    """Add records to the files of their tasks in a folder, each file atomically.
+
+    A record takes the place of the one in its slot. One that was made of something else (another version, say) is kept
+    in the folder `superseded`. Raises InputError for what is no record, before anything is written.
+    """
+    from filelock import FileLock
+
+    by_task: dict[str, list[Record]] = {}
+    for record in records:
+        by_task.setdefault(check(record, f"{record.get('method')}, seed {record.get('seed')}")["task"], []).append(
+            record
+        )
+    check_folder(folder)
+    with FileLock(folder / ".lock"):
+        for task, new in by_task.items():
+            file = folder / place(task)
+            kept = {_slot(record): record for record in (read(file) if file.exists() else ())}
+            for record in new:
+                before = kept.pop(_slot(record), None)
+                if before is not None and stale(before, record):
+                    _append(folder / "superseded" / place(task), before)
+                kept[_slot(record)] = record
+            write_atomically(file, "".join(map(_line, kept.values())))
+
+
+def _append(file: Path, record: Record) -> None:
     check_folder(file.parent)
-    write_sealed(file, check(record, str(file)))
+    write_atomically(file, (file.read_bytes() if file.exists() else b"") + _line(record).encode())
 
 
-def of_task(folder: Path, task: str, version: int, preset: str = "default") -> list[Record]:
-    """The records of a task's version, by method and seed."""
-    return [read(file) for file in sorted((folder / f"{task}-v{version}" / preset).glob("*.json"))]
+def _line(record: Record) -> str:
+    note = {"note": record["note"]} if "note" in record else {}
+    rest = {key: value for key, value in record.items() if key != "note"}
+    return json.dumps({**sealed(rest), **note}, separators=(",", ":"), allow_nan=False) + "\n"
+
+
+def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
+    """The records of a task under an unchanged preset, by method and seed: of its newest version, and each method's."""
+    file = folder / place(task)
+    found = [one for one in (read(file) if file.exists() else ()) if one["preset"] == preset and not one["set"]]
+    found = _newest([one for one in found if not one["salt"]], "task_version")
+    by_job: dict[str, list[Record]] = {}
+    for record in found:
+        by_job.setdefault(record["job"], []).append(record)
+    newest = [record for job in by_job.values() for record in _newest(job, "method_version")]
+    return sorted(newest, key=lambda record: (record["method"], record["seed"]))
+
+
+def _newest(records: list[Record], version: str) -> list[Record]:
+    newest = max((record[version] for record in records), default=0)
+    return [record for record in records if record[version] == newest]
 
 
 def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, Any]:
@@ -159,6 +236,11 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         for key in COMMON:
             if record[key] != first[key]:
                 raise InputError(f"records with {key} {first[key]} and {record[key]} do not belong in one table")
+    made_of: dict[str, list[Any]] = {}
+    for record in records:
+        parts = [record["method_version"], record["outside"]]
+        if made_of.setdefault(record["method"], parts) != parts:
+            raise InputError(f"records of two versions of {record['method']} do not belong in one table")
     if missing := [name for name in REFERENCES if name not in {record["method"] for record in records}]:
         raise InputError(f"records of {first['task']} are without those of {missing[0]}, which scores need")
     by_method: dict[str, list[Record]] = {}

@@ -31,8 +31,7 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     about: what the folder is for, as its settings.json says. Numbers come first: they stand, whatever pictures do.
     """
     made = records.of_run(finished, about["preset"], about["set"], task.episodes)
-    for record in made:
-        records.write(folder / "records", record)
+    records.write(folder / "records", made)
     results = {**records.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
     write_json(folder / "results.json", results)
     write_atomically(folder / "rows.csv", score.csv_rows(task, results, finished))

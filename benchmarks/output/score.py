@@ -14,6 +14,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.envs.task import Array
 
+VERSION = 1  # raised when the same records come to other figures
+
 
 def normalise(returns: Array, random: float, expert: float) -> Array:
     """Returns of any shape -> scores; 0 = random actions, 1 = the expert."""
@@ -89,6 +91,7 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
             "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": means(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
             "tier": seeds[0]["tier"],
+            "version": seeds[0]["method_version"],
             "budget": mean_budget([record["budget"] for record in seeds]),
             "cpu_s": round(float(np.mean([record["cpu_s"] for record in seeds])), 1),
         }

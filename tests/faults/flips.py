@@ -66,7 +66,7 @@ def files(folder: Path) -> dict[str, tuple[Path, Read]]:
     data = job.load(0)
     assert data is not None
     (record,) = records.of_job(data, "smoke", [], 1)
-    records.write(folder, record)
+    records.write(folder, [record])
     agent = folder / "agents" / "naive_rnn-0"
     monitor = CurveMonitor(job, 0.8)
     shutil.copy(kept, monitor.file)
@@ -106,7 +106,7 @@ def files(folder: Path) -> dict[str, tuple[Path, Read]]:
         "Trials .npz": (shown, lambda: whole(Trials.load(shown))),
         "agent.safetensors": (agent / "agent.safetensors", state),
         "agent.json": (agent / "agent.json", state),
-        "a record's .json": (folder / records.place(record), lambda: records.read(folder / records.place(record))),
+        "records .jsonl": (folder / "bandit.jsonl", lambda: records.read(folder / "bandit.jsonl")),
         "settings.json": (folder / "settings.json", lambda: read_sealed(folder / "settings.json")),
     }
 

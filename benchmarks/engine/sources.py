@@ -1,0 +1,161 @@
+"""Source files of tasks, methods and experts from outside, and digests that comments and docstrings do not change.
+
+A digest covers the file named, the modules and packages beside it that it imports, and the files that an MJCF names.
+Installed libraries count by their versions instead (`identity.versions`).
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import sysconfig
+from collections.abc import Iterable, Iterator
+from functools import cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+from deconfounded import envs
+from deconfounded.envs import outside
+
+ROOT = Path(__file__).resolve().parents[2]
+OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
+LIBRARIES = tuple(
+    Path(sysconfig.get_paths()[name]).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")
+)
+
+
+def is_ours(file: Path) -> bool:
+    """Whether a file belongs to this package."""
+    return any(file.is_relative_to(folder) for folder in OURS)
+
+
+def closure(files: Iterable[Path]) -> set[Path]:
+    """The Python files given, and the files outside of this package that they import, directly or not.
+
+    A module is looked for beside the file that imports it or, if that file is in a package, in the same package.
+    """
+    reached: set[Path] = set()
+    left = [file.resolve() for file in files]
+    while left:
+        file = left.pop()
+        if file not in reached and not is_ours(file):
+            reached.add(file)
+            left += _imports(file, file.stat().st_mtime_ns)
+    return reached
+
+
+@cache
+def _imports(file: Path, changed: int) -> tuple[Path, ...]:
+    """Files beside a file that it imports; `changed`, its time stamp, is there for the cache."""
+    root, package = _package(file)
+    imported: set[Path] = set()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*above, *([node.module] if node.module else [])])
+            names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            if not package or parts[0] == package[0]:
+                imported |= set(_modules(root, parts))
+    return tuple(imported)
+
+
+def _package(file: Path) -> tuple[Path, tuple[str, ...]]:
+    """The folder that a file's imports start from, and the names of the packages that it is in, outermost first."""
+    folder, names = file.parent, list[str]()
+    while (folder / "__init__.py").is_file():
+        names.insert(0, folder.name)
+        folder = folder.parent
+    return folder, tuple(names)
+
+
+def _modules(root: Path, parts: list[str]) -> Iterator[Path]:
+    """The files under `root` that importing the module `parts` runs: of its packages, then its own."""
+    for end in range(1, len(parts) + 1):
+        place = root.joinpath(*parts[:end])
+        for file in (place / "__init__.py", place.with_suffix(".py")):
+            if file.is_file():
+                yield file
+
+
+def mjcf(file: Path) -> set[Path]:
+    """An MJCF file, and the files that it includes or takes meshes, textures and height fields from."""
+    if not file.is_file():
+        return set()
+    named = {file}
+    try:
+        tree = ElementTree.fromstring(file.read_bytes())
+    except ElementTree.ParseError:  # MuJoCo says what is wrong with it
+        return named
+    compiler = {key: value for element in tree.iter("compiler") for key, value in element.items()}
+    for element in tree.iter():
+        if name := element.get("file"):
+            if element.tag in ("include", "model"):
+                named |= mjcf(file.parent / name)
+                continue
+            kind = "meshdir" if element.tag in ("mesh", "skin") else "texturedir"
+            asset = file.parent / compiler.get(kind, compiler.get("assetdir", "")) / name
+            named |= {asset} if asset.is_file() else set()
+    return named
+
+
+def of_task(task: envs.Task) -> set[Path]:
+    """The files of a task from outside: its classes' modules, what these import, and its MJCF; none for one of ours."""
+    classes = {file for cls in type(task).__mro__ if (file := outside.source(cls)) and not is_ours(file)}
+    own = {file for file in classes if not any(file.is_relative_to(folder) for folder in LIBRARIES)}
+    if not own:
+        return set()
+    return closure(own) | mjcf(task.home / f"{task.name}.xml")
+
+
+def of_reference(reference: str) -> set[Path]:
+    """The files of a method or expert from outside, `path/file.py:name` or `package.module:name`."""
+    file = outside.file(reference)
+    return closure([file]) if file else set()
+
+
+def digest(files: Iterable[Path], name: str = "") -> str:
+    """SHA-256 of files' names and contents, wherever they lie; of Python files without comments and docstrings.
+
+    name: of the object in them, where a file defines several.
+    """
+    total = hashlib.sha256(name.encode())
+    for one in sorted((file.name, content(file)) for file in files):
+        total.update(one[0].encode() + b"\0" + one[1])
+    return total.hexdigest()
+
+
+def content(file: Path) -> bytes:
+    """A file's bytes; of a Python file its syntax tree without docstrings, which comments and layout do not change."""
+    text = file.read_bytes()
+    if file.suffix != ".py":
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
+            first = node.body[0]
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                node.body = node.body[1:]
+    return ast.dump(tree).encode()
+
+
+def of_code(*objects: object) -> str:
+    """SHA-256 of the modules that define functions or classes of this package, without comments and docstrings."""
+    return digest({Path(inspect.getfile(one)).resolve() for one in objects})  # type: ignore[arg-type]
+
+
+@cache
+def package() -> str:
+    """SHA-256 of this whole package: whether two machines have the same of it installed."""
+    files = (file for folder in OURS for file in folder.rglob("*") if file.suffix in (".py", ".xml", ".safetensors"))
+    return digest(files)
