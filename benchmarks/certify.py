@@ -11,10 +11,8 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import platform
 import time
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.score import normalise
@@ -187,7 +186,7 @@ def certify(
         "trials": trials,
         "grid": len(witness.grid.theta),
         "seed": seed,
-        "versions": {"python": platform.python_version(), "mujoco": version("mujoco"), "numpy": np.__version__},
+        "versions": identity.versions(),
     }
 
 

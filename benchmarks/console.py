@@ -6,16 +6,19 @@ import argparse
 import contextlib
 import io
 import os
+import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 CLEANING_S = 5.0  # for which a signal after the first changes nothing
+NO_READER = 141  # 128 + SIGPIPE
+ROOT = Path(__file__).resolve().parents[1]
 
 
 class Parser(argparse.ArgumentParser):
@@ -65,6 +68,51 @@ def escape_output() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as Python's own for standard error
 
 
+def need_checkout() -> None:
+    """End this process with one line and exit code 2 where there is no source tree, but an installed package."""
+    if not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
+        name = Path(sys.argv[0]).stem
+        print(
+            f"error: {name} reads and writes docs/ of a checkout, and {ROOT} is none; clone the repository, and run it"
+            " there",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+
+
+def _flush() -> None:
+    """Flush stdout and stderr; what cannot be written there is dropped from now on."""
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        try:
+            stream.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _unread() -> bool:
+    """Whether stdout or stderr is a pipe that nobody reads any more."""
+    watched = select.poll()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        watched.register(stream, 0)
+    return any(event & select.POLLERR for _, event in watched.poll(0))
+
+
+@contextlib.contextmanager
+def quiet_pipe() -> Iterator[None]:
+    """If nobody reads what is printed any more (`| head -1`), end as other programs do: without a word."""
+    try:
+        yield
+        print(end="", flush=True)  # and not at exit, where it would be a traceback
+    except BrokenPipeError:
+        if not _unread():  # it was another pipe
+            raise
+        _flush()
+        sys.exit(NO_READER)
+    except BaseException:  # what --help printed is not flushed yet
+        _flush()
+        raise
+
+
 class Stoppable:
     """Meanwhile signals raise Stopped; those that come while it is being cleaned up do nothing."""
 
@@ -92,7 +140,7 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
     escape_output()
     signals = Stoppable()
     try:
-        with signals:
+        with signals, quiet_pipe():
             main()
         return
     except (Exception, KeyboardInterrupt) as error:

@@ -12,6 +12,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 from collections.abc import Callable
+from importlib.util import find_spec
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
@@ -36,6 +37,8 @@ def main() -> None:
     expert = policy.load(task, args.expert)
     if not 1 <= args.trials <= 100_000 or args.seed < 0:
         raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be from 1 and from 0 up")
+    if not find_spec("minari"):
+        raise envs.InputError("a data set needs Minari; `pip install deconfounded-imitation[data]` brings it")
     check_folder(args.out)
     behaviours: dict[str, Callable[[envs.BatchEnv], Agent]] = {
         "random": lambda env: RandomAgent(task.action_space),

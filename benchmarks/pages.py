@@ -6,9 +6,10 @@ With --still also docs/index.png, README's picture of docs/index.html; that take
 from __future__ import annotations
 
 if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
+    from deconfounded.benchmarks.console import need_checkout, stop_at_once
 
     stop_at_once()
+    need_checkout()
 
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.output import pages

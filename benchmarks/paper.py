@@ -26,6 +26,7 @@ from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.pool import Finished, Job, JobMonitor, by_method
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.output.figures import figure_2, figure_3
+from deconfounded.benchmarks.output.records import covered
 from deconfounded.deconf.data import Batch
 from deconfounded.deconf.deconfounded import DeconfoundedAgent
 from deconfounded.deconf.equations import posterior_policy
@@ -188,17 +189,13 @@ def table(methods: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
-    """The command line."""
-    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10).parse_args()
-    methods = commands.check(args, LEARNERS, SHOWN)
-    task = envs.get("bandit")
-    folder = args.out or Path("results") / f"paper-{args.preset}"
-    finished, results = commands.run(FigureJob, task, args, methods, folder)
-    references = exact(task)
-    results["exact"] = {
-        name: {"pulls": round(e["pulls"], 3), "loss": round(e["loss"], 4)} for name, e in references.items()
-    }
+def write(
+    task: envs.Task, about: dict[str, Any], finished: Finished, references: dict[str, dict[str, Any]], folder: Path
+) -> str:
+    """Write results, rows and figures; returns what to print."""
+    exactly = {name: {"pulls": round(e["pulls"], 3), "loss": round(e["loss"], 4)} for name, e in references.items()}
+    spans = [(begin, end) for _, _, entry in finished for begin, end in entry["meta"]["spans"]]
+    results = {**about, "wall_s": round(covered(spans), 1), "exact": exactly}
     results["methods"] = summarise(finished, references)
     write_json(folder / "results.json", results)
     rows = [f"{name},{seed},{float(entry['pulls']):.4f}" for name, seed, entry in finished]
@@ -206,7 +203,17 @@ def main() -> None:
     figure_2(task, folder / "figure2.png")
     figure_3([entry for entry in finished if entry[0] in SHOWN], references, folder / "figure3.png")
     figure_3(finished, references, folder / "tiers.png")
-    print(f"\n{table(results['methods'])}\n\n{results['wall_s']:.0f} s -> {folder / 'figure3.png'}")
+    return f"\n{table(results['methods'])}\n\n{results['wall_s']:.0f} s -> {folder / 'figure3.png'}"
+
+
+def main() -> None:
+    """The command line."""
+    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10).parse_args()
+    methods = commands.check(args, LEARNERS, SHOWN)
+    task = envs.get("bandit")
+    folder = args.out or Path("results") / f"paper-{args.preset}"
+    finished, about = commands.run(FigureJob, task, args, methods, folder)
+    print(write(task, about, finished, exact(task), folder))
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.physics import Physics, cores
@@ -188,8 +189,7 @@ def main() -> None:
     peer = against_envpool()
     print("envpool is not installed" if peer is None else f"share of raw mj_step: {peer['share_of_mj_step']}")
     about = {"machine": f"{platform.machine()}, {cores()} threads", "python": platform.python_version()}
-    versions = {name: version(name) for name in ("mujoco", "numpy", "gymnasium")}
-    write_json(args.out / "speed.json", {**about, "versions": versions, "tasks": found, "envpool": peer})
+    write_json(args.out / "speed.json", {**about, "versions": identity.versions(), "tasks": found, "envpool": peer})
     picture(found, args.out / "speed.png")
     print(f"-> {args.out}")
 

@@ -8,9 +8,10 @@ and kept as soon as they are done. Stopped, it goes on where it was. The first f
 from __future__ import annotations
 
 if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
+    from deconfounded.benchmarks.console import need_checkout, stop_at_once
 
     stop_at_once()
+    need_checkout()
 
 from collections.abc import Sequence
 from dataclasses import replace

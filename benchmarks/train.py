@@ -10,7 +10,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 import os
 import platform
 import time
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from safetensors.numpy import save as to_bytes
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.files import check_file, write_atomically, write_json
 from deconfounded.experts import policy
@@ -70,10 +70,7 @@ def main() -> None:
         "episodes_scored": len(returns),
         "wall_s": round(time.time() - start, 1),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores",
-        "versions": {
-            **{name: version(name) for name in ("mujoco", "numpy", "torch", "stable-baselines3")},
-            "python": platform.python_version(),
-        },
+        "versions": identity.versions(),
     }
     write_json(file.with_suffix(".json"), card)
     if returns.mean() - random.mean() < 2 * random.std():

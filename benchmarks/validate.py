@@ -9,9 +9,10 @@ that were measured; a case that is diagnosed again takes its row's place. Interr
 from __future__ import annotations
 
 if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
+    from deconfounded.benchmarks.console import need_checkout, stop_at_once
 
     stop_at_once()
+    need_checkout()
 
 import json
 from dataclasses import replace

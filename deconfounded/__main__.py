@@ -8,29 +8,30 @@ from __future__ import annotations
 import runpy
 import sys
 
-from deconfounded.benchmarks.console import stop_at_once
+from deconfounded.benchmarks.console import quiet_pipe, stop_at_once
 
+CHECKOUT = "(in a checkout)"
 COMMANDS = {
     "run": ("benchmarks.run", "train, deploy and score methods on a task"),
     "train": ("benchmarks.train", "train a task's expert (PPO)"),
     "check": ("benchmarks.check", "does a task hold together? the contract tests"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone"),
-    "validate": ("benchmarks.validate", "is a diagnosis right, where the truth is known?"),
+    "validate": ("benchmarks.validate", f"is a diagnosis right, where the truth is known? {CHECKOUT}"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
     "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
     "report": ("benchmarks.report", "make a run's report again, without training"),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
-    "table": ("benchmarks.table", "make the records that are missing"),
-    "publish": ("benchmarks.publish", "keep a finished run in docs/"),
-    "pages": ("benchmarks.pages", "write the pages of docs/ anew"),
+    "table": ("benchmarks.table", f"make the records that are missing {CHECKOUT}"),
+    "publish": ("benchmarks.publish", f"keep a finished run in docs/ {CHECKOUT}"),
+    "pages": ("benchmarks.pages", f"write the pages of docs/ anew {CHECKOUT}"),
     "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),
     "speed": ("benchmarks.speed", "how fast environments step"),
     "growth": ("benchmarks.growth", "how cost grows"),
     "seeds": ("benchmarks.seeds", "what seeds cost side by side"),
     "cost": ("benchmarks.cost", "score against CPU seconds"),
-    "tune": ("benchmarks.tune", "the opponents' tuning"),
+    "tune": ("benchmarks.tune", f"the opponents' tuning {CHECKOUT}"),
     "spectrum": ("benchmarks.spectrum", "where delusion begins: more and less noise"),
 }
 
@@ -39,9 +40,10 @@ def main() -> None:
     """Run the command that is named first, with the arguments that follow it."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("-h", "--help"):
-        print("usage: deconf COMMAND ...\n")
-        for known, (_, text) in COMMANDS.items():
-            print(f"  {known:10} {text}")
+        with quiet_pipe():
+            print("usage: deconf COMMAND ...\n")
+            for known, (_, text) in COMMANDS.items():
+                print(f"  {known:10} {text}")
         return
     if name not in COMMANDS:
         print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)
@@ -53,7 +55,7 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise
-        extra = "train" if name == "train" else "bench"
+        extra = "train" if name == "train" else "data" if error.name == "minari" else "bench"
         print(
             f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it",
             file=sys.stderr,

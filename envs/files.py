@@ -60,13 +60,17 @@ def save_figure(figure: Any, file: Path, dpi: int) -> None:
     write_atomically(file, buffer.getvalue())
 
 
-def write_json(file: Path, data: Any) -> None:
-    """JSON, atomically. Raises InputError for NaN or infinity, which JSON does not have."""
+def as_json(file: Path, data: Any) -> str:
+    """What `write_json` writes. Raises InputError for NaN or infinity, which JSON does not have."""
     try:
-        text = json.dumps(data, indent=2, allow_nan=False)
+        return json.dumps(data, indent=2, allow_nan=False) + "\n"
     except ValueError:
         raise InputError(f"{file} would hold NaN or infinity; nothing was written") from None
-    write_atomically(file, text + "\n")
+
+
+def write_json(file: Path, data: Any) -> None:
+    """JSON, atomically. Raises InputError for NaN or infinity, which JSON does not have."""
+    write_atomically(file, as_json(file, data))
 
 
 def _digest(data: dict[str, Any]) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import shutil
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
+from deconfounded import __version__
 from deconfounded.envs import InputError, outside
-from deconfounded.envs.files import check_folder, read_sealed, write_atomically, write_sealed
+from deconfounded.envs.files import as_json, check_folder, read_sealed, sealed, write_atomically
 from deconfounded.experts.demos import Agent
 
 ARRAYS = "agent.safetensors"
@@ -24,21 +24,32 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     """Keep an agent: its class by name, its settings, its arrays; about: what else to say of it, for json.
 
     Of a class that a file brought from outside, the file is kept too, so that the folder is whole; what else that file
-    imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept.
+    imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept, and writes nothing.
     """
-    if "." in type(agent).__qualname__:
-        raise InputError(f"{type(agent).__qualname__} cannot be saved; its class must stand at the top of its file")
+    cls, file, code = type(agent), folder / "agent.json", None
+    if "." in cls.__qualname__:
+        raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
+    if cls.__module__.startswith("outside_") and (source := outside.source(cls)) is not None:
+        code = source.read_bytes()
     settings, arrays = agent.state()
+    about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
+    about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
+    try:
+        content = to_bytes(arrays)
+        about["arrays"] = hashlib.sha256(content).hexdigest()
+        described = as_json(file, sealed(about))
+    except InputError:
+        raise
+    except Exception as error:  # whatever its class takes for its state
+        raise InputError(
+            f"{cls.__qualname__} cannot be saved ({outside.told(error)}); its state() must return a dictionary for json"
+            " and one of arrays"
+        ) from None
     check_folder(folder)
-    cls, code = type(agent), outside.source(type(agent))
-    where = cls.__module__
-    if where.startswith("outside_") and code is not None:
-        shutil.copy(code, folder / CODE)
-        where = CODE
-    write_atomically(folder / ARRAYS, content := to_bytes(arrays))
-    about["versions"] = {name: version(name) for name in ("deconfounded-imitation", "numpy")}
-    about["arrays"] = hashlib.sha256(content).hexdigest()
-    write_sealed(folder / "agent.json", {"class": f"{where}:{cls.__qualname__}", "settings": settings, **about})
+    if code is not None:
+        write_atomically(folder / CODE, code)
+    write_atomically(folder / ARRAYS, content)
+    write_atomically(file, described)
 
 
 def describe(folder: Path) -> dict[str, Any]:

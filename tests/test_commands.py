@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import json
 import multiprocessing
@@ -20,7 +21,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
-from deconfounded.benchmarks import certify, commands, cost, publish
+from deconfounded.benchmarks import certify, commands, cost, data, publish
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.local import Local
@@ -104,6 +105,16 @@ def test_bad_input_is_one_line(
     told = refusal(args, monkeypatch, capsys)
     assert says in told
     assert len(told.strip().splitlines()) == 1
+
+
+def test_what_is_not_installed_is_said_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before trials are made, which takes minutes."""
+    monkeypatch.setattr(data, "find_spec", lambda name: None)
+    monkeypatch.setattr(data, "run_trials", None)
+    told = refusal(("benchmarks/data.py", "--task", "bandit", "--out", str(tmp_path)), monkeypatch, capsys)
+    assert "`pip install deconfounded-imitation[data]` brings it" in told
 
 
 def test_bad_input_from_the_shell() -> None:
@@ -274,6 +285,42 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
         with pytest.raises(SystemExit) as ended:
             run_command(main)
         assert (ended.value.code, capsys.readouterr().err) == (code, says)
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("args", "code"),
+    [
+        (("-m", "deconfounded", "--help"), 141),
+        (("benchmarks/run.py", "--list"), 141),
+        (("benchmarks/pages.py", "--help"), 0),  # argparse thinks nothing of it
+    ],
+)
+def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered: str) -> None:
+    """What nobody reads is not printed; the exit code is that of SIGPIPE."""
+    read, write = os.pipe()
+    os.close(read)
+    environ = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    command = [sys.executable, *args]
+    done = subprocess.run(command, cwd=ROOT, env=environ, stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
+def test_another_closed_pipe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as that of a process of ours that is gone."""
+
+    def main() -> None:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    read, write = os.pipe()
+    with os.fdopen(read) as reader:
+        with os.fdopen(write, "w") as writer, monkeypatch.context() as patch:
+            patch.setattr("sys.stdout", writer)
+            patch.setattr("sys.stderr", writer)
+            with pytest.raises(SystemExit) as ended:
+                run_command(main)
+        assert (ended.value.code, reader.read()) == (2, "error: file: Broken pipe\n")
 
 
 class TestFiles:

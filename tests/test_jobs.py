@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import queue
 from collections.abc import Iterator
 from dataclasses import replace
@@ -16,7 +17,6 @@ from deconfounded.benchmarks import paper
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import figures
 from deconfounded.benchmarks.paper import FigureJob
 from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.recurrent import RecurrentConfig
@@ -119,10 +119,12 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert found["naive_rnn"]["target"] == "conditional"
     gap = np.abs(np.array(found["naive_rnn"]["online"]) - references["conditional"]["online"]).max()
     assert found["naive_rnn"]["max_gap_online"] == pytest.approx(gap, abs=2e-4)
-    assert "20 exploration trials" in paper.table(found)
-    figures.figure_2(task, tmp_path / "2.png")
-    figures.figure_3(finished, references, tmp_path / "3.png")
-    assert (tmp_path / "3.png").stat().st_size > 10_000
+    assert "20 exploration trials" in paper.write(task, {"set": []}, finished, references, tmp_path)
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["methods"] == found
+    assert results["wall_s"] > 0
+    assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + len(finished)
+    assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("figure2", "figure3", "tiers"))
 
 
 def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.metadata
 import json
 import multiprocessing
 import multiprocessing.forkserver
@@ -29,6 +30,7 @@ from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import naive_rnn, wire
 from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.envs import outside
 from deconfounded.envs.files import write_sealed
 from deconfounded.experts import policy, saved
 from deconfounded.experts.demos import Trials, run_trials
@@ -573,6 +575,39 @@ class TestSaved:
         agent.reset([np.random.default_rng(0)])
         with pytest.raises(envs.InputError, match="set its `side`"):
             agent.act(np.zeros((1, 6), np.float32))
+
+    def test_without_metadata(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A checkout on PYTHONPATH, that was never installed, keeps agents too."""
+
+        def missing(name: str) -> Any:
+            raise importlib.metadata.PackageNotFoundError(name)
+
+        monkeypatch.setattr(importlib.metadata, "distribution", missing)
+        agent = MAKERS["blind_bc"](Context(envs.get("bandit"), tiny_preset(), [0]))["blind_bc"]
+        assert isinstance(agent, LearnedAgent)
+        agent.save(tmp_path)
+        assert saved.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
+        assert isinstance(deconfounded.load(tmp_path), type(agent))
+
+    @pytest.mark.parametrize(
+        ("state", "says"),
+        [
+            ('{"sign": np.int64(1)}, {}', "int64 is not JSON serializable"),
+            ('{"sign": np.nan}, {}', "would hold NaN or infinity"),
+            ('{}, {"size": [1.0]}', "must return a dictionary for json and one of arrays"),
+        ],
+    )
+    def test_what_cannot_be_kept_leaves_nothing(self, tmp_path: Path, state: str, says: str) -> None:
+        """Not half an agent."""
+        text = f"""
+class Odd(Still):
+    def state(self): return {state}
+"""
+        (tmp_path / "odd.py").write_text(HEAD + text)
+        agent = outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")()
+        with pytest.raises(envs.InputError, match=says):
+            saved.save(agent, tmp_path / "kept")
+        assert not (tmp_path / "kept").exists()
 
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
         """It is kept with its code, and does not need the file it came from."""

@@ -354,11 +354,11 @@ class TestVerify:
         monkeypatch.setattr("sys.argv", ["verify", "bandit", "blind_bc", "3", "--records", str(tmp_path)])
         verify.main()
         assert capsys.readouterr().out.endswith("bandit blind_bc 3: same bits\n")
-        records.write(tmp_path, [{**record, "returns": [99.0], "bits": "0" * 64, "commit": None}])
+        records.write(tmp_path, [{**record, "returns": [99.0], "bits": "0" * 64, "commit": "0" * 40}])
         with pytest.raises(SystemExit) as ended:
             verify.main()
         assert ended.value.code == 1
-        assert "not the same\n    commit: None, now " in capsys.readouterr().out
+        assert "not the same\n    commit: 0000" in capsys.readouterr().out
 
     def test_which_record(self, job: BenchmarkJob, tmp_path: Path) -> None:
         one, two = kept(job)
