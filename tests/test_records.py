@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import platform
 import queue
 import shutil
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +80,16 @@ class TestIdentity:
             policy, "version", lambda task, *rest: 7 if task.name == "curling" else version(task, *rest)
         )
         assert stale() == [True, True, False, False]
+
+    def test_the_version_of_mujoco_is_that_of_what_steps(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Since 4 the package `mujoco` may be of another version than `mujoco-core`, or not there."""
+
+        def version(name: str) -> str:
+            raise PackageNotFoundError(name)
+
+        monkeypatch.setattr(identity, "version", version)
+        monkeypatch.setattr("mujoco.__version__", "4.5.6")
+        assert identity.versions() == {"python": platform.python_version(), "mujoco": "4.5.6"}
 
     def test_an_outside_task_is_its_text(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of its file, modules and packages beside it, its MJCF and what that includes; comments are no matter."""

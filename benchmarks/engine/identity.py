@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.pool import Job
 
 PROTOCOL = 1  # of seeding, roll-outs, what methods are handed, and what is measured of an agent
-LIBRARIES = ("mujoco", "dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
+LIBRARIES = ("dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
 AMOUNTS = {  # of a preset, by what a method uses
     "demonstrations": ("expert_trials", "fresh"),
     "exploration": ("explore_trials",),
@@ -75,8 +75,10 @@ def expert(task: envs.Task, source: str | None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of Python, and of the installed libraries that results depend on."""
-    installed = {"python": platform.python_version()}
+    """Of Python, of the MuJoCo that steps (since 4, a package's version need not be its), and of other libraries."""
+    import mujoco  # not before envs, which sets MUJOCO_GL aside
+
+    installed = {"python": platform.python_version(), "mujoco": mujoco.__version__}
     for name in LIBRARIES:
         try:
             installed[name] = version(name)
