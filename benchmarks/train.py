@@ -52,6 +52,7 @@ def main() -> None:
     progress = Progress(args.steps, "training")
     weights = train(task, args.steps, args.seed, progress.update)
     progress.close()
+    number = policy.version(task, file) + 1
     file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
     write_atomically(file, to_bytes(weights))
     env = envs.BatchEnv(task, 256)
@@ -60,6 +61,7 @@ def main() -> None:
     card = {
         "task": task.name,
         "task_version": task.version,
+        "version": number,
         "sha256": policy.fingerprint(task, file),
         "command": f"deconf train --task {args.task} --steps {args.steps} --seed {args.seed}",
         "algorithm": "PPO (stable-baselines3), privileged view, 64 environments, tanh networks of 64 x 64",

@@ -9,15 +9,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import tune
+from deconfounded.benchmarks import publish, tune
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import browser, index, pages, records, report, score, statistics
+from deconfounded.benchmarks.output import browser, gap, index, pages, records, report, score, statistics
 from deconfounded.benchmarks.output.answers import answers
+from deconfounded.envs.files import mark, mark_of, save_figure
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -447,3 +450,35 @@ def test_commands_of_numbers() -> None:
     assert pages.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"
     assert pages.command(task, results, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
     assert pages.command(task, results, "expert") == pages.command(task, results)
+
+
+def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
+    """And not otherwise, nor for another comment in the code that draws them."""
+    file, drawn = tmp_path / "gap.png", list[int]()
+
+    def draw(data: list[tuple[str, float, float]], file: Path, mark: str) -> None:
+        drawn.append(len(data))
+        gap.picture(data, file, mark=mark)
+
+    for data in ([("a", 0.1, 0.2)], [("a", 0.1, 0.2)], [("a", 0.1, 0.3)], [("a", 0.1, 0.3)]):
+        pages.redraw(file, draw, data)
+    assert drawn == [1, 1]
+    save_figure(plt.figure(), file, 50)
+    assert mark_of(file) == mark_of(tmp_path / "nowhere.png") == ""
+    pages.redraw(file, draw, data)
+    assert drawn == [1, 1, 1]
+
+
+def test_a_clip_of_the_same_film_is_not_encoded_anew(tmp_path: Path) -> None:
+    """Its mark says of which film it is; a copy is made only where that differs."""
+    frames = np.zeros((6, 16, 16, 3), np.uint8)
+    imageio.imwrite(tmp_path / "video.mp4", frames)
+    for name, film in (("one", "a"), ("two", "a"), ("three", "b")):
+        publish.clip(tmp_path / "video.mp4", tmp_path / f"{name}.webp", mark(film))
+    one, two, three = ((tmp_path / f"{name}.webp") for name in ("one", "two", "three"))
+    assert mark_of(one) == mark_of(two) == mark("a") != mark_of(three)
+    before = one.stat().st_mtime_ns
+    publish.copy(two, one)
+    assert one.stat().st_mtime_ns == before
+    publish.copy(three, one)
+    assert mark_of(one) == mark("b")

@@ -26,8 +26,9 @@ OFFLINE = ("--no-deps", "--no-index")
 
 
 def files(folder: Path) -> set[str]:
-    """All but bytecode, which anybody may leave."""
+    """All but bytecode and locks, which anybody may leave."""
     found = (file for file in folder.rglob("*") if not file.is_dir() and "__pycache__" not in file.parts)
+    found = (file for file in found if file.name != ".lock")
     return {str(file.relative_to(folder)) for file in found}
 
 

@@ -59,6 +59,7 @@ def picture(
     foretold: str = FORETOLD,
     hues: Sequence[str] | None = None,
     hollow: Sequence[bool] | None = None,
+    mark: str = "",
 ) -> None:
     """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ.
 
@@ -80,5 +81,5 @@ def picture(
     axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
     axes.margins(0.14, 0.08)
     axes.set_title("what cloning loses, score in the last episode", fontsize=11)
-    save_figure(figure, file, 100)
+    save_figure(figure, file, 100, mark)
     plt.close(figure)

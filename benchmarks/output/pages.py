@@ -9,18 +9,20 @@ docs/spectrum.md (of spectrum.json, which is `spectrum.py`'s).
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import cards, gap, index, records, score, spectra, validated
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.cards import DOCS, TIERS, kept, markdown_table, nats
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.files import mark, mark_of, write_atomically
 
 README = DOCS.parent / "README.md"
 SUMMARY = (
@@ -332,11 +334,22 @@ def texts(found: index.Found) -> dict[Path, str]:
 
 
 def write() -> str:
-    """Bring all of them up to date, and their pictures. Returns README's table of results."""
+    """Bring all of them up to date, and their pictures; what has not changed is not written.
+
+    Returns README's table of results.
+    """
     found = published()
     for file, text in texts(found).items():
-        write_atomically(file, text)
-    gap.picture([(one.task.name, *one[1:]) for one in _gaps(found)], DOCS / "gap.png")
-    validated.picture(_validated(), DOCS / "diagnose" / "validation.png")
-    spectra.picture(_spectrum()["points"], DOCS / "spectrum.png")
+        if file.read_text(encoding="utf-8") != text:
+            write_atomically(file, text)
+    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in _gaps(found)])
+    redraw(DOCS / "diagnose" / "validation.png", validated.picture, _validated())
+    redraw(DOCS / "spectrum.png", spectra.picture, _spectrum()["points"])
     return summary(found)
+
+
+def redraw(file: Path, draw: Callable[..., None], data: Any) -> None:
+    """Draw a picture of data (json) again, if these or the module that draws it have changed since it was drawn."""
+    made_of = mark(data, sources.of_code(draw))
+    if mark_of(file) != made_of:
+        draw(data, file, mark=made_of)

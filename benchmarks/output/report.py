@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.jobs import CLIPPED
 from deconfounded.benchmarks.engine.pool import Finished
@@ -22,7 +23,7 @@ from deconfounded.benchmarks.output import film, records, score
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
 from deconfounded.envs import outside
-from deconfounded.envs.files import save_figure, write_atomically, write_json
+from deconfounded.envs.files import mark, save_figure, write_atomically, write_json
 
 
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
@@ -66,6 +67,8 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
     """Score over the episodes of a trial, each method a line in its 95% band; later episodes than trained on shaded."""
+    drawn = ("score", "score_beyond", "band")
+    data = {name: [entry.get(key) for key in drawn] for name, entry in results["methods"].items()}
     figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
     trained = 0
     for name, entry in results["methods"].items():
@@ -85,7 +88,7 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
-    save_figure(figure, file, 110)
+    save_figure(figure, file, 110, mark(results["task"], data, sources.of_code(adaptation)))
     plt.close(figure)
 
 

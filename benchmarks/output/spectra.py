@@ -55,7 +55,7 @@ def table(points: list[Point]) -> str:
     return markdown_table(("task", "noise", "times", *told, *EXACT, *LEARNED), rows)
 
 
-def picture(points: list[Point], file: Path) -> None:
+def picture(points: list[Point], file: Path, mark: str = "") -> None:
     """A column for each task and kind of noise: scores above, evidence below."""
     import matplotlib
 
@@ -95,5 +95,5 @@ def picture(points: list[Point], file: Path) -> None:
     panels[1, 0].set_ylabel("evidence of theta, nats a step")
     panels[0, 0].legend(frameon=False, fontsize=8)
     panels[1, 0].legend(frameon=False, fontsize=8)
-    save_figure(figure, file, 100)
+    save_figure(figure, file, 100, mark)
     plt.close(figure)

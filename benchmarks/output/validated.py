@@ -53,9 +53,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     return markdown_table(("task", "certificate", "diagnosis", "", *FIGURES, "predicted gap", "measured"), lines)
 
 
-def picture(rows: list[dict[str, Any]], file: Path) -> None:
+def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
     """A dot a case: red where the certificate is passed, hollow where the thresholds were set without it."""
     names = [row["task"].replace("_process_", " x").replace("x0_", "x.").replace("0_", ".") for row in rows]
     points = [(name, row["predicted"], row["measured"]) for name, row in zip(names, rows, strict=True)]
     hues = ["tab:red" if row["certified"] else "tab:green" for row in rows]
-    gap.picture(points, file, "the diagnosis", hues, [_unseen(row) for row in rows])
+    gap.picture(points, file, "the diagnosis", hues, [_unseen(row) for row in rows], mark)
