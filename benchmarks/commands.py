@@ -1,4 +1,4 @@
-"""What run.py and paper.py share: their arguments, the checks of these, and what a run says of itself."""
+"""Commands that train methods share this: arguments, their checks, the engine, and the description of a run."""
 
 from __future__ import annotations
 

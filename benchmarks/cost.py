@@ -1,8 +1,7 @@
 """What learning costs: `python benchmarks/cost.py --task slippery_cartpole`
 
 Score in the last episode against CPU seconds, for each learned method, with shares of the default preset's updates. How
-its amounts were chosen: where the curve is flat, a smaller share does. Points of older code, in docs/speed/before.json,
-are drawn beside.
+its amounts were chosen: where the curve is flat, a smaller share does.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +25,6 @@ from deconfounded.envs.files import save_figure, write_json
 from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)
-BEFORE = Path(__file__).resolve().parents[1] / "docs" / "speed" / "before.json"
 LEARNED = tuple(name for name, method in METHODS.items() if method.learned and name != "deconfounded_gru")
 
 
@@ -37,8 +34,8 @@ def scaled(config: Any, share: float) -> Any:
     return replace(config, **{name: max(1, round(getattr(config, name) * share)) for name in counts})
 
 
-def picture(task: str, found: dict[str, Any], before: dict[str, Any], file: Path) -> None:
-    """A panel a method: score against CPU seconds, a dot a share; older code's as a cross."""
+def picture(task: str, found: dict[str, Any], file: Path) -> None:
+    """A panel a method: score against CPU seconds, a dot a share."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -53,8 +50,6 @@ def picture(task: str, found: dict[str, Any], before: dict[str, Any], file: Path
             cpu, [np.mean(one) for one in scores], "o-", color="tab:blue", label="1/4, 1/2 and all of the updates"
         )
         axes.vlines(cpu, [min(one) for one in scores], [max(one) for one in scores], color="tab:blue", alpha=0.4)
-        if method in before:
-            axes.plot(before[method]["cpu_s"], before[method]["score"], "x", ms=9, color="black", label="f112891")
         axes.set(title=method, xlabel="CPU seconds a seed", xlim=(0, None), ylim=(-0.05, 1.1))
     panels.flat[0].set_ylabel("score, last episode")
     panels.flat[0].legend(frameon=False, fontsize=8)
@@ -96,8 +91,7 @@ def main() -> None:
             found[method][f"{share:g}"] = {"cpu_s": results[method]["cpu_s"], "scores": last.round(4).tolist()}
             print(f"{method:22} {share:5g} of the updates: {results[method]['cpu_s']:6.1f} CPU s, {last.mean():.3f}")
     write_json(folder / "cost.json", {"task": task.name, "seeds": args.seeds, "methods": found})
-    before = json.loads(BEFORE.read_bytes()).get(task.name, {}) if BEFORE.is_file() else {}
-    picture(task.name, found, before, folder / "cost.png")
+    picture(task.name, found, folder / "cost.png")
     print(f"-> {folder / 'cost.png'}")
 
 

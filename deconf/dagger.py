@@ -72,8 +72,8 @@ class DaggerAgent(LearnedAgent):
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DaggerAgent:
-        change = copy.deepcopy(obs)
-        return cls.new(shape["width"], shape["latent"], shape["forgets"], signature, obs, change, draws)
+        sizes = (shape["width"], shape["latent"], shape["forgets"])
+        return cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
 
     def shape(self) -> dict[str, Any]:
         return {"width": 4 * self.memory.width, "latent": self.latent, "forgets": self.forgets}

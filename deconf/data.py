@@ -108,6 +108,13 @@ def take_steps(x: Tensor, index: Tensor) -> Tensor:
     return take(x.flatten(1, 2), index)
 
 
+def extent(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest value [S, 1, F] of x [S, B, T, F] where mask [S, B, T] is not 0."""
+    padding = mask[..., None] == 0
+    low, high = x.masked_fill(padding, torch.inf).amin((1, 2)), x.masked_fill(padding, -torch.inf).amax((1, 2))
+    return low[:, None], high[:, None]
+
+
 @dataclass
 class Batch:
     """Trials of S seeds as tensors: the steps that took place, episodes joined end to end and padded at the end.

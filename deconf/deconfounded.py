@@ -80,8 +80,8 @@ class DeconfoundedAgent(LearnedAgent):
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DeconfoundedAgent:
-        change = copy.deepcopy(obs)
-        agent = cls.new(shape["model"], shape["latent"], shape["width"], signature, obs, change, draws)
+        sizes = (shape["model"], shape["latent"], shape["width"])
+        agent = cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
         agent.resample = shape["resample"]
         return agent
 

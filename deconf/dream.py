@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.agents import LearnedAgent
-from deconfounded.deconf.data import Batch, Draws, take
+from deconfounded.deconf.data import Batch, Draws, extent, take
 from deconfounded.deconf.endings import Endings
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.models import VariationalModel
@@ -106,12 +106,9 @@ def farther(rivals: Tensor, known: Tensor, draws: Draws) -> Tensor:
 
 def seen_range(*data: Batch) -> tuple[Tensor, Tensor]:
     """Least and largest observation [S, 1, O] of trials [S, B, T]."""
-    low, high = [], []
-    for some in data:
-        padding, both = some.mask[..., None] == 0, (some.obs, some.next_obs)
-        low += [obs.masked_fill(padding, torch.inf).amin((1, 2)) for obs in both]
-        high += [obs.masked_fill(padding, -torch.inf).amax((1, 2)) for obs in both]
-    return torch.stack(low).amin(0)[:, None], torch.stack(high).amax(0)[:, None]
+    ends = [extent(obs, batch.mask) for batch in data for obs in (batch.obs, batch.next_obs)]
+    low, high = (torch.stack(values) for values in zip(*ends, strict=True))
+    return low.amin(0), high.amax(0)
 
 
 def known_range(held: Batch) -> tuple[Tensor, Tensor]:

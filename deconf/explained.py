@@ -15,7 +15,7 @@ from deconfounded.deconf.cloning import CloningConfig
 from deconfounded.deconf.data import Batch, Draws, Signature, take
 from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig, final_belief
 from deconfounded.deconf.dream import known_range
-from deconfounded.deconf.equations import gaussian_kl, inference_loss, masked_mean
+from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.models import VariationalModel
 from deconfounded.deconf.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.offline import OfflineConfig
@@ -124,13 +124,9 @@ def _dynamics(
         belief = model.belief(model.last(known))
         index = rest.draw_steps(how.inference_steps, draws)
         real, trial = rest.steps(index), index // batch.mask.shape[2]
-        log_next = model.dynamics.log_prob(
-            real.obs, real.action, real.next_obs, take(model.sample(belief, draws), trial)
-        )[..., 0]
-        centre, std = belief.chunk(2, -1)
-        kl = take(gaussian_kl(centre, std, *model.encoder.prior(centre)), trial)
+        theta_hat, centre, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
-        loss = inference_loss(log_next, kl, beta, real.mask)
+        loss = model.bound(real, centre, std, theta_hat, beta)
         model.eval()
         optimizer.step(loss)
         monitor.update(update + 1, how.inference_updates, {"inference": loss.mean().item()})

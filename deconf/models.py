@@ -126,7 +126,10 @@ class VariationalModel(LatentModel):
         real = batch.steps(index)
         memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
         mean, std = self.encoder.posterior(take(memories, index))
-        theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+        return self.bound(real, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
+
+    def bound(self, real: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
+        """The negative of Eq. (6) [S], of steps [S, K]: beliefs N(mean, std^2) about each, latents drawn from them."""
         log_next = self.dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)[..., 0]
         kl = gaussian_kl(mean, std, *self.encoder.prior(mean))
         return inference_loss(log_next, kl, beta, real.mask)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.agents import Monitor, ramp
-from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.data import Batch, Draws, Rngs, Signature, extent, listed, take
 from deconfounded.deconf.deconfounded import DeconfoundedAgent, final_belief
 from deconfounded.deconf.drift import apart, choose_kept
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
@@ -122,9 +122,7 @@ def synthesise(
     range of observations in which the expert acted, another begins: the dynamics were not learned there, and what they
     would say of the latent is noise.
     """
-    n, padding = config.synthetic, expert.mask[..., None] == 0
-    low = expert.obs.masked_fill(padding, torch.inf).amin((1, 2))[:, None]
-    high = expert.obs.masked_fill(padding, -torch.inf).amax((1, 2))[:, None]
+    n, (low, high) = config.synthetic, extent(expert.obs, expert.mask)
     theta_hat = take(latents, draws.below(latents.shape[1], n))
     obs, other = starts[:, :1], latents[:, :1]  # replaced at once
     over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)

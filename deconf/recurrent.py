@@ -1,4 +1,4 @@
-"""A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) and its training by likelihood: for naive_rnn and for dagger."""
+"""A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) and its training by likelihood: naive_rnn's."""
 
 from __future__ import annotations
 
@@ -86,18 +86,13 @@ class RecurrentAgent(LearnedAgent):
 class Cloner:
     """Trains an agent by likelihood: passes through trials, an update a chunk, the memory passed on between chunks.
 
-    Passes are shared out over `rounds`, number i (from 1) in proportion to i: `passes` counts each round's, `done`
-    counts all updates so far.
+    `done` and `total` count updates; there is at least one pass.
     """
 
-    def __init__(
-        self, agent: RecurrentAgent, config: RecurrentConfig, steps: int, monitor: Monitor, rounds: int = 1
-    ) -> None:
+    def __init__(self, agent: RecurrentAgent, config: RecurrentConfig, steps: int, monitor: Monitor) -> None:
         self.agent, self.chunk, self.monitor, self.done = agent, config.chunk, monitor, 0
         self.chunks = -(-steps // config.chunk)
-        share = config.updates / (self.chunks * rounds * (rounds + 1) / 2)
-        self.passes = [max(1, round(share * i)) for i in range(1, rounds + 1)]
-        self.total = sum(self.passes) * self.chunks
+        self.total = max(1, round(config.updates / self.chunks)) * self.chunks
         cooled = self.total if config.cooled else None
         self.optimizer = Adam([agent.memory, agent.policy], config.learning_rate, cooled)
 

@@ -21,7 +21,7 @@ from deconfounded.envs.task import ASSETS, Array
 
 
 class Random(Protocol):
-    """What is drawn from: a numpy generator, or demos.Streams, whose rows are in `groups` equal groups."""
+    """What is drawn from: a numpy generator, or `envs.streams.Streams`, whose rows are in `groups` equal groups."""
 
     def random(self, size: tuple[int, ...]) -> Array: ...
     def standard_normal(self, size: tuple[int, ...]) -> Array: ...
