@@ -29,14 +29,14 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.score import normalise
-from deconfounded.deconf import cloning
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
+from deconfounded.deconf.methods import cloning
 from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 from deconfounded.experts.policy import Expert
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 
 EPISODES = 5
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")

@@ -14,9 +14,9 @@ import sys
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
-from deconfounded.envs.check import check_task, sentence
-from deconfounded.envs.contract import CONTRACT
-from deconfounded.envs.probe import Skipped
+from deconfounded.envs.contract.check import check_task, sentence
+from deconfounded.envs.contract.core import CONTRACT
+from deconfounded.envs.contract.probe import Skipped
 
 
 def main() -> None:

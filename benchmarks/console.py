@@ -68,13 +68,11 @@ def escape_output() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as Python's own for standard error
 
 
-def need_checkout() -> None:
-    """End this process with one line and exit code 2 where there is no source tree, but an installed package."""
+def need_checkout(name: str) -> None:
+    """End a command with one line and exit code 2 where there is no source tree, but an installed package."""
     if not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
-        name = Path(sys.argv[0]).stem
         print(
-            f"error: {name} reads and writes docs/ of a checkout, and {ROOT} is none; clone the repository, and run it"
-            " there",
+            f"error: {name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there",
             file=sys.stderr,
         )
         sys.exit(2)

@@ -18,8 +18,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.envs.files import check_folder
-from deconfounded.experts import dataset, policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts import datasets, policy
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 
 
 def main() -> None:
@@ -48,8 +48,8 @@ def main() -> None:
     low, high = (float(run_trials(env, make(env), 1, args.seed)[1].mean()) for make in behaviours.values())
     kind = "random" if args.explore else "expert"
     seed = stream(EXPLORATION if args.explore else DEMOS, args.seed)
-    collected = dataset.collect(task, args.trials, behaviours[kind], seed)
-    written = dataset.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
+    collected = datasets.collect(task, args.trials, behaviours[kind], seed)
+    written = datasets.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
     print(f"{task.name}: {args.trials} trials, sha256 {collected[0].sha256} -> {written}")
 
 

@@ -25,14 +25,14 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.diagnose import Diagnosis
-    from deconfounded.deconf.findings import Amounts, Findings
-    from deconfounded.experts.demos import Trials
+    from deconfounded.deconf.diagnosis.diagnose import Diagnosis
+    from deconfounded.deconf.diagnosis.measures import Amounts, Findings
+    from deconfounded.experts.rollout import Trials
 
 
 def trials_of(source: Path) -> Trials:
     """What a file or a data set's folder holds. Raises InputError if that is no trials."""
-    from deconfounded.experts.demos import Trials
+    from deconfounded.experts.rollout import Trials
 
     if not source.exists():
         raise envs.InputError(f"there is no {source}; give a Minari data set's folder, or an .npz of Trials.save")
@@ -67,7 +67,7 @@ class Refit:
 
     def found(self) -> Findings | None:
         """What was measured, if it was of the same."""
-        from deconfounded.deconf.findings import Findings
+        from deconfounded.deconf.diagnosis.measures import Findings
 
         try:
             kept = json.loads(self.file.read_bytes())
@@ -80,7 +80,7 @@ class Refit:
         import numpy as np
 
         from deconfounded.benchmarks.engine import pool
-        from deconfounded.deconf.findings import measure
+        from deconfounded.deconf.diagnosis.measures import measure
 
         start, told = time.time(), 0
 
@@ -107,7 +107,7 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
     from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.pool import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
-    from deconfounded.deconf.diagnose import VERSION, DiagnoseConfig, check, judge
+    from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check, judge
 
     config, start = DiagnoseConfig(), time.time()
     check(trials, explore, config)

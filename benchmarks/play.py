@@ -20,16 +20,16 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import jobs
 from deconfounded.benchmarks.engine.guest import Stranger
-from deconfounded.deconf.agents import LearnedAgent
-from deconfounded.deconf.cloning import MemorylessAgent
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.methods.cloning import MemorylessAgent
 from deconfounded.envs.files import check_file
-from deconfounded.experts import saved
-from deconfounded.experts.demos import Agent
+from deconfounded.experts import store
+from deconfounded.experts.rollout import Agent
 
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    about, agent = saved.describe(folder), deconfounded.load(folder)
+    about, agent = store.describe(folder), deconfounded.load(folder)
     ours, theirs = jobs.spaces(task), about.get("spaces")
     if theirs not in (None, ours):
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")

@@ -21,7 +21,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.files import check_file, write_atomically, write_json
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
 
 STEPS = 3_000_000
 
@@ -46,7 +46,7 @@ def main() -> None:
         raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
     envs.check_task(task)
     check_file(file)
-    from deconfounded.experts.ppo import PPO_SETTINGS, train  # it takes seconds; bad input is told at once
+    from deconfounded.experts.train import PPO_SETTINGS, train
 
     start = time.time()
     progress = Progress(args.steps, "training")

@@ -18,11 +18,10 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import ROOT, Parser, run_command
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
-from deconfounded.benchmarks.output.cards import DOCS
 from deconfounded.envs import outside
 
 COMPARED = ("commit", "machine", "expert", "outside", "protocol", "task_version", "method_version", "expert_version")
@@ -94,7 +93,7 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
-    file = args.records or DOCS / "records"
+    file = args.records or ROOT / "docs" / "records"
     file = file / records.place(task.name) if file.is_dir() else file
     record = pick(file, method, args.seed)
     if record["job"] not in METHODS:

@@ -4,6 +4,6 @@ Importing it sets torch to one thread, since the networks are small and more thr
 `torch.set_num_threads` afterwards for networks of your own that are not.
 """
 
-from deconfounded.deconf.nets import prepare_torch
+from deconfounded.deconf.core.nets import prepare_torch
 
 prepare_torch()

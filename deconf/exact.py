@@ -16,8 +16,8 @@ from deconfounded.deconf.equations import belief_update
 from deconfounded.envs import BatchEnv, MujocoTask
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.task import Simulator
-from deconfounded.experts.demos import Agent
 from deconfounded.experts.policy import Expert, sample_rows
+from deconfounded.experts.rollout import Agent
 
 LEFT_OUT = 1e-4  # of the mass: a value that has less is not simulated
 AT_LEAST = 2

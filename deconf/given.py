@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from deconfounded.deconf.wire import pack
 from deconfounded.envs.task import InputError
-from deconfounded.experts.demos import Agent, Trials
+from deconfounded.experts.rollout import Agent, Trials
 
 ANSWERED = ("act", "features")
 USES = {

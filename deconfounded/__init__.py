@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from deconfounded.experts.demos import Agent
+    from deconfounded.experts.rollout import Agent
 
 
 def load(folder: Path | str) -> Agent:
     """The agent that `agent.save(folder)` or a run left in a folder; see `experts.saved`."""
-    from deconfounded.experts import saved
+    from deconfounded.experts import store
 
-    return saved.load(folder)
+    return store.load(folder)

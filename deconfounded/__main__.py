@@ -8,31 +8,31 @@ from __future__ import annotations
 import runpy
 import sys
 
-from deconfounded.benchmarks.console import quiet_pipe, stop_at_once
+from deconfounded.benchmarks.console import need_checkout, quiet_pipe, stop_at_once
 
-CHECKOUT = "(in a checkout)"
+STUDIES = "benchmarks.studies."  # of a checkout alone: they make this repository's own pages
 COMMANDS = {
     "run": ("benchmarks.run", "train, deploy and score methods on a task"),
     "train": ("benchmarks.train", "train a task's expert (PPO)"),
     "check": ("benchmarks.check", "does a task hold together? the contract tests"),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone"),
-    "validate": ("benchmarks.validate", f"is a diagnosis right, where the truth is known? {CHECKOUT}"),
+    "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?"),
     "play": ("benchmarks.play", "run a kept agent in one environment"),
-    "score": ("benchmarks.rescore", "score a kept agent on fresh thetas, or a range never seen"),
+    "score": ("benchmarks.score", "score a kept agent on fresh thetas, or a range never seen"),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
     "report": ("benchmarks.report", "make a run's report again, without training"),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
-    "table": ("benchmarks.table", f"make the records that are missing {CHECKOUT}"),
-    "publish": ("benchmarks.publish", f"keep a finished run in docs/ {CHECKOUT}"),
-    "pages": ("benchmarks.pages", f"write the pages of docs/ anew {CHECKOUT}"),
-    "paper": ("benchmarks.paper", "figures 2 and 3 of the paper"),
-    "speed": ("benchmarks.speed", "how fast environments step"),
-    "growth": ("benchmarks.growth", "how cost grows"),
-    "seeds": ("benchmarks.seeds", "what seeds cost side by side"),
-    "cost": ("benchmarks.cost", "score against CPU seconds"),
-    "tune": ("benchmarks.tune", f"the opponents' tuning {CHECKOUT}"),
-    "spectrum": ("benchmarks.spectrum", "where delusion begins: more and less noise"),
+    "table": ("benchmarks.studies.table", "make the records that are missing"),
+    "publish": ("benchmarks.studies.publish", "keep a finished run in docs/"),
+    "pages": ("benchmarks.studies.pages", "write the pages of docs/ anew"),
+    "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper"),
+    "speed": ("benchmarks.studies.speed", "how fast environments step"),
+    "growth": ("benchmarks.studies.growth", "how cost grows"),
+    "seeds": ("benchmarks.studies.seeds", "what seeds cost side by side"),
+    "cost": ("benchmarks.studies.cost", "score against CPU seconds"),
+    "tune": ("benchmarks.studies.tune", "the opponents' tuning"),
+    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise"),
 }
 
 
@@ -42,12 +42,14 @@ def main() -> None:
     if name in ("-h", "--help"):
         with quiet_pipe():
             print("usage: deconf COMMAND ...\n")
-            for known, (_, text) in COMMANDS.items():
-                print(f"  {known:10} {text}")
+            for command, (module, text) in COMMANDS.items():
+                print(f"  {command:10} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
         return
     if name not in COMMANDS:
         print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(2)
+    if COMMANDS[name][0].startswith(STUDIES):
+        need_checkout(name)
     stop_at_once()
     sys.argv = [f"deconf {name}", *sys.argv[2:]]
     try:

@@ -16,7 +16,7 @@ if _gl is not None:
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
-from deconfounded.envs.check import check_task
+from deconfounded.envs.contract.check import check_task
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.registry import (
     TASKS,

@@ -33,10 +33,10 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context,
 from deconfounded.benchmarks.engine.jobs import Recorder
 from deconfounded.benchmarks.engine.presets import CONFIGS, Preset, preset
 from deconfounded.benchmarks.output import index, score, statistics
-from deconfounded.deconf import diagnose, findings
+from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.envs.files import write_atomically
 from deconfounded.experts import policy
-from deconfounded.experts.demos import RandomAgent, run_trials
+from deconfounded.experts.rollout import RandomAgent, run_trials
 from tests import toys
 
 FILE = Path(__file__).with_suffix(".json")
@@ -252,7 +252,7 @@ def of_diagnosis(name: str) -> Numbers:
         amounts = few(diagnose.DiagnoseConfig().amounts, ("cloning", "naive", "offline", "exploring"))
         amounts = replace(amounts, rivals=4, dreams=8)
         measured = {
-            label: findings.measure(trials, exploration, amounts, np.random.default_rng(5))
+            label: measures.measure(trials, exploration, amounts, np.random.default_rng(5))
             for label, exploration in (("with exploration", explored), ("of expert trials alone", None))
         }
     return {
@@ -280,7 +280,7 @@ KINDS: dict[str, Kind] = {
     ),
     "protocol": (of_protocol, lambda name: identity.PROTOCOL, ["all"], "PROTOCOL in benchmarks/engine/identity.py"),
     "scores": (of_scores, lambda name: score.VERSION, ["all"], "VERSION in benchmarks/output/score.py"),
-    "diagnosis": (of_diagnosis, lambda name: diagnose.VERSION, ["all"], "VERSION in deconf/diagnose.py"),
+    "diagnosis": (of_diagnosis, lambda name: diagnose.VERSION, ["all"], "VERSION in deconf/diagnosis/diagnose.py"),
 }
 EVERY = [f"{kind}:{name}" for kind, (_, _, names, _) in KINDS.items() for name in names]
 

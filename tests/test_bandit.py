@@ -9,7 +9,7 @@ from deconfounded import envs
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, run_trials
+from deconfounded.experts.rollout import ExpertAgent, run_trials
 
 N = 20_000
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
-from deconfounded.envs.contract import CONTRACT
+from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.physics import Edit, ModelEdit
 from deconfounded.envs.streams import Streams
 from deconfounded.envs.task import Array
@@ -334,7 +334,7 @@ def test_an_expert_trained_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     monkeypatch.setattr("sys.argv", ["command", "--task", task.name, "--out", str(file)])
     for bias in (0.0, 0.1):
         weights = {"0.weight": np.zeros((1, 7), np.float32), "0.bias": np.full(1, bias, np.float32)}
-        monkeypatch.setattr("deconfounded.experts.ppo.train", lambda *_, weights=weights: weights)
+        monkeypatch.setattr("deconfounded.experts.train.train", lambda *_, weights=weights: weights)
         train.main()
     kept = policy.load(task, file).mean(np.zeros((1, 6), np.float32), np.zeros((1, 1)))
     np.testing.assert_allclose(kept, 0.1, rtol=1e-6)

@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine import catalogue, identity, pool, sources
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.engine.pool import DemonstrationJob, Job
-from deconfounded.deconf.agents import Training
+from deconfounded.deconf.core.agents import Training
 from deconfounded.envs import outside
 from tests.tools import processes, tiny_preset
 
@@ -32,7 +32,7 @@ from pathlib import Path
 
 import beside
 from deconfounded.deconf.given import uses
-from deconfounded.experts.demos import RandomAgent
+from deconfounded.experts.rollout import RandomAgent
 
 
 @uses("demonstrations")

@@ -21,11 +21,12 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
-from deconfounded.benchmarks import certify, commands, cost, data, publish
+from deconfounded.benchmarks import certify, commands, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.local import Local
-from deconfounded.benchmarks.output import pages, records, score
+from deconfounded.benchmarks.output import records, score
+from deconfounded.benchmarks.studies import cost, publish, site
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.experts.policy import OwnExpert
@@ -67,7 +68,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
         (("benchmarks/run.py", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
         (("benchmarks/certify.py", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
-        (("benchmarks/speed.py", "--n", "100000000000000000000"), "it must be from 1 to 1,000,000"),
+        (("benchmarks/studies/speed.py", "--n", "100000000000000000000"), "it must be from 1 to 1,000,000"),
         (
             ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
             "output folder /proc/none cannot be written",
@@ -77,7 +78,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
         (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
         (("benchmarks/play.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
-        (("benchmarks/rescore.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
+        (("benchmarks/score.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
         (
             ("benchmarks/verify.py", "bandit", "random", "0", "--records", "nowhere.jsonl"),
             "records nowhere.jsonl cannot be read: No such file",
@@ -91,12 +92,12 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
         (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
         (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
-        (("benchmarks/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
-        (("benchmarks/seeds.py", "--seeds", "0"), "must be at least 1"),
-        (("benchmarks/publish.py", "nowhere"), "holds no records and adaptation.png"),
+        (("benchmarks/studies/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
+        (("benchmarks/studies/seeds.py", "--seeds", "0"), "must be at least 1"),
+        (("benchmarks/studies/publish.py", "nowhere"), "holds no records and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
-        (("benchmarks/speed.py", "--task", "bandit"), "no physics to time"),
+        (("benchmarks/studies/speed.py", "--task", "bandit"), "no physics to time"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -293,7 +294,7 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
     [
         (("-m", "deconfounded", "--help"), 141),
         (("benchmarks/run.py", "--list"), 141),
-        (("benchmarks/pages.py", "--help"), 0),  # argparse thinks nothing of it
+        (("benchmarks/studies/site.py", "--help"), 0),  # argparse thinks nothing of it
     ],
 )
 def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered: str) -> None:
@@ -502,9 +503,9 @@ def test_records_are_few_and_small() -> None:
 
 
 def test_pages_are_up_to_date() -> None:
-    """What pages.py writes of tasks, certificates and results; README has a row for each of the latter two."""
-    for file, text in pages.texts(pages.published()).items():
-        assert file.read_text() == text, f"{file}: run `python benchmarks/pages.py`"
+    """What site.py writes of tasks, certificates and results; README has a row for each of the latter two."""
+    for file, text in site.texts(site.published()).items():
+        assert file.read_text() == text, f"{file}: run `deconf pages`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)
     tasks = {file.stem for file in (docs / "records").glob("*.jsonl")}

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.envs.contract import CONTRACT
-from deconfounded.envs.contract_physics import same_model
+from deconfounded.envs.contract.core import CONTRACT
+from deconfounded.envs.contract.physics import same_model
+from deconfounded.envs.contract.probe import Skipped, far_thetas, gl_works, streams
 from deconfounded.envs.physics import ModelEdit, SpecEdit
-from deconfounded.envs.probe import Skipped, far_thetas, gl_works, streams
 from deconfounded.experts import policy
 
 TASKS = envs.names()

@@ -18,11 +18,11 @@ from deconfounded.benchmarks.engine import measure
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import cloning, deconfounded, naive_rnn, offline
-from deconfounded.deconf.agents import Monitor
-from deconfounded.deconf.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
-from deconfounded.deconf.data import Batch, Draws, Signature
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.core.agents import Monitor
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.models import DiscreteModel, VariationalModel
+from deconfounded.deconf.core.nets import ActionHead, Embedding, Linear, Scaler, scalers
 from deconfounded.deconf.equations import (
     belief_update,
     gaussian_kl,
@@ -35,13 +35,13 @@ from deconfounded.deconf.equations import (
     reparametrise,
 )
 from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
-from deconfounded.deconf.models import DiscreteModel, VariationalModel
-from deconfounded.deconf.nets import ActionHead, Embedding, Linear, Scaler, scalers
-from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.deconf.methods import cloning, deconfounded, naive_rnn, offline
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
 

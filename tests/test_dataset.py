@@ -13,9 +13,9 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import data
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
-from deconfounded.deconf import naive_rnn
-from deconfounded.experts import dataset, policy
-from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.deconf.methods import naive_rnn
+from deconfounded.experts import datasets, policy
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
 minari = pytest.importorskip("minari")
@@ -32,10 +32,10 @@ def test_the_same_in_another_process(
     monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", tmp_path.name])
     data.main()
     assert f"{name}: 4 trials, sha256 {shown.sha256} -> {tmp_path}" in capsys.readouterr().out
-    code = f"from deconfounded.experts.demos import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
+    code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.stdout.strip() == shown.sha256, done.stderr
-    trials, theta = dataset.read(tmp_path)
+    trials, theta = datasets.read(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
     one, other = (naive_rnn.fit(given, tiny_preset().naive, context.rngs) for given in (shown, trials))
     for key, array in one.state()[1].items():
@@ -47,9 +47,9 @@ def test_the_same_in_another_process(
 def test_what_it_says(tmp_path: Path) -> None:
     """Returns, ends, reference scores and trials are Minari's own to read; theta is in the metadata alone."""
     task = envs.get("slippery_cartpole")
-    collected = dataset.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
+    collected = datasets.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
     _, returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5)
-    place = dataset.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
     found = minari.MinariDataset(place / "data")
     episodes = list(found.iterate_episodes())
     assert [round(float(one.rewards.sum()), 9) for one in episodes] == returns.ravel().round(9).tolist()

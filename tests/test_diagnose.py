@@ -13,16 +13,16 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import diagnose as command
 from deconfounded.benchmarks.console import run_command
-from deconfounded.deconf import diagnose, findings
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.diagnose import DiagnoseConfig
-from deconfounded.deconf.findings import Amounts, Findings
-from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.recurrent import RecurrentConfig
+from deconfounded.deconf.diagnosis import diagnose, measures
+from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
+from deconfounded.deconf.diagnosis.measures import Amounts, Findings
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.envs.task import InputError
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 
 ROOT = Path(__file__).parents[1]
 TINY = Amounts(
@@ -181,10 +181,10 @@ def _bandit(n: int = 24) -> tuple[Trials, Trials]:
 def test_measures(make) -> None:
     """Figures come out finite, for both kinds of actions, and the same again from the same seed."""
     shown, explored = make()
-    once, again = (findings.measure(shown, explored, TINY, np.random.default_rng(0)) for _ in range(2))
+    once, again = (measures.measure(shown, explored, TINY, np.random.default_rng(0)) for _ in range(2))
     assert once == again
     assert np.isfinite(once).all()
-    alone = findings.measure(shown, None, TINY, np.random.default_rng(0))
+    alone = measures.measure(shown, None, TINY, np.random.default_rng(0))
     assert {alone.explained, alone.explored, alone.shown, alone.acted} == {None}
     assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
@@ -201,10 +201,10 @@ def test_memory_is_found() -> None:
         ),
     )
     hidden = Trials(obs, sign, np.ones(shape, bool), 2)
-    found = findings.measure(hidden, None, amounts, np.random.default_rng(0))
+    found = measures.measure(hidden, None, amounts, np.random.default_rng(0))
     assert found.memory == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
     chance = Trials(obs, rng.integers(2, size=(*shape, 1)), np.ones(shape, bool), 2)
-    assert findings.measure(chance, None, amounts, np.random.default_rng(0)).memory < 0.02
+    assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory < 0.02
 
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor
 
 from deconfounded import envs
-from deconfounded.deconf import models
-from deconfounded.deconf.data import Batch, Draws, Signature
-from deconfounded.deconf.drift import choose_kept
+from deconfounded.deconf.core import models
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.drift import choose_kept
+from deconfounded.deconf.core.models import LatentModel
+from deconfounded.deconf.core.nets import Scaler
 from deconfounded.deconf.exact import ExactAgent, Grid
-from deconfounded.deconf.models import LatentModel
-from deconfounded.deconf.nets import Scaler
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, run_trials, thetas
+from deconfounded.experts.rollout import ExpertAgent, run_trials, thetas
 
 
 class Walking(TiltedCartpole):

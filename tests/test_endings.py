@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf import endings
-from deconfounded.deconf.data import Batch, Draws
-from deconfounded.deconf.dream import World
-from deconfounded.deconf.nets import scalers
-from deconfounded.experts.demos import Trials
+from deconfounded.deconf.core import termination
+from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.nets import scalers
+from deconfounded.deconf.diagnosis.learned_env import World
+from deconfounded.experts.rollout import Trials
 
 
 def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
@@ -29,7 +29,7 @@ def test_what_ends_them_is_learned() -> None:
     """Beyond the limit it is over, within it is not: right of 95% that are .3 or more away from it."""
     some = walks()
     draws = Draws([np.random.default_rng(0)], "cpu")
-    ends = endings.fit([some], scalers(Batch.of(some, 1))[0], draws)
+    ends = termination.fit([some], scalers(Batch.of(some, 1))[0], draws)
     assert ends is not None
     at = torch.linspace(-4, 4, 401)[None, :, None]
     over = (ends.logit(at) > 0)[0]
@@ -40,14 +40,14 @@ def test_what_ends_them_is_learned() -> None:
 
 def test_a_horizon_is_no_end() -> None:
     some = walks(limit=1e9)
-    assert endings.fit([some], scalers(Batch.of(some, 1))[0], Draws([np.random.default_rng(0)], "cpu")) is None
+    assert termination.fit([some], scalers(Batch.of(some, 1))[0], Draws([np.random.default_rng(0)], "cpu")) is None
 
 
 def test_arrivals() -> None:
     """Of an episode of three steps of four the last arrival is its end; of one of four none is."""
     obs = np.arange(10.0).reshape(2, 1, 5, 1)
     mask = np.array([[[1, 1, 1, 0]], [[1, 1, 1, 1]]], bool)
-    came, over = endings.arrivals(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
+    came, over = termination.arrivals(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
     assert came[:, 0].tolist() == [1, 2, 3, 6, 7, 8, 9]
     assert over.tolist() == pytest.approx([0, 0, 1, 0, 0, 0, 0])
 

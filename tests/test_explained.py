@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf import explained, findings
-from deconfounded.deconf.agents import Monitor
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Batch, Draws
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.diagnose import SILENT
-from deconfounded.deconf.findings import Amounts, split
-from deconfounded.experts.demos import Trials
+from deconfounded.deconf.core.agents import Monitor
+from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.diagnosis import latent, measures
+from deconfounded.deconf.diagnosis.diagnose import SILENT
+from deconfounded.deconf.diagnosis.measures import Amounts, split
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.experts.rollout import Trials
 
 NOISE, FALL = 0.1, 1.5
 EXPLORING = DeconfoundedConfig(inference_updates=400, inference_rate=3e-3)
@@ -39,10 +39,10 @@ def world(push: float, expert: bool, n: int, seed: int, episodes: int = 1, drift
     return Trials(np.stack(obs, -1)[..., None], np.stack(actions, -1)[..., None], np.ones((n, episodes, 40), bool))
 
 
-def by_world(push: float) -> explained.Explanation:
+def by_world(push: float) -> latent.Explanation:
     rng = np.random.default_rng(0)
     expert, explored = (split(world(push, kind, 128, seed), 0.25, rng) for seed, kind in enumerate((True, False)))
-    return explained.by_world(expert, explored, 1, EXPLORING, CLONING, Draws([rng], "cpu"), Monitor())
+    return latent.by_world(expert, explored, 1, EXPLORING, CLONING, Draws([rng], "cpu"), Monitor())
 
 
 def test_world_that_tells() -> None:
@@ -63,18 +63,18 @@ def test_world_that_says_nothing() -> None:
 def test_half_tells_the_other_half(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beliefs read as many steps as they were learned on: every other one; what is likely is asked of those between."""
     read: list[torch.Tensor] = []
-    final = explained.final_belief
-    monkeypatch.setattr(explained, "final_belief", lambda model, batch: read.append(batch.mask) or final(model, batch))
+    final = latent.final_belief
+    monkeypatch.setattr(latent, "final_belief", lambda model, batch: read.append(batch.mask) or final(model, batch))
     rng = np.random.default_rng(0)
     expert, explored = (split(world(0.2, kind, 32, seed), 0.25, rng) for seed, kind in enumerate((True, False)))
     few = replace(EXPLORING, inference_updates=5)
-    explained.by_world(expert, explored, 1, few, replace(CLONING, updates=5), Draws([rng], "cpu"), Monitor())
+    latent.by_world(expert, explored, 1, few, replace(CLONING, updates=5), Draws([rng], "cpu"), Monitor())
     assert read
     for mask in read:
         assert mask[..., ::2].any()
         assert not mask[..., 1::2].any()
     batch = Batch.of(expert[0], 1)
-    between = explained.odd(batch).mask
+    between = latent.odd(batch).mask
     assert between[..., 1::2].eq(batch.mask[..., 1::2]).all()
     assert not between[..., ::2].any()
 
@@ -85,6 +85,6 @@ def test_theta_that_drifts() -> None:
     expert, explored = (
         split(world(0.2, kind, 64, seed, 4, drifts=True), 0.25, rng) for seed, kind in enumerate((True, False))
     )
-    found = findings._by_world(expert, explored, amounts, Draws([rng], "cpu"), lambda share: None)
+    found = measures._by_world(expert, explored, amounts, Draws([rng], "cpu"), lambda share: None)
     assert found.latents.shape[1] == 4 * 48
     assert found.explored == pytest.approx(4, rel=0.35)

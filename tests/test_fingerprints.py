@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from deconfounded import envs
-from deconfounded.deconf import equations, offline
+from deconfounded.deconf import equations
+from deconfounded.deconf.methods import offline
 from tests import fingerprints
 
 LEARNED = ("deconfounded", "deconfounded_offline", "dagger", "naive_rnn", "blind_bc")

@@ -16,7 +16,7 @@ from gymnasium.wrappers import RecordVideo, vector
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.envs.probe import actions, gl_works, streams
+from deconfounded.envs.contract.probe import actions, gl_works, streams
 from deconfounded.envs.streams import Array
 
 TASKS = envs.names()

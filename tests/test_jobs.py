@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import paper
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.paper import FigureJob
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.recurrent import RecurrentConfig
-from deconfounded.experts.demos import Agent
+from deconfounded.benchmarks.studies import paper
+from deconfounded.benchmarks.studies.paper import FigureJob
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.experts.rollout import Agent
 
 
 def settings(name: str, fresh: bool) -> Any:

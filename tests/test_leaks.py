@@ -15,30 +15,30 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import (
+from deconfounded.deconf.core import models
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.models import DiscreteModel, LatentModel, VariationalModel
+from deconfounded.deconf.core.nets import ActionHead, scalers
+from deconfounded.deconf.methods import (
     dagger,
     deconfounded,
     deconfounded_mean,
     gail,
-    models,
     naive_obs,
     naive_rnn,
     naive_transformer,
     offline,
     palr,
 )
-from deconfounded.deconf.agents import LearnedAgent
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.data import Batch, Draws, Signature
-from deconfounded.deconf.deconfounded import DeconfoundedAgent, DeconfoundedConfig
-from deconfounded.deconf.models import DiscreteModel, LatentModel, VariationalModel
-from deconfounded.deconf.nets import ActionHead, scalers
-from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.envs.probe import actions, streams
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
+from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, RandomAgent, Trials, run_trials
 from deconfounded.experts.policy import NetworkExpert
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 from deconfounded.experts.sb3 import Sb3VecEnv
 from tests.tools import tiny_preset
 
@@ -367,7 +367,7 @@ def test_prior_is_fitted_if_asked_for(fit_prior: bool, monkeypatch: pytest.Monke
 
 def test_gru_scan_has_the_gradient_of_autograd() -> None:
     """Double precision, two seeds, with steps that did not take place."""
-    from deconfounded.deconf.scan import GruScan
+    from deconfounded.deconf.core.gru import GruScan
 
     draw = Draws([np.random.default_rng(i) for i in range(2)], "cpu").normal
     shapes: Sequence[tuple[int, ...]] = ((3, 5, 12), (3, 4), (4, 12), (1, 12))

@@ -18,20 +18,20 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Allowed, Context
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import deconfounded_mean, gail, rma
-from deconfounded.deconf.agents import LearnedAgent, Monitor, Training
-from deconfounded.deconf.beliefs import GruMemory
-from deconfounded.deconf.data import Batch, Draws, Signature
-from deconfounded.deconf.deconfounded_mean import MeanAgent, MeanConfig
-from deconfounded.deconf.gail import Discriminator, GailAgent, GailConfig
-from deconfounded.deconf.naive_obs import DroppingAgent, ObsAgent, ObsMemory
-from deconfounded.deconf.naive_transformer import TransformerAgent
-from deconfounded.deconf.nets import Adam, Scaler, scalers
-from deconfounded.deconf.palr import PalrAgent, PalrConfig, hscic
-from deconfounded.deconf.practice import WholePolicy
+from deconfounded.deconf.core.agents import LearnedAgent, Monitor, Training
+from deconfounded.deconf.core.beliefs import GruMemory
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.nets import Adam, Scaler, scalers
+from deconfounded.deconf.methods import deconfounded_mean, gail, rma
+from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
+from deconfounded.deconf.methods.gail import Discriminator, GailAgent, GailConfig
+from deconfounded.deconf.methods.naive_obs import DroppingAgent, ObsAgent, ObsMemory
+from deconfounded.deconf.methods.naive_transformer import TransformerAgent
+from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
+from deconfounded.deconf.methods.practice import WholePolicy
 from deconfounded.envs.streams import Array
-from deconfounded.experts.demos import Agent, RandomAgent, Trials, run_trials, trial_seeds
-from deconfounded.experts.ppo import train
+from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials, trial_seeds
+from deconfounded.experts.train import train
 from tests.tools import tiny_preset
 
 CONTROL = "slippery_cartpole"
@@ -329,7 +329,7 @@ class TestRma:
 
 
 def practice(n: int = 3, task: str = CONTROL, reward: Any = None) -> Any:
-    from deconfounded.deconf.practice import Practice
+    from deconfounded.deconf.methods.practice import Practice
 
     about = envs.get(task)
     width = len(about.observation)

@@ -28,12 +28,13 @@ from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, C
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import naive_rnn, wire
-from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.deconf import wire
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.methods import naive_rnn
 from deconfounded.envs import outside
 from deconfounded.envs.files import write_sealed
-from deconfounded.experts import policy, saved
-from deconfounded.experts.demos import Trials, run_trials
+from deconfounded.experts import policy, store
+from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -239,7 +240,7 @@ def test_a_bad_expert_is_one_line(tmp_path: Path, code: str, says: str) -> None:
 HEAD = """
 import numpy as np
 from deconfounded.deconf.given import uses
-from deconfounded.experts.demos import Agent
+from deconfounded.experts.rollout import Agent
 
 class Still(Agent):
     def begin(self, n): self.n = n
@@ -279,7 +280,7 @@ def forked(server: BaseContext, monkeypatch: pytest.MonkeyPatch) -> None:
         ("def fit(given): raise EOFError('mine')", r"mine \(EOFError, mine.py:11\)"),
         ("def fit(given): given.progress(float('nan'))", "progress was nan, {}; it must be finite numbers"),
         ("def fit(given): given._ask('environment')", "it asked for environment, and declares"),
-        ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.demos.Agent"),
+        ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.rollout.Agent"),
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
         ("def fit(given): import os; os._exit(1)", r"its process was killed \(out of memory\?\)"),
@@ -520,7 +521,7 @@ class TestSaved:
         (tmp_path / "agent.json").write_text("{")
         with pytest.raises(envs.InputError, match="is damaged"):
             deconfounded.load(tmp_path)
-        about = {"class": "deconfounded.deconf.recurrent:RecurrentAgent", "settings": {}}
+        about = {"class": "deconfounded.deconf.methods.recurrent:RecurrentAgent", "settings": {}}
         for arrays, says in (
             (None, "is of no agent"),
             ("0" * 64, r"agent\.safetensors is damaged, or of another agent"),
@@ -586,7 +587,7 @@ class TestSaved:
         agent = MAKERS["blind_bc"](Context(envs.get("bandit"), tiny_preset(), [0]))["blind_bc"]
         assert isinstance(agent, LearnedAgent)
         agent.save(tmp_path)
-        assert saved.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
+        assert store.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
         assert isinstance(deconfounded.load(tmp_path), type(agent))
 
     @pytest.mark.parametrize(
@@ -606,7 +607,7 @@ class Odd(Still):
         (tmp_path / "odd.py").write_text(HEAD + text)
         agent = outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")()
         with pytest.raises(envs.InputError, match=says):
-            saved.save(agent, tmp_path / "kept")
+            store.save(agent, tmp_path / "kept")
         assert not (tmp_path / "kept").exists()
 
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
@@ -627,7 +628,7 @@ def fit(given): return Constant(-0.25)
         expected = run_trials(context.env, agent, 1, 3)[1]
         agent.close()
         (tmp_path / "mine.py").unlink()
-        assert saved.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
+        assert store.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
         again = deconfounded.load(tmp_path / "kept")
         np.testing.assert_array_equal(run_trials(context.env, again, 1, 3)[1], expected)
 

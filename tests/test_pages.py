@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import publish, tune
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import browser, gap, index, pages, records, report, score, statistics
+from deconfounded.benchmarks.output import index, records, report, score, statistics
 from deconfounded.benchmarks.output.answers import answers
+from deconfounded.benchmarks.studies import browser, gap, publish, site, tune
 from deconfounded.envs.files import mark, mark_of, save_figure
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -60,8 +60,8 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
-    monkeypatch.setattr(pages, "DOCS", tmp_path)
-    lines = pages.tuning().splitlines()
+    monkeypatch.setattr(site, "DOCS", tmp_path)
+    lines = site.tuning().splitlines()
     words = [line.split(" | ")[-1].strip(" |") for line in lines[2:11]]
     assert words == ["kept", "", "", "", "", "", "", "chosen", ""], "palr is not through"
     assert lines[6:8] == ["| palr | a | 0.20 | 5 |  |", "| gail | a | 0.20 | 5 |  |"]
@@ -69,16 +69,16 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_presets_are_what_tuning_chose() -> None:
     """Today's preset is the setting that docs/tuning.json says, which can be tried again."""
-    rows = json.loads((pages.DOCS / "tuning.json").read_text())["rows"]
+    rows = json.loads((site.DOCS / "tuning.json").read_text())["rows"]
     for method in dict.fromkeys(row["method"] for row in rows):
         tried, of = ({}, *tune.TRIED[method]), [row for row in rows if row["method"] == method]
-        assert len(tried) == pages.BUDGET
+        assert len(tried) == site.BUDGET
         if len(of) < len(tried):  # tuning has begun
             continue
         assert [row["setting"] for row in of] == [tune.title(change) for change in tried]
         for task in map(envs.get, tune.TASKS):
             config = getattr(preset("default", task, "cpu"), METHODS[method].part)
-            assert asdict(config) == pages.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
+            assert asdict(config) == site.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
             began = tune.other(config, tune.BEFORE.get(method, {}))
             for row, change in zip(of, tried, strict=True):
                 assert asdict(tune.other(began, change)) == pytest.approx(row["amounts"][task.name])
@@ -447,9 +447,9 @@ def test_commands_of_numbers() -> None:
     outside = [{**one, "method": "mine", "job": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
     results = records.gather([*found, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"
-    assert pages.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"
-    assert pages.command(task, results, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
-    assert pages.command(task, results, "expert") == pages.command(task, results)
+    assert site.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"
+    assert site.command(task, results, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
+    assert site.command(task, results, "expert") == site.command(task, results)
 
 
 def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
@@ -461,11 +461,11 @@ def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
         gap.picture(data, file, mark=mark)
 
     for data in ([("a", 0.1, 0.2)], [("a", 0.1, 0.2)], [("a", 0.1, 0.3)], [("a", 0.1, 0.3)]):
-        pages.redraw(file, draw, data)
+        site.redraw(file, draw, data)
     assert drawn == [1, 1]
     save_figure(plt.figure(), file, 50)
     assert mark_of(file) == mark_of(tmp_path / "nowhere.png") == ""
-    pages.redraw(file, draw, data)
+    site.redraw(file, draw, data)
     assert drawn == [1, 1, 1]
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf.data import Batch, Draws
-from deconfounded.deconf.dream import farther
-from deconfounded.deconf.paths import back, oddest, strange, strayed, ways
-from deconfounded.experts.demos import Trials
+from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.diagnosis.deviation import back, oddest, strange, strayed, ways
+from deconfounded.deconf.diagnosis.learned_env import farther
+from deconfounded.experts.rollout import Trials
 
 
 def walks(n: int, seed: int) -> torch.Tensor:

@@ -16,15 +16,15 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
-from deconfounded.benchmarks import table as table_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import identity, pool, sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.envs.files import PARTIAL, write_sealed
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Trials
+from deconfounded.experts.rollout import Trials
 from tests.tools import tiny_preset
 
 
@@ -41,7 +41,7 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkJob:
 class TestIdentity:
     """Versions, not the text of this package, decide what is made again; of what is from outside, its text."""
 
-    @pytest.mark.parametrize("name", ["envs/task.py", "envs/physics.py", "experts/demos.py", "deconf/nets.py"])
+    @pytest.mark.parametrize("name", ["envs/task.py", "envs/physics.py", "experts/rollout.py", "deconf/core/nets.py"])
     def test_the_text_of_the_package_is_in_no_identity(self, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """A file with more in it than a comment: nothing is stale."""
         read = Path.read_bytes

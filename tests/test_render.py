@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from deconfounded.envs import render
-from deconfounded.envs.probe import gl_works
+from deconfounded.envs.contract.probe import gl_works
 
 RENDER_AND_TRAIN = """
 import sys

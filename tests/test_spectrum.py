@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import noisier, spectrum, validate
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.output import gap, spectra, validated
+from deconfounded.benchmarks.studies import gap, noise, spectra, spectrum, validate, validation
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 
@@ -19,7 +18,7 @@ PNG = b"\x89PNG"
 TIMES = ("0.25", "0.5", "1", "2", "4", "8")
 
 
-@pytest.mark.parametrize("base", noisier.BASES)
+@pytest.mark.parametrize("base", noise.BASES)
 def test_noise_is_scaled_and_nothing_else(base: str) -> None:
     """Each kind alone, in the order of its factors; the same starts and outcomes, and the suite's expert."""
     task, weights = envs.get(base), str(ASSETS / "experts" / f"{base}.safetensors")
@@ -42,19 +41,19 @@ def test_noise_is_scaled_and_nothing_else(base: str) -> None:
         assert isinstance(theirs, policy.BoxExpert)
         assert isinstance(ours, policy.BoxExpert)
         np.testing.assert_array_equal(theirs.mean(one.observe(), one.theta), ours.mean(one.observe(), one.theta))
-    assert len(names) == sum(map(len, noisier.FACTORS.values()))
+    assert len(names) == sum(map(len, noise.FACTORS.values()))
 
 
 def test_spectrum_is_shown(tmp_path: Path) -> None:
     """A column for each task and kind of noise: its factors in order, with what both kinds have in common in each."""
     points: list[dict[str, Any]] = []
-    for base in noisier.BASES:
+    for base in noise.BASES:
         for _, kind, factor, _ in spectrum.variants(base):
             nats = {"evidence_nats_per_step": {"dynamics": 0.5, "actions": 700.0}, "verdict": "passed"}
             scores = {name: [factor, factor + 0.2] for name in (*EXACT, *spectra.LEARNED)}
             points.append({"task": base, "kind": kind, "factor": factor, "certificate": nats, "scores": scores})
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in spectra.table(points).splitlines()[2:]]
-    head = [[base, kind, times] for base in noisier.BASES for kind in spectra.KINDS.values() for times in TIMES]
+    head = [[base, kind, times] for base in noise.BASES for kind in spectra.KINDS.values() for times in TIMES]
     assert [row[:3] for row in rows] == head
     for row in rows:
         assert row[3:6] == ["0.50", "700", "passed"]
@@ -114,7 +113,7 @@ def test_validation_has_what_the_spectrum_found() -> None:
             assert validate.certificate(task, source, Path()) is (point["certificate"]["verdict"] == "passed")
             scores = validate.measured(task, source, Path())
             assert scores["naive_rnn"] == np.mean(point["scores"]["naive_rnn"])
-    assert unseen == sum(factor != 1 for factor in noisier.FACTORS["process"]) * len(noisier.BASES)
+    assert unseen == sum(factor != 1 for factor in noise.FACTORS["process"]) * len(noise.BASES)
 
 
 def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
@@ -125,11 +124,11 @@ def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> 
 
     seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
     ranked = "verdicts are right; predicted and measured gaps rank alike by"
-    assert validated.told(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
-    other = [row(noisier.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
-    assert validated.told([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
-    table = validated.table([*seen, *other]).splitlines()
+    assert validation.told(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
+    other = [row(noise.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
+    assert validation.told([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
+    table = validation.table([*seen, *other]).splitlines()
     assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
     assert table[-1].endswith("| 16.00 |  |  | 8.00 | -8.00 |")
-    validated.picture([*seen, *other], tmp_path / "validation.png")
+    validation.picture([*seen, *other], tmp_path / "validation.png")
     assert (tmp_path / "validation.png").read_bytes().startswith(PNG)

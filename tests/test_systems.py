@@ -23,10 +23,10 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from deconfounded import envs
 from deconfounded.benchmarks.engine import catalogue, sources
 from deconfounded.benchmarks.engine.context import stream
+from deconfounded.envs.contract.probe import actions, gl_works
 from deconfounded.envs.files import write_atomically
-from deconfounded.envs.probe import actions, gl_works
-from deconfounded.experts import dataset, policy
-from deconfounded.experts.demos import RandomAgent
+from deconfounded.experts import datasets, policy
+from deconfounded.experts.rollout import RandomAgent
 from deconfounded.experts.sb3 import Sb3VecEnv
 
 ROOT = Path(__file__).parents[1]
@@ -64,8 +64,8 @@ class TestOtherProcesses:
         env = gymnasium.make(own.gym_id)
         assert env.spec is not None
         (tmp_path / "spec.json").write_text(env.spec.to_json())
-        collected = dataset.collect(own, 1, lambda env: RandomAgent(own.action_space), 5)
-        data = dataset.write(tmp_path / "data", own, "random", collected, "random", (1.0, 2.0))
+        collected = datasets.collect(own, 1, lambda env: RandomAgent(own.action_space), 5)
+        data = datasets.write(tmp_path / "data", own, "random", collected, "random", (1.0, 2.0))
         vec = envs.make_vec(own.name, 2)
         vec.reset(seed=3)
         vec.step(np.ones((2, 1)))

@@ -13,14 +13,14 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output.score import normalise
-from deconfounded.deconf import cloning
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.dagger import DaggerConfig
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.methods import cloning
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.dagger import DaggerConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, run_trials, thetas
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 
 N, EPISODES = 48, 3
 

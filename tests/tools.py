@@ -5,17 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from deconfounded.benchmarks.engine.presets import Preset
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.dagger import DaggerConfig
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.deconfounded_mean import MeanConfig
-from deconfounded.deconf.gail import GailConfig
-from deconfounded.deconf.naive_obs import DropoutConfig
-from deconfounded.deconf.naive_transformer import TransformerConfig
-from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.palr import PalrConfig
-from deconfounded.deconf.recurrent import RecurrentConfig
-from deconfounded.deconf.rma import RmaConfig
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.dagger import DaggerConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
+from deconfounded.deconf.methods.gail import GailConfig
+from deconfounded.deconf.methods.naive_obs import DropoutConfig
+from deconfounded.deconf.methods.naive_transformer import TransformerConfig
+from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.palr import PalrConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.rma import RmaConfig
 
 
 def tiny_preset() -> Preset:

@@ -21,7 +21,7 @@ from deconfounded import envs
 from deconfounded.envs.files import write_atomically
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import ExpertAgent, run_trials
+from deconfounded.experts.rollout import ExpertAgent, run_trials
 
 N, SEED = 64, 1000
 Arrays = dict[str, Array]

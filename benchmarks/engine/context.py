@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity
-from deconfounded.deconf.agents import Monitor
-from deconfounded.deconf.data import Source
+from deconfounded.deconf.core.agents import Monitor
+from deconfounded.deconf.core.data import Source
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials, thetas
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials, thetas
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset

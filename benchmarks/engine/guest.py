@@ -27,7 +27,7 @@ from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
-from deconfounded.experts.demos import Agent
+from deconfounded.experts.rollout import Agent
 
 
 def die_with_parent() -> None:
@@ -49,7 +49,7 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     escape_output()
     from deconfounded.deconf.given import Given, serve
     from deconfounded.deconf.wire import pack
-    from deconfounded.experts.saved import save
+    from deconfounded.experts.store import save
 
     def say(*what: Any) -> None:
         with contextlib.suppress(OSError):  # nobody listens any more
@@ -60,7 +60,7 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
         agent = outside.find("method", reference)(given)
         given.close()
         if not isinstance(agent, Agent):
-            raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.demos.Agent")
+            raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
         say("fitted")
         while True:
             folder, described = serve(channel, agent)

@@ -16,11 +16,11 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context,
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.pool import Job, JobMonitor
-from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
-from deconfounded.experts import saved
-from deconfounded.experts.demos import Agent, run_trials, thetas
+from deconfounded.experts import store
+from deconfounded.experts.rollout import Agent, run_trials, thetas
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
@@ -146,7 +146,7 @@ class BenchmarkJob(Job):
                 if isinstance(agent, Guest):
                     told = agent.keep(folder, about)
                 elif isinstance(agent, LearnedAgent):
-                    saved.save(agent.of_seed(i), folder, **about)
+                    store.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
                 told = f"its agent is not kept: {outside.told(error)}"
         return told

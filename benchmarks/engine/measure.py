@@ -8,8 +8,8 @@ import numpy as np
 
 from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.task import Array
-from deconfounded.experts.demos import Trials
 from deconfounded.experts.policy import Expert
+from deconfounded.experts.rollout import Trials
 
 
 def objective(expert: Expert, trials: Trials, theta: Array) -> Array:

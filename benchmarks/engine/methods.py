@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.benchmarks.engine.context import EXPLORATION, Allowed, Context, stream
-from deconfounded.deconf import (
+from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.methods import (
     cloning,
     dagger,
     deconfounded,
@@ -24,13 +25,12 @@ from deconfounded.deconf import (
     palr,
     rma,
 )
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.envs.task import Array
-from deconfounded.experts.demos import Agent, ExpertAgent, RandomAgent, Trials, thetas, trial_seeds
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, thetas, trial_seeds
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.practice import Practice
+    from deconfounded.deconf.methods.practice import Practice
 
 
 def _deploy(name: str, agent: deconfounded.DeconfoundedAgent) -> dict[str, Agent]:
@@ -88,7 +88,7 @@ def _rma(context: Context | Allowed) -> dict[str, Agent]:
 def _gail(context: Context | Allowed) -> dict[str, Agent]:
     def practise(n: int, seed: int, mean: NDArray[Any], std: NDArray[Any], reward: Any) -> Practice:
         """Environments under thetas that nobody is told."""
-        from deconfounded.deconf.practice import Practice
+        from deconfounded.deconf.methods.practice import Practice
 
         return Practice(context.task, n, trial_seeds(n, stream(EXPLORATION, seed)), mean, std, reward)
 

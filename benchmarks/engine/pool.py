@@ -23,9 +23,9 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.deconf.agents import Monitor, Training
+from deconfounded.deconf.core.agents import Monitor, Training
 from deconfounded.envs.files import check_folder, read_sealed, sweep, write_atomically, write_sealed
-from deconfounded.experts.demos import Agent
+from deconfounded.experts.rollout import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
 

@@ -10,18 +10,18 @@ from typing import Any, get_args, get_type_hints
 from gymnasium import spaces
 
 from deconfounded import envs
-from deconfounded.deconf.cloning import CloningConfig
-from deconfounded.deconf.dagger import DaggerConfig
-from deconfounded.deconf.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.deconfounded_mean import MeanConfig
-from deconfounded.deconf.gail import GailConfig
-from deconfounded.deconf.naive_obs import DropoutConfig
-from deconfounded.deconf.naive_transformer import TransformerConfig
-from deconfounded.deconf.offline import OfflineConfig
-from deconfounded.deconf.palr import PalrConfig
-from deconfounded.deconf.recurrent import RecurrentConfig
-from deconfounded.deconf.rma import RmaConfig
-from deconfounded.deconf.sizes import MANY, SPACIOUS, WIDE
+from deconfounded.deconf.core.sizes import MANY, SPACIOUS, WIDE
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.dagger import DaggerConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
+from deconfounded.deconf.methods.gail import GailConfig
+from deconfounded.deconf.methods.naive_obs import DropoutConfig
+from deconfounded.deconf.methods.naive_transformer import TransformerConfig
+from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.palr import PalrConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.rma import RmaConfig
 
 MOST = 1e9  # of any amount
 LONGER, GENTLE = 1.6, 2e-3  # where MANY are observed: updates of what infers theta, their rate (3e-3: ant_goal worse)

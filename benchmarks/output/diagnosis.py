@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.deconf.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
+from deconfounded.deconf.diagnosis.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
@@ -53,8 +53,8 @@ def _code(found: Diagnosis, about: dict[str, Any]) -> str:
     method = found.next.fit.partition(".")[0]
     return f"""from pathlib import Path
 import numpy as np
-from deconfounded.deconf import {method}
-from deconfounded.experts.demos import Trials
+from deconfounded.deconf.methods import {method}
+from deconfounded.experts.rollout import Trials
 
 trials = {read}
 agent = {found.next.fit}

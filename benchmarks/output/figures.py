@@ -20,7 +20,7 @@ from deconfounded.deconf.exact import ExactAgent
 from deconfounded.envs.files import save_figure
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Agent, ExpertAgent, run_trials
+from deconfounded.experts.rollout import Agent, ExpertAgent, run_trials
 
 WINDOW = 20  # steps of a smoothed curve, as in the paper
 COLOURS_OF_ARMS = ["#2ca02c", "#d62728", "#ff7f0e", "#9467bd", "#8c564b"]  # the first is the best arm

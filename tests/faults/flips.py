@@ -24,10 +24,10 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import pool
 from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.output import records
-from deconfounded.deconf.agents import LearnedAgent
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs.files import read_sealed
 from deconfounded.experts import policy
-from deconfounded.experts.demos import Trials
+from deconfounded.experts.rollout import Trials
 from tests.tools import tiny_preset
 
 Read = Callable[[], Any]

@@ -29,10 +29,10 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.jobs import spaces
-from deconfounded.deconf.agents import LearnedAgent
-from deconfounded.deconf.cloning import CloningConfig, fit
-from deconfounded.experts import policy, saved
-from deconfounded.experts.demos import Trials, run_trials
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.methods.cloning import CloningConfig, fit
+from deconfounded.experts import policy, store
+from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
 
 REACHED = (  # where a command's work begins
@@ -186,7 +186,7 @@ def commands(folder: Path) -> Iterator[tuple[str, str]]:
     shown = Context(envs.get("bandit"), preset, [0]).demonstrations
     agent = fit(shown, preset.cloning, [np.random.default_rng(0)])
     assert isinstance(agent, LearnedAgent)
-    saved.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
+    store.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
     for command, (base, options) in ODD.items():
         for option, values in options.items():
             for value in values:

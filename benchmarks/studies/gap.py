@@ -1,0 +1,85 @@
+"""Over all tasks: the gap that the exact policies predict, against the one measured between learned agents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.studies.cards import markdown_table
+from deconfounded.envs.files import save_figure
+
+FORETOLD = "exact interventional less conditional"
+
+
+class Gap(NamedTuple):
+    """Of a task, in scores of the last episode: as something foretells it, and deconfounded less naive_rnn."""
+
+    task: envs.Task
+    predicted: float
+    measured: float
+
+
+def gap(task: envs.Task, methods: dict[str, Any]) -> Gap | None:
+    """FORETOLD and measured, from the `methods` of results.json; None if one of the four is not there."""
+    if not {"interventional", "conditional", "deconfounded", "naive_rnn"} <= set(methods):
+        return None
+    last = {name: float(methods[name]["score_last"]) for name in methods}
+    return Gap(task, last["interventional"] - last["conditional"], last["deconfounded"] - last["naive_rnn"])
+
+
+def _correlation(gaps: Sequence[Gap]) -> str:
+    """Pearson's, and over how many tasks."""
+    r = np.corrcoef([one.predicted for one in gaps], [one.measured for one in gaps])[0, 1]
+    return f"{two_decimals(r)} over {len(gaps)} tasks"
+
+
+def section(gaps: Sequence[Gap]) -> str:
+    """Its part of docs/results.md."""
+    explored = [one for one in gaps if one.task.tier != 3]  # in expert trials of Tier 3 the world is silent about theta
+    if len(explored) < 3:
+        return ""
+    text = f"""## Predicted and measured
+
+What cloning loses, in the last episode: as the exact policies foretell it (interventional less conditional), and as it
+was measured (`deconfounded` less `naive_rnn`). Pearson's correlation is {_correlation(explored)} of Tier 2 and none.
+With those of Tier 3, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
+    rows = [(one.task.name, two_decimals(one.predicted), two_decimals(one.measured)) for one in gaps]
+    table = markdown_table(("task", "predicted", "measured"), rows)
+    return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
+
+
+def picture(
+    points: Sequence[tuple[str, float, float]],
+    file: Path,
+    foretold: str = FORETOLD,
+    hues: Sequence[str] | None = None,
+    hollow: Sequence[bool] | None = None,
+    mark: str = "",
+) -> None:
+    """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ.
+
+    Dots within 0.05 of the origin, where there is nothing to tell, bear no name: they hide each other's.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
+    axes.axline((0, 0), slope=1, color="0.8", lw=1)
+    some = zip(points, hues or ["tab:blue"] * len(points), hollow or [False] * len(points), strict=True)
+    for (name, predicted, measured), hue, empty in some:
+        at = predicted, measured
+        axes.plot(*at, "o", color=hue, fillstyle="none" if empty else "full")
+        if np.hypot(*at) > 0.05:
+            axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
+    axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
+    axes.margins(0.14, 0.08)
+    axes.set_title("what cloning loses, score in the last episode", fontsize=11)
+    save_figure(figure, file, 100, mark)
+    plt.close(figure)

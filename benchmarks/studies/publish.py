@@ -1,0 +1,97 @@
+"""Keep a finished run in docs/: `deconf publish results/slippery_cartpole-default`
+
+Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
+certificate; makes a small animated picture of the video; and brings the pages up to date that show them (`site.py`).
+All of it is looked at before anything is changed.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+import hashlib
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+from PIL import Image
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import site
+from deconfounded.benchmarks.studies.site import DOCS
+from deconfounded.envs.files import mark, mark_of
+
+LOOK: dict[str, Any] = {"duration": 150, "loop": 0, "quality": 30, "method": 4}  # of clips
+
+
+def clip(video: Path, file: Path, mark: str) -> None:
+    """Every third frame, as an animated .webp: all clips together are to stay small."""
+    first, *others = (Image.fromarray(frame) for frame in imageio.imread(video)[::3])
+    first.save(file, save_all=True, append_images=others, xmp=mark.encode(), **LOOK)
+
+
+def copy(source: Path, file: Path) -> None:
+    """Copy a picture, unless the one that is there was made of the same."""
+    if not mark_of(source) or mark_of(source) != mark_of(file):
+        shutil.copy(source, file)
+
+
+def keep(run: Path) -> None:
+    """Copy what is worth keeping of a finished run. Raises InputError, and changes nothing, if something is amiss."""
+    files, beside = sorted((run / "records").glob("*.jsonl")), [run / "adaptation.png", run / "video.mp4"]
+    if links := [file for file in (*files, *beside) if file.is_symlink()]:
+        raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
+    if len(files) != 1 or not (run / "adaptation.png").is_file():
+        raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
+    found = records.read(files[0])
+    results = records.gather(found, list(METHODS))
+    if results["preset"] != "default" or {"set", "salt"} & set(results):
+        raise envs.InputError(
+            f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
+        )
+    if results["task"] not in envs.SUITE:
+        raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
+    task = envs.get(results["task"])
+    if results["task_version"] != task.version:
+        raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")
+    certificates = [file for file in (run.parent / "certificates").glob(f"{task.name}.*") if not file.is_symlink()]
+    for file in certificates:
+        if file.suffix == ".json":
+            site.check_certificate(file, task)
+    with tempfile.TemporaryDirectory() as scratch:
+        small = Path(scratch) / "clip.webp"
+        if (run / "video.mp4").exists():
+            try:
+                looks = mark(hashlib.sha256((run / "video.mp4").read_bytes()).hexdigest(), LOOK)
+                kept = DOCS / f"{task.name}.webp"
+                shutil.copy(kept, small) if mark_of(kept) == looks else clip(run / "video.mp4", small, looks)
+            except Exception as error:
+                raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
+        records.write(DOCS / "records", found)
+        copy(run / "adaptation.png", DOCS / f"{task.name}.png")
+        if small.exists():
+            copy(small, DOCS / f"{task.name}.webp")
+        else:
+            (DOCS / f"{task.name}.webp").unlink(missing_ok=True)
+    for file in certificates:
+        shutil.copy(file, DOCS / "certificates")
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("run", type=Path, help="output folder of a finished run")
+    keep(parser.parse_args().run)
+    print(site.write())
+
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,99 @@
+"""Make the records that are missing, method by method and task by task: `deconf table`
+
+Every method on every task of the suite: ten seeds of those that a default run makes, the paper's comparison and the
+exact policies, and five of all others. A record of today's versions, settings and expert stays; the others are made,
+and kept as soon as they are done. Stopped, it goes on where it was. The first five seeds of everything come first.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.pool import Job
+    from deconfounded.benchmarks.output.records import Record
+
+SEEDS, FEWER = 10, 5
+
+
+def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
+    """The seeds of a method that belong in the table, from `least` up to `most`."""
+    return tuple(range(least, most if method in (*DEFAULT, *REFERENCES) else min(most, FEWER)))
+
+
+def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
+    """The job's seeds of which there is no record among those kept of its task, or one that is stale today."""
+    from deconfounded.benchmarks.engine.identity import identity
+    from deconfounded.benchmarks.output import records
+
+    today = identity(job)
+    there = {
+        record["seed"]
+        for record in kept
+        if (record["job"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
+    }
+    return tuple(seed for seed in job.seeds if seed not in there)
+
+
+def main() -> None:
+    """The command line."""
+    parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
+    parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
+    parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
+    args = parser.parse_args()
+    tasks = [envs.get(name) for name in args.tasks]
+    asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
+    methods = [name for name in METHODS if name in asked]
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.studies.site import DOCS
+
+    folder = args.out or Path("results") / "table"
+    kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
+    jobs = [
+        BenchmarkJob(
+            task.reference,
+            changed(preset(args.preset, task, args.device), args.set),
+            method,
+            seeds_of(method, least, most),
+            folder / task.name / "jobs",
+        )
+        for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
+        for task in tasks
+        for method in methods
+    ]
+    files = {task.reference: kept / records.place(task.name) for task in tasks}
+    there = {name: records.read(file) if file.exists() else [] for name, file in files.items()}
+    left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}
+    if args.list:
+        for job, seeds in left.items():
+            print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
+        return
+    for job, seeds in left.items():
+        task, own = envs.get(job.task), job.folder.parent
+        # Workers of its own: a record tells the code that is there when it is made, and they have imported it.
+        with commands.locked(own), commands.engine(args.cluster) as engine:
+            prepare(own, commands.about(BenchmarkJob, task, args.preset, job.preset, args.set), resume=True)
+            label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
+            finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
+        new = [one for one in finished if one[0] == job.method and one[1] in seeds]
+        records.write(kept, records.of_run(new, args.preset, args.set, task.episodes))
+
+
+if __name__ == "__main__":
+    run_command(main, commands.KEPT)

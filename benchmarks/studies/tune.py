@@ -1,0 +1,166 @@
+"""The opponents' tuning: `deconf tune`
+
+Each opponent gets four settings, the preset of before among them, on two development tasks: the cartpole on a tilted
+rail and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at
+once. Interrupted, it goes on where it was; what is there of today's versions and amounts stays.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
+    from deconfounded.benchmarks.console import stop_at_once
+
+    stop_at_once()
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
+from deconfounded.envs.files import write_atomically, write_json
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.presets import Preset
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
+Change = dict[str, float | str]
+"""Amounts by name, each times so much, or what is put in its place."""
+
+_NETWORK: tuple[Change, ...] = ({"learning_rate": 0.3}, {"updates": 2}, {"width": 2})
+TRIED: dict[str, tuple[Change, ...]] = {
+    "naive_rnn": _NETWORK,
+    "naive_obs": _NETWORK,
+    "naive_dropout": _NETWORK,
+    "palr": ({"penalty": 10}, {"penalty": 100}, {"updates": 2}),
+    "rma": _NETWORK,
+    "deconfounded_mean": ({"beta": 0.1}, {"model": "evidence"}, {"inference_updates": 4}),
+    "naive_transformer": ({"learning_rate": 0.3}, {"updates": 2}, {"layers": 2}),
+    "gail": ({"policy_rate": 0.3}, {"discriminator_rate": 0.3}, {"rounds": 2}),
+}
+"""Of each opponent, what is tried beside the preset as it was before."""
+BEFORE: dict[str, Change] = {
+    "naive_obs": {"learning_rate": 1 / 0.3},
+    "naive_dropout": {"learning_rate": 1 / 0.3},
+    "palr": {"penalty": 0.1},
+    "rma": {"learning_rate": 1 / 0.3},
+    "deconfounded_mean": {"model": "gru"},
+    "naive_transformer": {"layers": 0.5},
+    "gail": {"discriminator_rate": 1 / 0.3},
+}
+"""What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
+
+
+def other(config: Any, change: Change) -> Any:
+    """A method's configuration with the change."""
+    values = {}
+    for name, by in change.items():
+        now = getattr(config, name)
+        values[name] = by if isinstance(by, str) else round(now * by) if isinstance(now, int) else now * by
+    return replace(config, **values)
+
+
+def began(today: Preset) -> Preset:
+    """The amounts that the search begins with."""
+    undone = {METHODS[name].part: change for name, change in BEFORE.items()}
+    return replace(today, **{part: other(getattr(today, part), change) for part, change in undone.items()})
+
+
+def title(change: Change) -> str:
+    """Of a setting."""
+    told = (f"{name} {by}" if isinstance(by, str) else f"{name} x {by:g}" for name, by in change.items())
+    return ", ".join(told) or "the preset"
+
+
+def share(source: Path, other: Path, but: str = "") -> None:
+    """Demonstrations and references are the same for all settings: those that another folder lacks are copied there."""
+    other.mkdir(parents=True, exist_ok=True)
+    for file in source.glob("*.npz"):
+        if not (other / file.name).exists() and file.stem.rpartition("-")[0] != but:
+            write_atomically(other / file.name, file.read_bytes())
+
+
+def kept(file: Path) -> list[dict[str, Any]]:
+    """The rows of the file, one a setting."""
+    return json.loads(file.read_bytes())["rows"] if file.is_file() else []
+
+
+def keep(row: dict[str, Any], file: Path) -> None:
+    """Among the file's rows, in place of the one of the same method and setting."""
+    rows = kept(file)
+    same = [one for one in rows if (one["method"], one["setting"]) == (row["method"], row["setting"])]
+    if same:
+        rows[rows.index(same[0])] = row
+    else:
+        rows.append(row)
+    write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
+
+
+def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
+    """Of a method's setting: what each task's run has of everything, and what its row is known by."""
+    from deconfounded.benchmarks.engine.presets import preset
+
+    part, settings, versions = METHODS[name].part, {}, {}
+    for task in map(envs.get, TASKS):
+        start = began(preset("default", task, "cpu"))
+        settings[task.name] = replace(start, **{part: other(getattr(start, part), change)})
+        versions[task.name] = task.version
+    amounts = {task: asdict(getattr(one, part)) for task, one in settings.items()}
+    of = {"method_version": METHODS[name].version, "task_versions": versions}
+    return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
+
+
+def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:
+    """The results of a setting on a task: those of the method and of the references."""
+    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.output import records
+
+    own = out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
+    jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
+    with commands.locked(own), Local() as engine:
+        prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
+        share(out / task.name, own / "jobs")
+        finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
+        share(own / "jobs", out / task.name, but=name)
+    return records.gather(records.of_run(finished, "default", [], task.episodes))
+
+
+def main() -> None:
+    """The command line."""
+    parser = Parser(__doc__)
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help=f"some of {', '.join(TRIED)}; default: all")
+    parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
+    args = parser.parse_args()
+    check_names("method", args.methods or (), list(TRIED))
+    from deconfounded.benchmarks.output.index import last_scores
+
+    file = DOCS / "tuning.json"
+    for name, change in [(method, one) for method in args.methods or TRIED for one in ({}, *TRIED[method])]:
+        settings, row = plan(name, change)
+        if any(all(one.get(key) == value for key, value in row.items()) for one in kept(file)):
+            print(f"{name}, {row['setting']}: it is in {file.name}")
+            continue
+        row |= {"scores": {}, "loss": {}, "cpu_s": {}}
+        for task in map(envs.get, TASKS):
+            found = run(name, change, settings[task.name], task, args.out)
+            row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
+            entry = found["methods"][name]
+            row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
+            row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
+            row["cpu_s"][task.name] = entry["cpu_s"]
+        keep(row, file)
+        told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
+        print(f"{name}, {row['setting']}: {told}")
+    print(f"-> {file}")
+
+
+if __name__ == "__main__":
+    run_command(main, "what was finished is kept, and the same command goes on")

@@ -1,0 +1,1 @@
+"""What several methods share: data, networks, beliefs, models, agents."""

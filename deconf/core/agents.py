@@ -1,0 +1,181 @@
+"""What fitting a method and deploying it have in common: the monitor of training, and the agent of S seeds."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from deconfounded.deconf.core.data import Batch, Draws, Signature, listed
+from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.envs.task import Array, InputError
+from deconfounded.experts import store
+from deconfounded.experts.rollout import Agent, State
+
+Training = dict[str, Any]
+"""Tensors, numbers, strings, and lists and dictionaries of these."""
+
+
+class Monitor:
+    """What training reports to, and where it leaves what it needs to go on after an interruption. This one is deaf.
+
+    `budget` counts the data that each seed used, by kind; whoever makes the data tells by `spend`.
+    """
+
+    def __init__(self) -> None:
+        self.budget: dict[str, list[int]] = {}
+
+    def spend(self, kind: str, each: Sequence[int]) -> None:
+        """Each seed used so much more of a kind of data."""
+        before = self.budget.get(kind, [0] * len(each))
+        self.budget[kind] = [int(a + b) for a, b in zip(before, each, strict=True)]
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        """Updates done, updates in all, losses by name (the mean over seeds), and the agent so far, if it can act."""
+
+    def save(self, state: Callable[[], Training]) -> None:
+        """Training could go on from here, given `state()`."""
+
+    def load(self) -> Training | None:
+        """What was saved, if training was interrupted."""
+        return None
+
+
+class Stateful(Protocol):
+    """A network, an optimizer, or random numbers."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
+
+
+class Checkpoint:
+    """The parts of a training run, to be left with its monitor and put back as they were."""
+
+    def __init__(self, monitor: Monitor, rngs: Sequence[np.random.Generator], **parts: Stateful) -> None:
+        self.monitor, self.rngs, self.parts = monitor, rngs, parts
+
+    def save(self, **rest: Any) -> None:
+        """rest: what else is needed to go on."""
+        self.monitor.save(
+            lambda: {
+                "rngs": [rng.bit_generator.state for rng in self.rngs],
+                "parts": {name: part.state_dict() for name, part in self.parts.items()},
+                "rest": rest,
+            }
+        )
+
+    def load(self) -> Training | None:
+        """Put the parts back; returns the rest. None, and nothing is touched, if nothing was saved."""
+        if (state := self.monitor.load()) is None:
+            return None
+        for rng, before in zip(self.rngs, state["rngs"], strict=True):
+            rng.bit_generator.state = before
+        for name, part in self.parts.items():
+            part.load_state_dict(state["parts"][name])
+        return state["rest"]
+
+
+def ramp(done: int, until: float) -> float:
+    """Rises from 0 to 1."""
+    return min(1.0, done / until) if until else 1.0
+
+
+class LearnedAgent(Agent):
+    """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers.
+
+    Raises InputError where it is used out of order: `begin`, then `reset`, then `act` and `observe`.
+    """
+
+    def __init__(self, policy: ActionHead) -> None:
+        parameter = next(policy.parameters())
+        self.seeds, self.device = len(parameter), parameter.device
+        self.policy = policy
+        self._n, self._draws = 0, Draws([], self.device)
+
+    def begin(self, n: int) -> None:
+        if not isinstance(n, int | np.integer) or n < 1 or n % self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
+        self._n = n // self.seeds
+        self._draws = Draws([], self.device)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        given = listed(rngs)
+        if not self._n:
+            raise InputError("reset was called before begin; begin(n) says how many trials there are")
+        if len(given) != self.seeds:
+            raise InputError(f"an agent of {self.seeds} seeds was given {len(given)} generators; it needs one for each")
+        self._draws = Draws(given, self.device)
+
+    @torch.no_grad()
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        if not len(self._draws):
+            raise InputError("act was called before begin and reset; begin(n) trials, reset([generator]), then act")
+        return self.choose(self._tensor(obs)).double().cpu().numpy().reshape(len(obs), -1)
+
+    def _tensor(self, obs: NDArray[np.float32]) -> Tensor:
+        shape, width = np.shape(obs), self.policy.signature.obs
+        if shape != (self.seeds * self._n, width):
+            raise InputError(
+                f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
+            )
+        return torch.as_tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)
+
+    @abstractmethod
+    def choose(self, obs: Tensor) -> Tensor:
+        """Observation [S, N, O] -> action [S, N, A]."""
+
+    @torch.no_grad()
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.remember(Batch.step(self._tensor(obs), action, next_obs, alive))
+
+    def remember(self, step: Batch) -> None:
+        """Take note of a transition; agents without memory need nothing here."""
+
+    @abstractmethod
+    def parts(self) -> dict[str, nn.Module]:
+        """Its networks."""
+
+    @abstractmethod
+    def shape(self) -> dict[str, Any]:
+        """What `blank` needs, beside the signature, to make networks of the same shape."""
+
+    @classmethod
+    @abstractmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> LearnedAgent:
+        """An agent with those networks, that knows nothing."""
+
+    def state(self) -> State:
+        settings = {"seeds": self.seeds, "signature": asdict(self.policy.signature), "shape": self.shape()}
+        named = ((f"{name}.{key}", x) for name, part in self.parts().items() for key, x in part.state_dict().items())
+        return settings, {key: x.cpu().numpy().copy() for key, x in named}
+
+    @classmethod
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LearnedAgent:
+        signature, seeds = Signature(**settings["signature"]), settings["seeds"]
+        nothing = torch.zeros(seeds, 2, signature.obs)
+        draws = Draws([np.random.default_rng(0) for _ in range(seeds)], "cpu")
+        agent = cls.blank(settings["shape"], signature, Scaler(nothing, nothing[..., 0] + 1), draws)
+        for name, part in agent.parts().items():
+            own = {key.removeprefix(f"{name}."): x for key, x in arrays.items() if key.startswith(f"{name}.")}
+            part.load_state_dict({key: torch.tensor(x) for key, x in own.items()})
+            part.eval()
+        return agent
+
+    def of_seed(self, i: int) -> LearnedAgent:
+        """The agent of the i-th seed, by itself, on the CPU."""
+        settings, arrays = self.state()
+        own = {key: x[i : i + 1] if x.ndim else x for key, x in arrays.items()}  # what is stacked, is over seeds
+        return self.from_state({**settings, "seeds": 1}, own)
+
+    def save(self, folder: Path | str) -> None:
+        """Keep it in a folder, for `deconfounded.load`."""
+        store.save(self, Path(folder))

@@ -1,0 +1,196 @@
+"""q_phi(theta_hat | tau): two beliefs behind one interface.
+
+A belief keeps a memory of a history and reads a Gaussian over theta_hat from it (`posterior`). Memories come for all
+prefixes of a batch of trials at once (`forward`), or one transition at a time (`start`, `update`), alike.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.gru import GruScan
+from deconfounded.deconf.core.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
+
+FEW = 16  # products of actions and changes, that evidence may read beside both
+
+
+class Belief(nn.Module, ABC):
+    """q_phi and the prior p(theta_hat), a Gaussian in each of D dimensions: N(0, 1) until `set_prior`."""
+
+    inputs: Inputs
+    prior_mean: Tensor
+    prior_std: Tensor
+
+    def __init__(self, latent: int, draws: Draws) -> None:
+        super().__init__()
+        self.register_buffer("prior_mean", torch.zeros(len(draws), latent, device=draws.device))
+        self.register_buffer("prior_std", torch.ones(len(draws), latent, device=draws.device))
+
+    def set_prior(self, theta_hat: Tensor) -> None:
+        """Fit the prior to latents [S, B, D] inferred on whole trials (empirical Bayes).
+
+        Without it, early samples are spread over more of the latent space than there is data for.
+        """
+        self.prior_mean.copy_(theta_hat.mean(1))
+        self.prior_std.copy_(theta_hat.std(1, correction=0).clamp(min=0.05))
+
+    def prior(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std, shaped to go with [S, ..., D]."""
+        return per_seed(self.prior_mean, like), per_seed(self.prior_std, like)
+
+    @abstractmethod
+    def forward(self, batch: Batch) -> Tensor:
+        """Memories [S, B, T + 1, M] after 0, 1, ..., T transitions, episodes joined end to end."""
+
+    @abstractmethod
+    def start(self, n: int) -> Tensor:
+        """The memory [S, N, M] of n histories without a transition, for each seed."""
+
+    @abstractmethod
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        """Memory after one more transition each (step without a time axis); kept where its mask is 0."""
+
+    @abstractmethod
+    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std [..., D] of q_phi given memories [..., M]."""
+
+
+class EvidenceBelief(Belief):
+    """The order-free belief: a sum of evidence over transitions, read by a small network.
+
+    Given theta the dynamics are Markov, so that p(theta | tau) depends on the *set* of transitions alone: log p(theta |
+    tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
+    sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
+    size however long the trial. Without a transition, q is the prior. A trial longer than training's can be counts as
+    one of that length with the same mean evidence: the belief then grows no surer, but nothing is new to the network.
+
+    The evidence starts out whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its
+    common part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the
+    latent is ignored. So it does where theta shows in what an action changes, and in nothing else (a motor that turns
+    the other way): a network must first find that product. Where these products are few, it is handed them.
+    """
+
+    longest: Tensor
+
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(latent, draws)
+        self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
+        products = signature.obs * signature.action_features
+        self.products = products if products <= FEW else 0
+        inputs = 2 * signature.obs + signature.action_features + self.products
+        self.evidence = mlp(inputs, width, self.width, draws)
+        self.whiten = Whitener(self.width, draws)
+        self.out = mlp(2 * self.width + 1, width, 2 * latent, draws)
+        self.register_buffer("longest", torch.tensor(0.0))
+
+    def _terms(self, batch: Batch) -> Tensor:
+        """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
+        change = self.change(batch.next_obs - batch.obs)
+        action = self.inputs.action(batch.action)
+        inputs = [self.inputs.obs(batch.obs), action, change]
+        if self.products:
+            inputs.append((action[..., None] * change[..., None, :]).flatten(-2))
+        evidence = self.whiten(self.evidence(torch.cat(inputs, -1)), batch.mask)
+        mask = batch.mask[..., None]
+        return torch.cat([evidence * mask, mask], -1)
+
+    def forward(self, batch: Batch) -> Tensor:
+        terms = self._terms(batch)
+        if self.training:
+            self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
+        return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
+
+    def start(self, n: int) -> Tensor:
+        return self.prior_mean.new_zeros(len(self.prior_mean), n, self.width + 1)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return memory + self._terms(step)
+
+    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        scale = (self.longest / memory[..., -1:]).clamp(max=1) if self.longest else 1.0
+        total, count = memory[..., :-1] * scale, memory[..., -1:] * scale
+        n = 1 + count
+        mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
+        std = (F.softplus(raw) + 1e-6).sqrt()
+        none, (prior_mean, prior_std) = count == 0, self.prior(mean)
+        return torch.where(none, prior_mean, mean), torch.where(none, prior_std, std)
+
+
+class GruMemory(nn.Module):
+    """A GRU (Cho et al., 2014) over embedded transitions (s, a, s'): the history encoder of appendix D.
+
+    It starts out remembering: its gates keep memories for 1 to 100 steps (Tallec and Ollivier, 2018). With torch's
+    initialisation a memory lasts two steps, theta hardly shows in it, and one seed of five of `dagger` never learns to
+    tell it.
+    """
+
+    def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
+        super().__init__()
+        self.width, self.seeds = width, len(draws)
+        self.inputs = Embedding(width, signature, obs, draws)
+        self.input, self.recurrent = Linear(3 * 32, 3 * width, draws), Linear(width, 3 * width, draws)
+        with torch.no_grad():
+            keep = slice(width, 2 * width)
+            self.input.bias[..., keep] = torch.log(1 + 98 * draws.uniform(1, width))
+            self.recurrent.bias[..., keep] = 0
+
+    def start(self, n: int) -> Tensor:
+        """The memory [S, N, W] of empty histories."""
+        return self.recurrent.weight.new_zeros(self.seeds, n, self.width)
+
+    def _embed(self, batch: Batch) -> Tensor:
+        inputs = self.inputs
+        embedded = [inputs.obs(batch.obs), inputs.action(batch.action), inputs.obs(batch.next_obs)]
+        return self.input(torch.cat(embedded, -1))
+
+    def forward(self, batch: Batch, memory: Tensor) -> Tensor:
+        """Transitions [S, B, T, ...] after a memory [S, B, W] -> memories [S, B, T + 1, W]."""
+        return GruScan.apply(self._embed(batch), memory, self.recurrent.weight, self.recurrent.bias, batch.mask)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        """Memory [S, N, W] after one more transition each; kept where its mask is 0."""
+        return self(step[:, :, None], memory)[:, :, -1]
+
+
+class GruBelief(Belief):
+    """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
+
+    Its inputs start out of unit size: He's initialisation for the observations' embedding, action embeddings of about
+    1, and a tanh's gain for what enters the GRU. Without that, Eq. (6) stays for thousands of updates on the plateau
+    where the latent is ignored. (The memories of policies go without: dagger then learns less well at the fork.)
+    """
+
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(latent, draws)
+        self.memory = GruMemory(width, signature, obs, draws)
+        self.inputs = self.memory.inputs
+        self.out = Linear(width, 2 * latent, draws)
+        with torch.no_grad():
+            for layer in self.inputs.embed_obs:
+                if isinstance(layer, Linear):
+                    layer.weight.mul_(6**0.5)
+                    layer.bias.zero_()
+            self.inputs.embed_action.weight.mul_(3)
+            self.memory.input.weight.mul_(3)
+
+    def forward(self, batch: Batch) -> Tensor:
+        return self.memory(batch, self.start(len(batch)))
+
+    def start(self, n: int) -> Tensor:
+        return self.memory.start(n)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return self.memory.update(memory, step)
+
+    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        mean, raw = self.out(memory).chunk(2, -1)
+        return mean, (F.softplus(raw) + 1e-6).sqrt()

@@ -1,0 +1,209 @@
+"""Data of S seeds side by side: their random numbers, and their trials as tensors with a leading axis of S."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from deconfounded.envs.task import Array, InputError
+from deconfounded.experts.rollout import Trials
+
+Rngs = np.random.Generator | Sequence[np.random.Generator]
+"""One generator for each seed; a single one stands for one seed."""
+
+Source = Trials | Callable[[Sequence[np.random.Generator]], Trials]
+"""Trials, or what draws fresh ones: as many for each generator."""
+
+
+def listed(rng: Rngs) -> list[np.random.Generator]:
+    """The generators, one a seed. Raises InputError for anything else, a number, say."""
+    rngs = [rng] if isinstance(rng, np.random.Generator) else rng
+    if not isinstance(rngs, Sequence) or not all(isinstance(one, np.random.Generator) for one in rngs):
+        raise InputError(f"random numbers were to come from {rng!r}; give np.random.default_rng(0), or a list of such")
+    return list(rngs)
+
+
+def drawn(source: Source, rngs: Sequence[np.random.Generator]) -> Trials:
+    """The trials, or fresh ones."""
+    return source if isinstance(source, Trials) else source(rngs)
+
+
+class Draws:
+    """S independent streams of random numbers: row s of every draw comes from generator s alone."""
+
+    def __init__(self, rngs: Sequence[np.random.Generator], device: str | torch.device) -> None:
+        self.device = torch.device(device)
+        self._streams = [torch.Generator(device).manual_seed(int(rng.integers(2**31))) for rng in rngs]
+
+    def __len__(self) -> int:
+        return len(self._streams)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Where the streams stand."""
+        return {str(i): stream.get_state() for i, stream in enumerate(self._streams)}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Go on from there."""
+        for i, stream in enumerate(self._streams):
+            stream.set_state(state[str(i)].cpu())  # wherever it was loaded to
+
+    def uniform(self, *shape: int) -> Tensor:
+        """U(0, 1) [S, *shape]."""
+        return torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self._streams])
+
+    def normal(self, *shape: int) -> Tensor:
+        """N(0, 1) [S, *shape]."""
+        return torch.stack([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
+
+    def below(self, high: int, *shape: int) -> Tensor:
+        """Whole numbers 0 .. high - 1, [S, *shape]."""
+        return torch.stack([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
+
+
+@dataclass(frozen=True)
+class Signature:
+    """The kind of data: O, A, the number of discrete actions (0: continuous), and whether observations are 0 or 1."""
+
+    obs: int
+    action: int
+    actions: int
+    binary: bool
+
+    @staticmethod
+    def of(trials: Trials) -> Signature:
+        """Read off data. Observations that hold only 0 and 1 are modelled as Bernoulli, others as Gaussian."""
+        binary = bool(np.isin(trials.obs, (0, 1)).all())
+        return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
+
+    @property
+    def action_features(self) -> int:
+        """Width of an action as a network's input: one-hot if discrete."""
+        return self.actions or self.action
+
+    def encode_action(self, action: Tensor) -> Tensor:
+        """[..., A] -> [..., action_features]."""
+        return F.one_hot(action[..., 0].long(), self.actions).float() if self.actions else action
+
+    def randomise(self, action: Tensor, share: float, draws: Draws) -> Tensor:
+        """Actions [S, N, A], each replaced by a uniformly random one with probability `share`."""
+        uniform = draws.uniform(*action.shape[1:])
+        other = (uniform * self.actions).floor() if self.actions else 2 * uniform - 1
+        return torch.where(draws.uniform(action.shape[1], 1) < share, other, action)
+
+
+def take(x: Tensor, index: Tensor) -> Tensor:
+    """x [S, M, ...] at each seed's own indices [S, K] -> [S, K, ...]."""
+    return x[torch.arange(len(index), device=index.device)[:, None], index]
+
+
+def take_steps(x: Tensor, index: Tensor) -> Tensor:
+    """x [S, B, T, ...] at indices [S, K] into the B T of each seed -> [S, K, ...]."""
+    return take(x.flatten(1, 2), index)
+
+
+def extent(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest value [S, 1, F] of x [S, B, T, F] where mask [S, B, T] is not 0."""
+    padding = mask[..., None] == 0
+    low, high = x.masked_fill(padding, torch.inf).amin((1, 2)), x.masked_fill(padding, -torch.inf).amax((1, 2))
+    return low[:, None], high[:, None]
+
+
+@dataclass
+class Batch:
+    """Trials of S seeds as tensors: the steps that took place, episodes joined end to end and padded at the end.
+
+    obs, next_obs [S, B, T, O]; action [S, B, T, A]; mask [S, B, T], 1 for a step and 0 for padding.
+    """
+
+    obs: Tensor
+    action: Tensor
+    next_obs: Tensor
+    mask: Tensor
+
+    @staticmethod
+    def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
+        """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
+        if len(trials) % seeds:
+            raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
+        mask = trials.mask.reshape(len(trials), -1)
+        order = np.argsort(~mask, axis=1, kind="stable")
+
+        def join(array: NDArray[np.float32]) -> Tensor:
+            flat = np.take_along_axis(array.reshape(*mask.shape, -1), order[..., None], 1)
+            return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
+
+        steps = join(mask.astype(np.float32))[..., 0]
+        return Batch(join(trials.obs[:, :, :-1]), join(trials.action), join(trials.obs[:, :, 1:]), steps)
+
+    @staticmethod
+    def step(
+        obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> Batch:
+        """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
+        rows = [torch.as_tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
+        action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
+        return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """obs, action, next_obs and mask."""
+        return self.obs, self.action, self.next_obs, self.mask
+
+    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int | None, ...]) -> Batch:
+        return Batch(*(x[index] for x in self.tensors))
+
+    def trials(self, index: Tensor) -> Batch:
+        """Seed s's trials index[s], [S, K]."""
+        return Batch(*(take(x, index) for x in self.tensors))
+
+    def steps(self, index: Tensor) -> Batch:
+        """Seed s's steps index[s] [S, K], as `draw_steps` counts them; without a time axis."""
+        return Batch(*(take_steps(x, index) for x in self.tensors))
+
+    @cached_property
+    def _counted(self) -> Tensor:
+        return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
+
+    def joined(self, other: Batch) -> Batch:
+        """The trials of both; the shorter ones are padded."""
+        steps = max(self.mask.shape[2], other.mask.shape[2])
+
+        def padded(x: Tensor) -> Tensor:
+            return torch.cat([x, x.new_zeros(*x.shape[:2], steps - x.shape[2], *x.shape[3:])], 2)
+
+        return Batch(
+            *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
+        )
+
+    def beginnings(self, update: int, shortest: float) -> Batch:
+        """The first n steps of every trial, n log-uniform between a share of them and all, over updates 0, 1, 2, ...
+
+        What is known of theta in deployment is the beginning of a trial, and most is learned early in it: long ones are
+        needed, but not in every update, where they would take most of the time. n is the same for all seeds, so that
+        none depends on another's: it follows the golden ratio's multiples, modulo 1, and not a random number.
+        """
+        golden = (5**0.5 - 1) / 2
+        return self[:, :, : max(1, round(self.mask.shape[2] * shortest ** (golden * update % 1)))]
+
+    def draw_trials(self, k: int | None, draws: Draws) -> Batch:
+        """k trials of each seed, uniformly and with replacement; None: all, as they are."""
+        return self if k is None else self.trials(draws.below(len(self), k))
+
+    def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
+        """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""
+        if k is None:
+            return torch.arange(self.mask[0].numel(), device=self.mask.device).expand(len(self.mask), -1)
+        counted = self._counted
+        count = counted[:, -1:]
+        nth = (draws.uniform(k).double() * count).long().clamp(max=count - 1) + 1
+        return torch.searchsorted(counted, nth)
+
+    def __len__(self) -> int:
+        return self.mask.shape[1]

@@ -1,0 +1,212 @@
+"""Latent-variable models of the dynamics: what infers theta_hat from a history, and is trained on exploration.
+
+Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a, theta_hat), trained on Eq. (6). Discrete: K models of the
+dynamics, and exact Bayesian inference over which one it is (footnote 4).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief
+from deconfounded.deconf.core.data import Batch, Draws, Signature, take
+from deconfounded.deconf.core.nets import Adam, DynamicsHead, Inputs, Scaler, per_seed, sample_index
+from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
+from deconfounded.envs.task import InputError
+
+BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
+
+
+class LatentModel(nn.Module, ABC):
+    """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
+
+    `kept` [S] is the share of a memory that is left when an episode ends: 1, but where theta drifts.
+    """
+
+    kind: str
+    latent: int
+    width: int
+    inputs: Inputs
+    kept: Tensor
+
+    def __init__(self, draws: Draws) -> None:
+        super().__init__()
+        self.register_buffer("kept", torch.ones(len(draws), device=draws.device))
+
+    def forget(self, memory: Tensor) -> Tensor:
+        """The memory [S, N, M] with which the next episode of a trial begins."""
+        return torch.lerp(self.start(memory.shape[1]), memory, per_seed(self.kept[:, None], memory))
+
+    @abstractmethod
+    def start(self, n: int) -> Tensor:
+        """The memory [S, N, M] of n histories without a transition, for each seed."""
+
+    @abstractmethod
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        """Memory after one more transition each (step without a time axis); kept where its mask is 0."""
+
+    @abstractmethod
+    def last(self, batch: Batch) -> Tensor:
+        """The memory [S, B, M] of whole trials."""
+
+    @abstractmethod
+    def belief(self, memory: Tensor) -> Tensor:
+        """[..., M] -> [..., P]."""
+
+    @abstractmethod
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
+
+    @abstractmethod
+    def point(self, belief: Tensor) -> Tensor:
+        """What the belief says in one point: its mean, or its probabilities; for probes."""
+
+    @abstractmethod
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        """log p_psi(s' | s, a, theta_hat) [S, N] of a step (no time axis), under what the memory [S, N, M] says."""
+
+    @abstractmethod
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        """[S], to minimise, on trials [S, B, T]; steps: how many of them to predict, None for all."""
+
+    def set_prior(self, belief: Tensor, draws: Draws) -> None:
+        """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
+
+    def learn(self, optimizer: Adam, batch: Batch, steps: int | None, beta: float, draws: Draws) -> float:
+        """One update on `loss`; returns its mean over seeds."""
+        self.train()
+        loss = self.loss(batch, steps, beta, draws)
+        self.eval()
+        optimizer.step(loss)
+        return loss.mean().item()
+
+
+class VariationalModel(LatentModel):
+    """The paper's: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
+
+    def __init__(
+        self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(draws)
+        self.kind, self.latent, self.width = kind, latent, width
+        self.encoder: Belief = BELIEFS[kind](latent, width, signature, obs, change, draws)  # type: ignore[abstract]
+        self.inputs = self.encoder.inputs
+        self.dynamics = DynamicsHead(latent, width, self.inputs, change, draws)
+
+    def start(self, n: int) -> Tensor:
+        return self.encoder.start(n)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return self.encoder.update(memory, step)
+
+    def last(self, batch: Batch) -> Tensor:
+        return self.encoder(batch)[:, :, -1]
+
+    def belief(self, memory: Tensor) -> Tensor:
+        return torch.cat(self.encoder.posterior(memory), -1)
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        mean, std = belief.chunk(2, -1)
+        return reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+
+    def point(self, belief: Tensor) -> Tensor:
+        return belief.chunk(2, -1)[0]
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        theta_hat = self.sample(self.belief(memory), draws)
+        return self.dynamics.log_prob(step.obs, step.action, step.next_obs, theta_hat)[..., 0]
+
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        index = batch.draw_steps(steps, draws)
+        real = batch.steps(index)
+        memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
+        mean, std = self.encoder.posterior(take(memories, index))
+        return self.bound(real, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
+
+    def bound(self, real: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
+        """The negative of Eq. (6) [S], of steps [S, K]: beliefs N(mean, std^2) about each, latents drawn from them."""
+        log_next = self.dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)[..., 0]
+        kl = gaussian_kl(mean, std, *self.encoder.prior(mean))
+        return inference_loss(log_next, kl, beta, real.mask)
+
+    def set_prior(self, belief: Tensor, draws: Draws) -> None:
+        self.encoder.set_prior(self.sample(belief, draws))
+
+
+class DiscreteModel(LatentModel):
+    """theta_hat is one of K, one-hot; p_psi(s' | s, a, k) is fitted to the exact marginal likelihood.
+
+    The memory is the log-belief, updated by Bayes' rule: Eq. (5) with a learned model, without encoder or bound.
+    p(k) is uniform, so that each k stands for an equal share of p(theta); fitted, whichever k is ahead takes more.
+    """
+
+    kind = "discrete"
+
+    def __init__(
+        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> None:
+        super().__init__(draws)
+        self.latent, self.width, self.inputs = latent, width, Inputs(signature, obs)
+        self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
+
+    def _evidence(self, batch: Batch) -> Tensor:
+        log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
+        return log_next * batch.mask[..., None]
+
+    def start(self, n: int) -> Tensor:
+        scale = self.dynamics.log_std
+        return scale.new_full((len(scale), n, self.latent), -math.log(self.latent))
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return belief_update(memory, self._evidence(step))
+
+    def last(self, batch: Batch) -> Tensor:
+        return belief_update(self.start(len(batch)), self._evidence(batch).sum(2))
+
+    def belief(self, memory: Tensor) -> Tensor:
+        return memory.exp()
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        return F.one_hot(sample_index(belief, draws), self.latent).float()
+
+    def point(self, belief: Tensor) -> Tensor:
+        return belief
+
+    def forget(self, memory: Tensor) -> Tensor:
+        return super().forget(memory).log_softmax(-1)
+
+    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
+        return torch.logsumexp(memory + self._evidence(step), -1)
+
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        """The mean over histories of n = 1, 2, 4, ... steps: a trial of T is dealt, step by step, into T / n of them.
+
+        What is dealt is a history under the same theta; of a trial that ended early it is shorter. Of whole long trials
+        alone, whichever k happens to be best at the start claims every one, and the others never learn.
+        """
+        log_next, mask = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs), batch.mask
+        doublings = (mask.shape[2] - 1).bit_length()
+        padding = 2**doublings - mask.shape[2]
+        log_next, mask = F.pad(log_next, (0, 0, 0, padding)), F.pad(mask, (0, padding))
+        prior = self.start(1)[:, 0]
+        losses = []
+        for i in range(doublings + 1):
+            dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
+            losses.append(marginal_loss(prior, dealt, real))
+        return torch.stack(losses).mean(0)
+
+
+def new(
+    kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+) -> LatentModel:
+    """`evidence`, `gru` or `discrete`, untrained. Raises InputError for another kind."""
+    if kind == "discrete":
+        return DiscreteModel(latent, width, signature, obs, change, draws)
+    if kind not in BELIEFS:
+        raise InputError(f"model was {kind!r}; it must be one of {', '.join(BELIEFS)}, discrete")
+    return VariationalModel(kind, latent, width, signature, obs, change, draws)

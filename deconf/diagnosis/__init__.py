@@ -1,0 +1,1 @@
+"""Is data confounded? From expert trials and exploration alone."""

@@ -1,0 +1,1 @@
+"""One file a method, and the training loops that several share."""

@@ -1,0 +1,243 @@
+"""Deconfounded imitation learning, Tier 2: Algorithm 1 (training) and Algorithm 2 (deployment) of the paper.
+
+A latent-variable model learns from exploration that is blind to theta. Latents theta_hat_H are inferred on whole
+expert trials, and a latent-conditional policy pi_eta(a | s, theta_hat) is cloned. At test time the agent samples
+theta_hat from its belief, acts, and updates the belief on what follows.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor, ramp
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
+from deconfounded.deconf.core.drift import apart, choose_kept
+from deconfounded.deconf.core.models import LatentModel
+from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.envs.task import InputError
+from deconfounded.experts.rollout import Agent, Trials
+
+Explore = Callable[[Agent | None, Sequence[np.random.Generator]], Trials]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each generator."""
+
+
+@dataclass(frozen=True)
+class DeconfoundedConfig:
+    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy.
+
+    The discrete model has no bound to weigh and no step to leave out: beta, warm_up, inference_steps and fit_prior are
+    not for it.
+    """
+
+    model: Literal["evidence", "gru", "discrete"] = "evidence"
+    width: int = 64
+    latent: int = 4  # dimensions of theta_hat, or its number of values if discrete
+    beta: float = 1e-3
+    warm_up: float = 0.5  # share of inference updates over which beta rises to its value
+    rounds: int = 8
+    inference_updates: int = 300  # a round
+    inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
+    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
+    inference_steps: int | None = 1024  # of them, whose next observation is predicted; None: all
+    inference_rate: float = 1e-3
+    imitation_updates: int = 500  # a round
+    final_updates: int = 2000  # of the policy, after the last round
+    imitation_batch: int | None = 1024  # steps; None: all there are
+    imitation_rate: float = 1e-3
+    cooled: bool = True  # learning rates fall to 0 along a cosine
+    # Use the explorations of all rounds; else each round's alone, with demonstrations drawn anew if there is a source.
+    accumulate: bool = True
+    fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
+    drifts: bool = False  # theta changes between the episodes of a trial: see deconf/core/drift.py
+    device: str = "cpu"
+    random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
+
+
+class DeconfoundedAgent(LearnedAgent):
+    """Algorithm 2. resample: draw theta_hat anew every step, or once an episode."""
+
+    def __init__(self, model: LatentModel, policy: ActionHead, resample: Literal["step", "episode"] = "step") -> None:
+        super().__init__(policy)
+        self.model, self.resample = model, resample
+
+    @staticmethod
+    def new(
+        kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> DeconfoundedAgent:
+        """One that knows nothing yet. Raises InputError for a kind of model that there is not."""
+        model = new_model(kind, latent, width, signature, obs, change, draws)
+        return DeconfoundedAgent(model.eval(), ActionHead(model.inputs.obs_width + latent, width, signature, draws))
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DeconfoundedAgent:
+        sizes = (shape["model"], shape["latent"], shape["width"])
+        agent = cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
+        agent.resample = shape["resample"]
+        return agent
+
+    def shape(self) -> dict[str, Any]:
+        model = self.model
+        return {"model": model.kind, "latent": model.latent, "width": model.width, "resample": self.resample}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"model": self.model, "policy": self.policy}
+
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self._memory = self.model.start(self._n)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        self._latent: Tensor | None = None
+        self._memory = self.model.forget(self._memory)
+
+    def latent(self) -> Tensor:
+        """The theta_hat [S, N, D] to act under now."""
+        if self._latent is None or self.resample == "step":
+            self._latent = self.model.sample(self.model.belief(self._memory), self._draws)
+        return self._latent
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(torch.cat([self.model.inputs.obs(obs), self.latent()], -1), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        self._memory = self.model.update(self._memory, step)
+
+    def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
+        """The imitation loss [S] on steps of expert trials; their theta_hat_H is drawn from beliefs [S, B, P]."""
+        index = batch.draw_steps(steps, draws)
+        real = batch.steps(index)
+        theta_hat = self.model.sample(take(belief, index // batch.mask.shape[2]), draws)
+        with torch.no_grad():
+            inputs = self.model.inputs.obs(real.obs)
+        return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        """The imitation loss [S] on the expert's trials, given theta_hat_H."""
+        return self.loss(batch, final_belief(self.model, batch), None, self._draws)
+
+    @torch.no_grad()
+    def features(self) -> NDArray[np.float32]:
+        point = self.model.point(self.model.belief(self._memory))
+        return point.flatten(0, 1).cpu().numpy()
+
+
+class Explorer(DeconfoundedAgent):
+    """The imitator itself, so far, with some random actions; blind to theta but for what its own history tells.
+
+    In every other trial its latents are drawn once an episode from those inferred on expert trials (which is what the
+    prior stands for) instead of from the belief, so that each expert's behaviour is tried under each theta.
+    """
+
+    def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
+        super().__init__(agent.model, agent.policy)
+        self.latents, self.random_share = latents, random_share
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
+        self._drawn = take(self.latents, self._draws.below(self.latents.shape[1], self._n))
+
+    def latent(self) -> Tensor:
+        return torch.where(self._blind, self._drawn, super().latent())
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.signature.randomise(super().choose(obs), self.random_share, self._draws)
+
+
+def fit(
+    trials: Source, explore: Explore, config: DeconfoundedConfig, rng: Rngs, monitor: Monitor | None = None
+) -> DeconfoundedAgent:
+    """Algorithm 1.
+
+    trials: of the expert, without theta; in as many equal groups as there are generators in rng, one after another. Or
+    what draws them: fresh ones every round, if config does not accumulate.
+    explore: called once a round. Raises InputError if the two disagree.
+    """
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    seeds = len(rngs)
+    each = apart if config.drifts else lambda trials: trials
+    shown, first = each(drawn(trials, rngs)), explore(None, rngs)
+    episodes, first = first.mask.shape[1], each(first)
+    signature = Signature.of(shown)
+    if Signature.of(first) != signature:
+        raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
+    expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
+    # Experts' changes count too: those of random actions alone can be far smaller, and theta is then learned poorly.
+    obs, change = scalers(seen.joined(expert))
+    agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
+    model, policy = agent.model, agent.policy  # the model is in its eval mode but for its updates
+    drawn_at_once = config.inference_batch
+    if config.drifts:
+        model.kept.fill_(0.5)  # while it explores
+        drawn_at_once = drawn_at_once and drawn_at_once * episodes  # as much evidence as of trials that are whole
+
+    inferences = config.rounds * config.inference_updates
+    total = inferences + config.rounds * config.imitation_updates + config.final_updates
+    inference = Adam([model], config.inference_rate, inferences if config.cooled else None)
+    imitation = Adam([policy], config.imitation_rate)
+
+    def imitate(done: int, optimizer: Adam) -> None:
+        """One update of eta."""
+        loss = agent.loss(expert, belief, config.imitation_batch, draws)
+        optimizer.step(loss)
+        monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
+
+    begin, done = 0, 0
+    checkpoint = Checkpoint(
+        monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
+    )
+    if before := checkpoint.load():
+        begin, belief, latents, seen = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
+        expert = Batch(*before["expert"]) if before["expert"] else expert
+        done = begin * (config.inference_updates + config.imitation_updates)
+    for i in range(begin, config.rounds):
+        if i > 0:
+            explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
+            new = Batch.of(each(explore(explorer, rngs)), seeds, device)
+            seen = seen.joined(new) if config.accumulate else new
+            if not config.accumulate:
+                expert = Batch.of(each(drawn(trials, rngs)), seeds, device)
+        for j in range(config.inference_updates):  # of phi and psi
+            warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
+            beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
+            batch = beginnings.draw_trials(drawn_at_once, draws)
+            loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
+            done += 1
+            monitor.update(done, total, {"inference": loss}, agent)
+        belief = final_belief(model, expert)
+        latents = model.sample(belief, draws)
+        if config.fit_prior:
+            model.set_prior(belief, draws)
+        for _ in range(config.imitation_updates):
+            imitate(done, imitation)
+            done += 1
+        fresh = None if isinstance(trials, Trials) else expert.tensors
+        checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=seen.tensors, expert=fresh)
+    final = Adam([policy], config.imitation_rate, config.final_updates)
+    for _ in range(config.final_updates):
+        imitate(done, final)
+        done += 1
+    if config.drifts:
+        choose_kept(model, seen[:, -(len(first) // seeds) :], episodes, draws)
+    return agent
+
+
+@torch.no_grad()
+def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
+    """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
+    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
+    return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))

@@ -1,0 +1,172 @@
+"""Tier 2 as its authors released it (vuoristo/deconfounding), where that is not Algorithm 1 and 2 as they wrote it.
+
+Same data as `deconfounded`; four things differ. The policy is trained and deployed on the mean of the running belief:
+theta_hat is sampled nowhere but in the model's own training, and expert actions early in a trial are cloned under what
+was known then, not under what the whole trial tells. The KL divergence is from the belief a step before, not from the
+prior. The latent of a step predicts the next several transitions, not just one. And errors of these are squared errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from deconfounded.deconf.core.agents import Checkpoint, Monitor
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explore
+from deconfounded.envs.task import InputError
+from deconfounded.experts.rollout import Trials
+
+
+@dataclass(frozen=True)
+class MeanConfig:
+    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy."""
+
+    model: Literal["evidence", "gru"] = "gru"
+    width: int = 64
+    latent: int = 8
+    beta: float = 1.0  # weight of the KL divergence from the belief a step before, against the sum of squared errors
+    ahead: int = 10  # transitions that a latent predicts
+    rounds: int = 8
+    inference_updates: int = 60  # a round
+    inference_batch: int = 16  # trials
+    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
+    inference_steps: int = 2048  # pairs of a latent and a transition that it is to predict
+    inference_rate: float = 1e-3
+    imitation_updates: int = 250  # a round
+    final_updates: int = 2000  # of the policy, after the last round
+    imitation_batch: int = 1024  # steps
+    imitation_rate: float = 2e-3
+    device: str = "cpu"
+
+
+class MeanAgent(DeconfoundedAgent):
+    """Acts on the mean of its belief."""
+
+    model: VariationalModel
+
+    @staticmethod
+    def new(
+        kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
+    ) -> MeanAgent:
+        """One that knows nothing yet. Raises InputError for a model without a mean."""
+        if kind not in ("evidence", "gru"):
+            raise InputError(f"model was {kind!r}; it must be evidence or gru")
+        model = VariationalModel(kind, latent, width, signature, obs, change, draws)
+        return MeanAgent(model.eval(), ActionHead(signature.obs + latent, width, signature, draws))
+
+    def latent(self) -> Tensor:
+        return self.model.point(self.model.belief(self._memory))
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(torch.cat([_scaler(self.model)(obs), self.latent()], -1), self._draws)
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        """The imitation loss [S] on the expert's trials, given the running belief's mean."""
+        return self.imitation(batch, running_mean(self.model, batch), None, self._draws)
+
+    def imitation(self, batch: Batch, mean: Tensor, steps: int | None, draws: Draws) -> Tensor:
+        """The imitation loss [S] on steps of expert trials [S, B, T], under means [S, B, T, D]."""
+        index = batch.draw_steps(steps, draws)
+        real = batch.steps(index)
+        features = torch.cat([_scaler(self.model)(real.obs), take_steps(mean, index)], -1)
+        return imitation_loss(self.policy.log_prob(features, real.action), real.mask)
+
+
+def _scaler(model: VariationalModel) -> Scaler:
+    """The policy has its own inputs: the released one's, too, is trained apart from the encoder's."""
+    return model.inputs.scaler
+
+
+def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, draws: Draws) -> Tensor:
+    """[S], on trials [S, B, T]: sum over steps ahead of the mean squared error, and the KL of each belief.
+
+    Which latent predicts which transition is drawn, `inference_steps` pairs of them, that stand for all.
+    """
+    memories = model.encoder(batch)[:, :, :-1]
+    mean, std = model.encoder.posterior(memories)  # before each step, [S, B, T, D]
+    start = model.encoder.prior(mean[:, :, :1])
+    before = [torch.cat([s.expand_as(x[:, :, :1]), x[:, :, :-1]], 2) for s, x in zip(start, (mean, std), strict=True)]
+    kl = masked_mean(gaussian_kl(mean, std, *before).flatten(1), batch.mask.flatten(1))
+    theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+    ahead = min(config.ahead, batch.mask.shape[2])
+    offset = draws.below(ahead, config.inference_steps)
+    index = batch.draw_steps(config.inference_steps, draws)  # of the latents
+    steps = batch.mask.shape[2]
+    inside = index % steps + offset < steps
+    then = batch.steps(torch.where(inside, index + offset, index))
+    mask = then.mask * inside
+    out = model.dynamics(then.obs, then.action, take_steps(theta_hat, index))[..., 0, :]
+    if model.inputs.signature.binary:
+        error = (torch.sigmoid(out) - then.next_obs).square().mean(-1)
+    else:
+        error = (out - model.dynamics.change(then.next_obs - then.obs)).square().mean(-1)
+    return ahead * masked_mean(error, mask) + config.beta * kl
+
+
+@torch.no_grad()
+def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tensor:
+    """The belief's mean before each step, [S, B, T, D]; so many trials at a time, for the sake of memory."""
+    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
+    return torch.cat([model.encoder.posterior(model.encoder(trials[:, i])[:, :, :-1])[0] for i in indices], 1)
+
+
+def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
+    """trials: of the expert, without theta, in as many equal groups as there are generators in rng.
+
+    explore: called once a round. Raises InputError for less than one round.
+    """
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    first, draws = explore(None, rngs), Draws(rngs, device)
+    expert, seen = Batch.of(trials, len(rngs), device), Batch.of(first, len(rngs), device)
+    obs, change = scalers(seen.joined(expert))
+    agent = MeanAgent.new(config.model, config.latent, config.width, Signature.of(trials), obs, change, draws)
+    model, policy = agent.model, agent.policy
+    assert isinstance(model, VariationalModel)
+    inferences = config.rounds * config.inference_updates
+    total = inferences + config.rounds * config.imitation_updates + config.final_updates
+    inference = Adam([model], config.inference_rate, inferences)
+    imitation = Adam([policy], config.imitation_rate)
+    checkpoint = Checkpoint(
+        monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
+    )
+    begin, done = 0, 0
+    if before := checkpoint.load():
+        begin, seen, mean = before["round"], Batch(*before["seen"]), before["mean"]
+        done = begin * (config.inference_updates + config.imitation_updates)
+
+    def imitate(updates: int, optimizer: Adam, done: int) -> int:
+        """That many updates of eta; returns how many there were of all kinds."""
+        for _ in range(updates):
+            loss = agent.imitation(expert, mean, config.imitation_batch, draws)
+            optimizer.step(loss)
+            done += 1
+            monitor.update(done, total, {"imitation": loss.mean().item()}, agent)
+        return done
+
+    for i in range(begin, config.rounds):
+        if i > 0:
+            seen = seen.joined(Batch.of(explore(agent, rngs), len(rngs), device))
+        for j in range(config.inference_updates):
+            beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
+            model.train()
+            loss = inference_loss(model, beginnings.draw_trials(config.inference_batch, draws), config, draws)
+            model.eval()
+            inference.step(loss)
+            done += 1
+            monitor.update(done, total, {"inference": loss.mean().item()}, agent)
+        mean = running_mean(model, expert)
+        done = imitate(config.imitation_updates, imitation, done)
+        checkpoint.save(round=i + 1, seen=seen.tensors, mean=mean)
+    final = Adam([policy], config.imitation_rate, config.final_updates)
+    imitate(config.final_updates, final, done)
+    return agent

@@ -1,0 +1,287 @@
+"""GAIL with memory, the published paper's baseline: a recurrent policy, trained by PPO to be taken for the expert.
+
+A discriminator tells the expert's transitions (s, a, s') from the policy's own (Ho and Ermon, 2016), and its logit is
+the reward. Practice is in environments without theta, which are stepped far more often than any explorer does; no
+reward of the task is seen. What the policy does is so made to look like the expert's mixture over theta: it need not be
+what the expert does under *this* theta, unless the transitions show it.
+
+RecurrentPPO is sb3-contrib's. A trial is one episode of it, so that its LSTM outlives the resets. Seeds practise one
+after another, each with random numbers of its own; their discriminators are trained side by side.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
+from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
+from deconfounded.envs.task import InputError
+from deconfounded.experts.rollout import Trials
+
+if TYPE_CHECKING:
+    from sb3_contrib import RecurrentPPO
+
+    from deconfounded.deconf.methods.practice import Practice, Reward
+
+Practise = Callable[[int, int, NDArray[Any], NDArray[Any], "Reward"], "Practice"]
+"""n environments from a seed, that scale observations by mean and std [O], with that reward."""
+
+
+@dataclass(frozen=True)
+class GailConfig:
+    """Widths and amounts, for each seed. A round is `steps` in each of `envs`, from new trials; then PPO, then D."""
+
+    width: int = 64
+    rounds: int = 60
+    envs: int = 16
+    steps: int = 512
+    epochs: int = 5  # of PPO, over a round's steps
+    minibatch: int = 1024  # steps
+    gamma: float = 0.99
+    policy_rate: float = 1e-3
+    discriminator_updates: int = 20  # a round
+    discriminator_batch: int = 512  # transitions of each kind
+    discriminator_rate: float = 1e-3
+    device: str = "cpu"
+
+
+class Lstm(nn.Module):
+    """S LSTMs side by side, for deployment: torch's own equations, gates i, f, g, o."""
+
+    def __init__(self, inputs: int, width: int, draws: Draws) -> None:
+        super().__init__()
+        self.width = width
+        self.input, self.recurrent = Linear(inputs, 4 * width, draws), Linear(width, 4 * width, draws)
+
+    def forward(self, x: Tensor, state: Tensor) -> Tensor:
+        """x [S, N, I], state [S, N, 2 W] (hidden, cell) -> the next state."""
+        hidden, cell = state.chunk(2, -1)
+        i, f, g, o = (self.input(x) + self.recurrent(hidden)).chunk(4, -1)
+        cell = f.sigmoid() * cell + i.sigmoid() * g.tanh()
+        return torch.cat([o.sigmoid() * cell.tanh(), cell], -1)
+
+
+class PpoHead(ActionHead):
+    """Stable-Baselines3's distribution: categorical, or Gaussian with one std, whatever the features."""
+
+    def __init__(self, width: int, signature: Signature, draws: Draws) -> None:
+        super().__init__(width, width, signature, draws)
+        self.net = mlp(width, width, signature.actions or signature.action, draws)
+        self.log_std = nn.Parameter(torch.zeros(len(draws), 1, signature.action, device=draws.device))
+
+    def _gaussian(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        mean = self.net(features)
+        return mean, self.log_std.exp().expand_as(mean)
+
+
+class GailAgent(LearnedAgent):
+    """What PPO has trained, of all seeds; it acts as that does, and carries its memory over resets."""
+
+    policy: PpoHead
+
+    def __init__(self, lstm: Lstm, policy: PpoHead, obs: Scaler) -> None:
+        super().__init__(policy)
+        self.lstm, self.obs, self.width = lstm, obs, lstm.width
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> GailAgent:
+        width = shape["width"]
+        lstm = Lstm(signature.obs + signature.action_features + 1, width, draws)
+        return cls(lstm, PpoHead(width, signature, draws), obs)
+
+    def shape(self) -> dict[str, Any]:
+        return {"width": self.width}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"lstm": self.lstm, "policy": self.policy, "obs": self.obs}
+
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self._state = torch.zeros(self.seeds, self._n, 2 * self.width, device=self.device)
+        self._next = self._state
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        before = self.policy.signature.action_features
+        self._before = torch.zeros(self.seeds, self._n, before + 1, device=self.device)
+        self._before[..., -1] = 1  # an episode begins
+
+    def choose(self, obs: Tensor) -> Tensor:
+        self._next = self.lstm(torch.cat([self.obs(obs), self._before], -1), self._state)
+        return self.policy.sample(self._next[..., : self.width], self._draws)
+
+    def remember(self, step: Batch) -> None:
+        alive = step.mask[..., None] > 0
+        action = self.policy.signature.encode_action(step.action)
+        self._state = torch.where(alive, self._next, self._state)
+        self._before = torch.where(alive, F.pad(action, (0, 1)), self._before)
+
+    def features(self) -> NDArray[np.float32]:
+        return self._state[..., : self.width].flatten(0, 1).cpu().numpy()
+
+    @torch.no_grad()
+    def take(self, i: int, policy: Any) -> None:
+        """The weights of Stable-Baselines3's policy, for seed i."""
+        lstm = policy.lstm_actor
+        for gate, weight, bias in (
+            (self.lstm.input, lstm.weight_ih_l0, lstm.bias_ih_l0),
+            (self.lstm.recurrent, lstm.weight_hh_l0, lstm.bias_hh_l0),
+        ):
+            gate.weight[i], gate.bias[i, 0] = weight.T, bias
+        theirs = [*policy.mlp_extractor.policy_net, policy.action_net]
+        linear = [layer for layer in theirs if isinstance(layer, nn.Linear)]
+        ours = [layer for layer in self.policy.net if isinstance(layer, Linear)]
+        for mine, layer in zip(ours, linear, strict=True):
+            mine.weight[i], mine.bias[i, 0] = layer.weight.T, layer.bias
+        if not self.policy.signature.actions:
+            self.policy.log_std[i, 0] = policy.log_std
+
+
+class Discriminator(nn.Module):
+    """Logits that a transition is the expert's."""
+
+    def __init__(self, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws) -> None:
+        super().__init__()
+        self.signature, self.obs, self.change = signature, obs, change
+        self.net = mlp(2 * signature.obs + signature.action_features, width, 1, draws)
+
+    def forward(self, batch: Batch) -> Tensor:
+        """Steps [S, N] without a time axis -> [S, N]."""
+        inputs = [self.obs(batch.obs), self.signature.encode_action(batch.action)]
+        return self.net(torch.cat([*inputs, self.change(batch.next_obs - batch.obs)], -1))[..., 0]
+
+    def loss(self, expert: Batch, own: Batch) -> Tensor:
+        """[S]: cross-entropy of telling the expert's steps from the policy's own."""
+        return (F.softplus(-self(expert)) + F.softplus(self(own))).mean(-1) / 2
+
+    @torch.no_grad()
+    def reward(self, *step: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The logit [N] of transitions: observation, action, next observation; of one seed's discriminator alone."""
+        obs, action, then = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
+        return self(Batch(obs, action, then, obs[..., 0]))[0].cpu().numpy()
+
+    def of_seed(self, i: int) -> Discriminator:
+        """A copy of the i-th seed's."""
+        one = copy.deepcopy(self)
+        for tensor in (*one.parameters(), *one.buffers()):
+            tensor.data = tensor.data[i : i + 1]
+        return one
+
+
+@contextlib.contextmanager
+def numbers(seed: int) -> Iterator[None]:
+    """Stable-Baselines3 draws from torch's and numpy's global generators: seeded here, and put back after."""
+    before = np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            np.random.set_state(before)  # noqa: NPY002
+
+
+class Player:
+    """RecurrentPPO of one seed: what of it is to be kept in a checkpoint."""
+
+    def __init__(self, ppo: RecurrentPPO) -> None:
+        self.ppo = ppo
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"policy": self.ppo.policy.state_dict(), "adam": self.ppo.policy.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.ppo.policy.load_state_dict(state["policy"])
+        self.ppo.policy.optimizer.load_state_dict(state["adam"])
+
+
+def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monitor: Monitor | None = None) -> GailAgent:
+    """trials: of the expert, in as many equal groups as there are generators in rng; practise: in what it trains.
+
+    Raises InputError for less than one round, or where sb3-contrib is not installed.
+    """
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    if find_spec("sb3_contrib") is None:
+        raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
+    rngs, monitor, signature = listed(rng), monitor or Monitor(), Signature.of(trials)
+    seeds, draws = len(rngs), Draws(rngs, config.device)
+    expert = Batch.of(trials, seeds, config.device)
+    obs, change = scalers(expert)
+    discriminator = Discriminator(config.width, signature, obs, change, draws)
+    optimizer = Adam([discriminator], config.discriminator_rate)
+    agent = GailAgent.blank({"width": config.width}, signature, obs, draws)
+    mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
+
+    def environments(i: int) -> Practice:
+        return practise(config.envs, int(rngs[i].integers(2**31)), mean[i], std[i], discriminator.of_seed(i).reward)
+
+    players = [Player(_ppo(environments(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
+    named = {f"player{i}": player for i, player in enumerate(players)}
+    checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
+    begin = (checkpoint.load() or {"round": 0})["round"]
+    for done in range(begin, config.rounds):
+        own, begun = [], []
+        for i, player in enumerate(players):
+            env = environments(i)
+            with numbers(int(rngs[i].integers(2**31))):
+                player.ppo.set_env(env)
+                player.ppo.learn(config.envs * config.steps)
+            own.append([np.concatenate(column) for column in zip(*env.transitions, strict=True)])
+            begun.append(env.begun)
+            agent.take(i, player.ppo.policy)
+        monitor.spend("exploration_trials", begun)
+        monitor.spend("interactions", [config.envs * config.steps] * seeds)
+        before, action, then = (torch.as_tensor(np.stack(x), device=config.device) for x in zip(*own, strict=True))
+        seen = Batch(before, action, then, torch.ones_like(before[..., 0]))[:, None]
+        losses = []
+        for _ in range(config.discriminator_updates):
+            real, fake = (x.steps(x.draw_steps(config.discriminator_batch, draws)) for x in (expert, seen))
+            loss = discriminator.loss(real, fake)
+            optimizer.step(loss)
+            losses.append(loss.mean().item())
+        monitor.update(done + 1, config.rounds, {"discriminator": float(np.mean(losses))}, agent)
+        checkpoint.save(round=done + 1)
+    return agent
+
+
+def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
+    """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
+    from sb3_contrib import RecurrentPPO
+    from stable_baselines3.common.logger import Logger
+
+    from deconfounded.deconf.methods.practice import WholePolicy
+
+    widths = [config.width, config.width]
+    policy = {
+        "lstm_hidden_size": config.width,
+        "net_arch": {"pi": widths, "vf": widths},
+        "activation_fn": nn.ReLU,
+        "log_std_init": -0.5,
+    }
+    with numbers(seed):
+        ppo = RecurrentPPO(
+            WholePolicy,
+            env,
+            learning_rate=config.policy_rate,
+            n_steps=config.steps,
+            batch_size=config.minibatch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            policy_kwargs=policy,
+            device=config.device,
+        )
+    ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
+    return ppo

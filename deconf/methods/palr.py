@@ -1,0 +1,104 @@
+"""Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn, whose memory is to forget its last action.
+
+What the memory knows of the action just taken is to be no more than what the expert's next action explains. The penalty
+is kernel-based, the Hilbert-Schmidt conditional independence criterion, HSCIC (Park and Muandet, 2020): the dependence
+between memory and past action, given the action to come. It is 0 where they are conditionally independent. Only the
+last action is kept from leaking: older ones may, and so may a theta that was wrongly inferred from them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from deconfounded.deconf.core.agents import Monitor
+from deconfounded.deconf.core.beliefs import GruMemory
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, take_steps
+from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.methods.clones import by_chunks, clone
+from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
+
+
+@dataclass(frozen=True)
+class PalrConfig(RecurrentConfig):
+    """penalty: weight of the HSCIC; samples: steps of a chunk that it is estimated on; ridge: of its regression."""
+
+    penalty: float = 0.1
+    samples: int = 128
+    ridge: float = 1e-2
+
+
+def kernel(x: Tensor) -> Tensor:
+    """Gaussian kernel matrix [n, n] of rows [n, F]; its width is their root mean square distance."""
+    squares = (x[:, None] - x[None]).square().sum(-1)
+    return torch.exp(-squares / squares.detach().mean().clamp(min=1e-6))
+
+
+def hscic(x: Tensor, y: Tensor, given: Tensor, ridge: float) -> Tensor:
+    """The squared distance of P(x, y | z) from P(x | z) P(y | z), as kernel embeddings; averaged over z. A number.
+
+    x [n, F], y [n, G], given [n, H]: joint samples of x, y and z. ridge: of the regressions on z, a sample.
+    """
+    kx, ky, kz = kernel(x), kernel(y), kernel(given)
+    n = len(x)
+    weight = torch.linalg.solve(kz + n * ridge * torch.eye(n, device=x.device), kz)  # a column for each z
+    by_x, by_y = kx @ weight, ky @ weight
+    joint = (weight * ((kx * ky) @ weight)).sum(0)
+    mixed = (weight * by_x * by_y).sum(0)
+    apart = (weight * by_x).sum(0) * (weight * by_y).sum(0)
+    return (joint - 2 * mixed + apart).mean()
+
+
+class PalrAgent(RecurrentAgent):
+    """naive_rnn's; what is new is its loss."""
+
+    config: PalrConfig | None = None  # while it is trained
+    noise: Draws
+
+    @staticmethod
+    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
+        agent = PalrAgent(
+            GruMemory(width, signature, obs, draws), ActionHead(width + signature.obs, width, signature, draws)
+        )
+        agent.noise = draws
+        return agent
+
+    def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        states = self.memory(batch, state)
+        features = torch.cat([states[:, :, :-1], self.memory.inputs.scaler(batch.obs)], -1)
+        log_policy = self.policy.log_prob(features, label)
+        loss = imitation_loss(log_policy.flatten(1), batch.mask.flatten(1))
+        if self.config is not None:
+            loss = loss + self.config.penalty * self.leakage(states[:, :, :-1], batch, label)
+        return loss, states[:, :, -1].detach()
+
+    def leakage(self, memories: Tensor, batch: Batch, label: Tensor) -> Tensor:
+        """HSCIC [S] of the memory [S, B, T, W] before each step and the action taken last, given the expert's next."""
+        assert self.config is not None
+        if batch.mask.shape[2] < 2:
+            return memories.new_zeros(len(memories))
+        encode, later = self.policy.signature.encode_action, batch[:, :, 1:]
+        index = later.draw_steps(self.config.samples, self.noise)
+        columns = (memories[:, :, 1:], encode(batch.action[:, :, :-1]), encode(label[:, :, 1:]))
+        drawn = (take_steps(column, index) for column in columns)
+        # Seed by seed: a product over a stack may take another order for one seed than for several.
+        found = torch.stack([hscic(x, y, given, self.config.ridge) for x, y, given in zip(*drawn, strict=True)])
+        return found * (later.mask.flatten(1).sum(1) > 0)  # of padding alone, nothing leaks
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
+
+
+def fit(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> PalrAgent:
+    """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
+
+    def start(signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
+        agent = PalrAgent.new(config.width, signature, obs, draws)
+        agent.config = config
+        return agent
+
+    return clone(trials, config, rng, start, by_chunks(config), monitor)

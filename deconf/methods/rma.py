@@ -1,0 +1,160 @@
+"""Teacher and student as in rapid motor adaptation (Kumar et al., 2021): sees theta in training, and only there.
+
+The teacher is oracle BC, pi(a | s, theta), cloned from demonstrations whose thetas are told. The student acts by the
+teacher's policy on its own estimate of theta, which a recurrent network regresses from its own roll-outs: their actions
+were chosen by the student, and so are no evidence of theta. It acts on one estimate, the mean, as though it were sure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
+from deconfounded.deconf.core.beliefs import GruMemory
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
+from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.methods import cloning
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.envs.task import Array, InputError
+from deconfounded.experts.rollout import Agent, Trials
+
+Tell = Callable[[Agent | None, Sequence[np.random.Generator]], tuple[Trials, Array]]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each generator.
+
+Returns trials, and the encoded theta [B, E, F] of their episodes."""
+
+
+@dataclass(frozen=True)
+class RmaConfig:
+    """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation.
+
+    Updates are of the student; each round adds roll-outs of the student so far, and later rounds get more updates.
+    """
+
+    width: int = 64
+    updates: int = 1500
+    batch: int = 32
+    chunk: int = 50
+    rounds: int = 8
+    learning_rate: float = 3e-3
+    teacher_updates: int = 2000
+    teacher_batch: int = 1024  # steps
+    teacher_rate: float = 2e-3
+    device: str = "cpu"
+
+
+class Adapter(GruMemory):
+    """Regresses theta from a history of the student's own transitions."""
+
+    def __init__(self, width: int, theta: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
+        super().__init__(width, signature, obs, draws)
+        self.theta, self.out = theta, mlp(width, width, theta, draws)
+
+
+class RmaAgent(LearnedAgent):
+    """Acts on the observation and on its estimate of theta; carries its memory over resets."""
+
+    def __init__(self, adapter: Adapter, policy: ActionHead, obs: Scaler) -> None:
+        super().__init__(policy)
+        self.adapter, self.obs = adapter, obs
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RmaAgent:
+        width, theta = shape["width"], shape["theta"]
+        policy = ActionHead(signature.obs + theta, shape["teacher"], signature, draws)
+        return cls(Adapter(width, theta, signature, obs, draws), policy, obs)
+
+    def shape(self) -> dict[str, Any]:
+        teacher = next(self.policy.parameters()).shape[-1]
+        return {"width": self.adapter.width, "theta": self.adapter.theta, "teacher": teacher}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"adapter": self.adapter, "policy": self.policy, "obs": self.obs}
+
+    def begin(self, n: int) -> None:
+        super().begin(n)
+        self._state = self.adapter.start(self._n)
+
+    def choose(self, obs: Tensor) -> Tensor:
+        return self.policy.sample(torch.cat([self.obs(obs), self.adapter.out(self._state)], -1), self._draws)
+
+    def remember(self, step: Batch) -> None:
+        self._state = self.adapter.update(self._state, step)
+
+    @torch.no_grad()
+    def features(self) -> NDArray[np.float32]:
+        return self.adapter.out(self._state).flatten(0, 1).cpu().numpy()
+
+    def loss(self, batch: Batch, theta: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Squared error [S] of theta [S, B, T, F] after a memory [S, B, W], and the memory after the batch."""
+        states = self.adapter(batch, state)
+        error = (self.adapter.out(states[:, :, :-1]) - theta).square().sum(-1)
+        return masked_mean(error.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
+
+
+def fit(
+    trials: Trials, theta: Array, tell: Tell, config: RmaConfig, rng: Rngs, monitor: Monitor | None = None
+) -> RmaAgent:
+    """Clone the teacher, then teach the student on its own roll-outs.
+
+    trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
+    Raises InputError for less than one round.
+    """
+    if config.rounds < 1:
+        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
+    rngs, monitor = listed(rng), monitor or Monitor()
+    draws = Draws(rngs, config.device)
+    teacher = cloning.fit(trials, _teacher(config), rngs, theta)
+    signature, width = Signature.of(trials), config.width
+    adapter = Adapter(width, theta.shape[-1], signature, teacher.scaler, draws)
+    agent = RmaAgent(adapter, teacher.policy, teacher.scaler)
+    chunks = -(-trials.mask[0].size // config.chunk)
+    share = config.updates / (chunks * config.rounds * (config.rounds + 1) / 2)
+    passes = [max(1, round(share * (i + 1))) for i in range(config.rounds)]
+    total = sum(passes) * chunks
+    optimizer = Adam([adapter], config.learning_rate, total)
+    checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=optimizer, draws=draws)
+    data, told, begin = None, torch.empty(0), 0
+    if before := checkpoint.load():
+        begin, data, told = before["round"], Batch(*before["data"]), before["told"]
+    for i in range(begin, config.rounds):
+        own, thetas = tell(agent if i > 0 else None, rngs)
+        new, label = Batch.of(own, len(rngs), config.device), along(own, thetas, len(rngs), config.device)
+        data, told = (new, label) if data is None else (data.joined(new), torch.cat([told, label], 1))
+        for j in range(passes[i]):
+            index = draws.below(len(data), config.batch)
+            error = _pass(agent, optimizer, data.trials(index), take(told, index), config.chunk)
+            monitor.update((sum(passes[:i]) + j + 1) * chunks, total, {"theta": error}, agent)
+        checkpoint.save(round=i + 1, data=data.tensors, told=told)
+    return agent
+
+
+def _teacher(config: RmaConfig) -> CloningConfig:
+    return CloningConfig(
+        config.width, config.teacher_updates, config.teacher_batch, config.teacher_rate, device=config.device
+    )
+
+
+def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: int) -> float:
+    """An update a chunk of trials [S, B, T], the memory passed on between chunks; returns the mean error."""
+    state, errors = agent.adapter.start(len(batch)), []
+    for begin in range(0, batch.mask.shape[2], chunk):
+        part = slice(begin, begin + chunk)
+        error, state = agent.loss(batch[:, :, part], theta[:, :, part], state)
+        optimizer.step(error)
+        errors.append(error.mean().item())
+    return sum(errors) / len(errors)
+
+
+def along(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
+    """theta [B, E, F] of episodes -> [S, B, T, F], at each step as `Batch.of` joins them."""
+    each = np.repeat(theta[:, :, None], trials.mask.shape[2], 2).astype(np.float32)
+    return Batch.of(Trials(trials.obs, each, trials.mask), seeds, device).action

@@ -1,0 +1,1 @@
+"""What every task must hold, as checks: its maths, its physics, its protocols."""

@@ -1,0 +1,113 @@
+"""Does a task hold together? Asked before anything is trained or measured: a slip in a task file is one line then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from gymnasium import spaces
+
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.contract.probe import actions, beyond_bounds
+from deconfounded.envs.outside import told
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Streams
+from deconfounded.envs.task import InputError, Task
+
+
+def sentence(error: Exception) -> str:
+    """One line: what an error says and, unless it is a check's own, its type and where it was raised."""
+    ours = isinstance(error, AssertionError) and str(error)
+    return " ".join(str(error).split()) if ours else told(error)
+
+
+@contextmanager
+def _part(task: Task, name: str) -> Iterator[None]:
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{name} of {task.name}: {sentence(error)}") from error
+
+
+def check_task(task: Task) -> None:
+    """Build it, take one step, then an episode of random actions. Raises InputError that names what does not fit."""
+    if isinstance(task, MujocoTask):
+        _check_model(task)
+    with _part(task, "action_space"):
+        _check_actions(task)
+    n = 2
+    rng = Streams([np.random.default_rng(seed) for seed in range(n)])
+    action = np.zeros((n, *(task.action_space.shape or (1,))))
+    with _part(task, "apply_latent"):
+        env = BatchEnv(task, n)
+    with _part(task, "init_state"):
+        state = task.init_state(rng)
+    with _part(task, "outcome"):
+        noise = task.sample_noise(rng)[:, 0]
+        then = task.apply_noise(env.simulator.outcome(state, action), noise)
+    for name, shape, ask in (
+        ("observe", (n, len(task.observation)), lambda: task.observe(state)),
+        ("reward", (n,), lambda: task.reward(state, action, then, env.theta)),
+        ("terminated", (n,), lambda: task.terminated(then)),
+    ):
+        with _part(task, name):
+            given = np.asarray(ask())
+            if given.shape != shape:
+                raise InputError(f"{name} of {task.name} gave {given.shape} of {n} environments; it must be {shape}")
+            if not np.isfinite(given).all():
+                raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
+    with _part(task, "an episode"):
+        _check_episodes(task)
+
+
+def _check_model(task: MujocoTask) -> None:
+    """The model compiles, every joint has its noise stated, and pictures have their camera."""
+    with _part(task, f"the model ({task.home.name}/{task.name}.xml, or what `spec` makes)"):
+        model = task.model
+    with _part(task, "process_noise"):
+        noise = task.noise
+        for i in range(model.njnt):
+            if (joint := model.joint(i).name) not in task.process_noise:
+                named = f"joint {joint}" if joint else f"joint number {i}, which has no name"
+                raise InputError(f"process_noise of {task.name} lacks {named}; it must have every joint, 0 if no noise")
+        if not noise.size:
+            raise InputError(f"process_noise of {task.name} was 0 throughout; one step must not give theta away")
+    cameras = [model.camera(i).name for i in range(model.ncam)]
+    if "view" not in cameras:
+        given = ", ".join(cameras) or "none"
+        raise InputError(f"cameras of {task.name} were {given}; one must be called view, for pictures")
+
+
+def _check_actions(task: Task) -> None:
+    """Actions are those that experts, networks and random agents make, and the expert's have a density."""
+    space = task.action_space
+    if isinstance(space, spaces.Discrete):
+        return
+    box = isinstance(space, spaces.Box) and len(space.shape) == 1
+    if not box or (space.low != -1).any() or (space.high != 1).any():
+        given = " ".join(str(space).split())
+        raise InputError(
+            f"action_space of {task.name} was {given}; it must be Box(-1, 1, (A,)), which `control` scales, or Discrete"
+        )
+    if not 0 < task.expert_noise < np.inf:
+        raise InputError(
+            f"expert_noise of {task.name} was {task.expert_noise:g}; it must be above 0, and finite, or the expert's"
+            f" log_prob is NaN"
+        )
+
+
+def _check_episodes(task: Task) -> None:
+    """Rewards and observations keep to their bounds, in an episode each of 16 environments with random actions."""
+    env = BatchEnv(task, 16)
+    env.reset(0)
+    for action in actions(task, 16, task.horizon):
+        if beyond := beyond_bounds(task, env.state[env.alive]):
+            raise InputError(beyond)
+        reward = env.step(action)[1].max()
+        if reward > 1 + 1e-9:
+            raise InputError(f"reward of {task.name} was {reward:g}; it must be at most 1 a step")
+        if not env.alive.any():
+            return

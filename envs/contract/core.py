@@ -1,0 +1,288 @@
+"""The contract as a library: what every task must hold, each check by name, so that any task can be held to it.
+
+    for check in CONTRACT.values():
+        check(task)
+
+A check returns nothing, or raises AssertionError or InputError with a sentence that says what it found, or Skipped if
+it does not apply or cannot be made here. All are of the task at hand: no registry is asked. What adapters must do is in
+protocols.py, and what is MuJoCo's in physics.py.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from deconfounded.envs.adapters import GymEnv, GymVectorEnv
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.contract import physics, protocols
+from deconfounded.envs.contract.probe import Skipped, actions, far_thetas, refused, require, same, streams
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.task import Array, Task
+
+
+def no_leak(task: Task) -> None:
+    """Same seed, many thetas: the first observations and infos are identical."""
+    env = GymEnv(task)
+    first = [env.reset(seed=3, options={"theta": theta}) for theta in far_thetas(task)]
+    for theta, (obs, info) in zip(far_thetas(task), first, strict=True):
+        same(obs, first[0][0], f"first observations of theta {theta} and {far_thetas(task)[0]}, of the same seed,")
+        require(info == {}, f"the info of reset was {info}; it must be empty")
+    info = env.step(env.action_space.sample())[4]
+    require(info == {}, f"the info of step was {info}; it must be empty")
+
+
+def effect(task: Task) -> None:
+    """Same seed and actions, another theta: another trajectory. Where no tier has a cure, exactly the same one.
+
+    Actions are random or, since Tier 3 may need to be looked for, each axis pushed for the whole episode.
+    """
+    plans, thetas = [actions(task, 1, task.horizon)], far_thetas(task)
+    if isinstance(task, MujocoTask):
+        axes = np.eye(task.action_space.shape[0])
+        plans += [np.tile(axis, (task.horizon, 1, 1)) for axis in axes]
+    differs = np.zeros((len(plans), len(thetas) - 1), bool)
+    for i, plan in enumerate(plans):
+        runs = []
+        for theta in thetas:
+            batch = BatchEnv(task, 1)
+            batch.reset(3, {"theta": theta})
+            runs.append(np.array([batch.step(action)[0] for action in plan]))
+        differs[i] = [(runs[0] != run).any() for run in runs[1:]]
+    if task.tier is None:
+        require(not differs.any(), "theta changes a trajectory, and the tier is None: nothing must tell of theta")
+    else:
+        alike = thetas[1:][np.logical_not(differs.any(0))].tolist()
+        require(not alike, f"thetas {alike} have the trajectories of {thetas[0].tolist()}; theta must have an effect")
+
+
+def privileged_view(task: Task) -> None:
+    """It appends the encoded theta, and is the same otherwise."""
+    plain, privileged = GymEnv(task), GymEnv(task, privileged=True)
+    obs, seen = plain.reset(seed=5)[0], privileged.reset(seed=5)[0]
+    same(seen[: len(obs)], obs, "observations with and without the privileged view")
+    encoded, appended = task.encode_theta(plain.batch.theta)[0], seen[len(obs) :]
+    equal = appended.shape == encoded.shape and np.allclose(appended, encoded, rtol=1e-6, atol=0)
+    require(equal, f"the privileged view appends {appended}; it must be {encoded}, the encoded theta")
+
+
+def keep_theta(task: Task) -> None:
+    """A trial keeps its theta, but for what drifts, and gets a new start or noise; the next trial gets a new theta."""
+    batch = BatchEnv(task, 16)
+    batch.reset(1)
+    theta = batch.theta.copy()
+    first = [batch.step(action)[0] for action in actions(task, 16, 3)]
+    batch.reset(options={"keep_theta": True})
+    for i, latent in enumerate(task.latents):
+        before, after = theta[:, i], batch.theta[:, i]
+        if latent.drift:
+            require((before != after).all(), f"{latent.name}, which drifts, stood still from one episode to the next")
+        else:
+            same(after, before, f"{latent.name} before and after a reset with keep_theta")
+    again = [batch.step(action)[0] for action in actions(task, 16, 3)]
+    require((np.array(first) != np.array(again)).any(), "two episodes of a trial are the same: neither start nor noise")
+    batch.reset()
+    require((batch.theta != theta).any(), "a reset without keep_theta drew the theta of the trial before")
+
+
+def theta_follows_its_distribution(task: Task) -> None:
+    """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003).
+
+    So is that of what they drift to.
+    """
+    draws = task.sample_theta(streams(*range(2000)))
+    if task.drifts:
+        draws = task.drifted(draws, streams(*range(2000, 4000)))
+    for i, latent in enumerate(task.latents):
+        if latent.distribution == "categorical":
+            counts = (draws[:, i, None] == latent.grid(0)).mean(0)
+            off = np.abs(counts - 1 / latent.features).max()
+        else:
+            sorted_cdf = np.sort(latent.cdf(draws[:, i]))
+            off = np.abs(sorted_cdf - (np.arange(2000) + 0.5) / 2000).max()
+        require(off < 0.04, f"2,000 draws of {latent.name} are {off:.3f} off its distribution; it must be below .04")
+
+
+def any_batch_size(task: Task) -> None:
+    """An environment's run depends on its own seed alone, to the bit."""
+    acts = actions(task, 5, task.horizon)
+    large = BatchEnv(task, 5)
+    seen = [large.reset(11)] + [large.step(action)[0] for action in acts]
+    for i in (0, 4):
+        small = BatchEnv(task, 1)
+        again = [small.reset(11 + i)] + [small.step(action[i : i + 1])[0] for action in acts]
+        same(np.array(seen)[:, i], np.array(again)[:, 0], f"runs of seed {11 + i} among five and alone")
+
+
+def seed_streams(task: Task) -> None:
+    """Environment i of seed s draws theta, start and noise from SeedSequence(s + i).spawn(3), in that order."""
+    batch = BatchEnv(task, 2)
+    batch.reset(20)
+    for i in range(2):
+        theta, start, _ = map(streams, np.random.SeedSequence(20 + i).spawn(3))  # type: ignore[arg-type]
+        same(batch.theta[i], task.sample_theta(theta)[0], "theta and what the seed's first stream draws")
+        same(batch.state[i], task.init_state(start)[0], "the start and what the seed's second stream draws")
+
+
+def seed_kinds(task: Task) -> None:
+    """A seed is a number from 0 up, of any kind, or one for each environment."""
+    batch = BatchEnv(task, 2)
+    first = batch.reset(3)
+    kinds: tuple[Any, ...] = (np.int64(3), [3, 4])
+    for kind in kinds:
+        same(batch.reset(kind), first, f"first observations of seed 3 and {kind!r}")
+    for wrong in ([1], -1):
+        with refused(f"seed {wrong} of two environments", "seed was"):
+            batch.reset(wrong)
+
+
+def forced_theta_moves_nothing_else(task: Task) -> None:
+    """Start and noise belong to the seed: forcing the theta that would have been drawn changes no bit."""
+    acts = actions(task, 4, 10)
+    free, forced = BatchEnv(task, 4), BatchEnv(task, 4)
+    seen = [free.reset(2)] + [free.step(action)[0] for action in acts]
+    again = [forced.reset(2, {"theta": free.theta.copy()})] + [forced.step(action)[0] for action in acts]
+    same(np.array(seen), np.array(again), "runs of the same seed with theta drawn and forced")
+
+
+def starts_vary_and_nothing_is_constant(task: Task) -> None:
+    """No observation stands still for whole episodes, and physics does not start in the same place each time."""
+    batch = BatchEnv(task, 8)
+    seen = np.array([batch.reset(0)] + [batch.step(action)[0] for action in actions(task, 8, task.horizon)])
+    still = [name for name, ptp in zip(task.observation, np.ptp(seen, (0, 1)), strict=True) if not ptp > 0]
+    require(not still, f"observation {', '.join(still)} of {task.name} never moved; it must tell something")
+    if isinstance(task, MujocoTask):
+        require(
+            (seen[0] != seen[0, 0]).any(), "eight episodes started with the same observations; init_state must vary"
+        )
+
+
+def observations_share_no_memory(task: Task) -> None:
+    """What agents remember stays as it was."""
+    env = GymEnv(task)
+    first, _ = env.reset(seed=0)
+    copy = first.copy()
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    same(first, copy, "the first observation before and after three steps")
+
+
+def theta_out_of_bounds(task: Task) -> None:
+    """A theta out of bounds, NaN or of the wrong length is refused, with the bounds."""
+    env, latent = GymEnv(task), task.latents[0]
+    says = rf"^{re.escape(latent.name)} of {task.name} was .*must be .*{re.escape(f'{latent.high:g}')}"
+    for wrong in (latent.high + 1, latent.low - 1, float("nan")):
+        with refused(f"{latent.name} {wrong:g}", says):
+            env.reset(options={"theta": [wrong] + [lat.low for lat in task.latents[1:]]})
+    with refused("a theta of too many numbers", "must be"):
+        env.reset(options={"theta": [0.0] * (len(task.latents) + 6)})
+
+
+def wrong_actions(task: Task) -> None:
+    """Actions of a wrong shape, NaN, or that are no numbers are refused."""
+    env = GymVectorEnv(task, 2)
+    env.reset(seed=0)
+    good = actions(task, 2, 1)[0]
+    for what, wrong, says in (
+        ("an action of one row for two environments", good[:1], "shape"),
+        ("an action of NaN", np.full_like(good, np.nan), "NaN"),
+        ("action 'left'", "left", "must be numbers"),
+    ):
+        with refused(what, says):
+            env.step(wrong)
+
+
+def reset_options(task: Task) -> None:
+    """Unknown options, keep_theta and step before the first reset are refused."""
+    env = GymEnv(task)
+    with refused("keep_theta", "before the first reset"):
+        env.reset(options={"keep_theta": True})
+    with refused("option thetas", "unknown"):
+        env.reset(options={"thetas": [0]})
+    with refused("step", "before the first reset"):
+        GymEnv(task).step(env.action_space.sample())
+
+
+def log_prob_is_the_density_of_the_noise(task: Task) -> None:
+    """Importance sampling: under outcome p, E[q(s') / p(s')] = 1 for another theta's outcome q; 4,000 draws.
+
+    It fails if log_prob is not normalised, or not that of the noise that apply_noise adds.
+    """
+    m = 4000
+    low, high = task.latents[0].grid(9)[[0, -1]]
+    near = high if task.latents[0].distribution == "categorical" else low + 0.03 * (high - low)
+    rest = [lat.low for lat in task.latents[1:]]
+    batch = BatchEnv(task, 1)
+    batch.reset(0, {"theta": [low, *rest]})
+    action = actions(task, 1, 1)[0]
+    p = batch.simulator.outcome(batch.state, action)
+    batch.reset(0, {"theta": [near, *rest]})
+    q = batch.simulator.outcome(batch.state, action)
+    if (p == q).all():  # theta is not to be seen here: another action's outcome then
+        q = batch.simulator.outcome(batch.state, 0.8 * action)
+    if isinstance(task, MujocoTask):  # at most one standard deviation off: the ratio's variance is finite then
+        distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
+        q = p + (q - p) / max(1, distance[0])
+    noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
+    drawn = task.apply_noise(np.repeat(p, m, 0), noise)
+    ratio = np.exp(task.log_prob(drawn, q) - task.log_prob(drawn, p))
+    off, error = abs(ratio.mean() - 1), ratio.std() / np.sqrt(m)
+    require(
+        off < 4 * error + 1e-9, f"log_prob of {task.name}: the mean ratio of densities is {ratio.mean():.4f}, not 1"
+    )
+    require(ratio.std() > 0, f"log_prob of {task.name} is the same for two outcomes that differ")
+    if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
+        fall = task.log_prob(p, p) - task.log_prob(drawn, p)
+        right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
+        found = f"log_prob of {task.name} falls by {fall.mean():.3f} under its own noise; it must be {right:g}"
+        require(abs(fall.mean() - right) < bound, found)
+
+
+def log_sense_is_the_density_of_the_readings(task: Task) -> None:
+    """As above, of what sensors read under one theta, and under another near by; 4,000 states of random episodes.
+
+    A task whose theta moves no state must do so, and have readings that tell.
+    """
+    batch, m = BatchEnv(task, 50), 4000
+    thetas = task.theta_grid(9)[[0, -1]]
+    batch.reset(0)
+    action = actions(task, 1, 1)[0]
+    outcomes = task.outcome(np.repeat(batch.state[:1], 2, 0), np.repeat(action, 2, 0), thetas)
+    if not task.moves_state:
+        same(outcomes[1], outcomes[0], f"outcomes of thetas {thetas.tolist()}, which is said to move no state,")
+    seen: list[Array] = []
+    for action in actions(task, batch.n, m // batch.n):
+        batch.step(action)
+        seen.append(batch.state)
+    state = np.concatenate(seen)
+    noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
+    drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), noise)
+    if (drawn == state).all():
+        require(task.moves_state, f"theta of {task.name} moves no state, and its sensors read nothing")
+        raise Skipped("this task has no sensors of theta")
+    near = thetas[1]
+    for _ in range(30):  # so near that the ratio's variance is small
+        fall = task.log_sense(drawn, thetas[0]) - task.log_sense(drawn, near)
+        if fall.mean() < 0.3:
+            break
+        near = thetas[0] + (near - thetas[0]) / 2
+    off, error = abs(np.exp(-fall).mean() - 1), np.exp(-fall).std() / np.sqrt(m)
+    require(off < 4 * error + 1e-9, f"log_sense of {task.name}: the mean ratio of densities is {1 + off:.4f}, not 1")
+    require(fall.std() > 0, f"log_sense of {task.name} is the same for two thetas")
+
+
+CONTRACT: dict[str, Callable[[Task], None]] = {
+    check.__name__: check
+    for check in (
+        *protocols.CHECKS,
+        *(no_leak, effect, privileged_view, keep_theta, theta_follows_its_distribution),
+        *(any_batch_size, seed_streams, seed_kinds, forced_theta_moves_nothing_else),
+        *(starts_vary_and_nothing_is_constant, observations_share_no_memory),
+        *(theta_out_of_bounds, wrong_actions, reset_options, log_prob_is_the_density_of_the_noise),
+        log_sense_is_the_density_of_the_readings,
+        *physics.CHECKS,
+    )
+}

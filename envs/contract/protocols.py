@@ -1,0 +1,102 @@
+"""The part of the contract that is about protocols: gymnasium, Stable-Baselines3, dm_env, and that they all agree."""
+
+from __future__ import annotations
+
+import unittest
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
+
+from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.contract.probe import Skipped, actions, gl_works, require, same, told_by
+from deconfounded.envs.task import Task
+
+
+def gymnasium_env(task: Task) -> None:
+    """gymnasium's own checker finds nothing to warn of."""
+
+    def entry(**kwargs: Any) -> GymEnv:
+        return GymEnv(task, **kwargs)
+
+    env = gymnasium.make(EnvSpec(task.gym_id, entry_point=entry))
+    with told_by("gymnasium's checker"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped, skip_render_check=not gl_works())
+
+
+def stable_baselines(task: Task) -> None:
+    """Nor does Stable-Baselines3's, in the privileged view."""
+    try:
+        from stable_baselines3.common.env_checker import check_env as check_env_sb3
+    except ModuleNotFoundError as error:
+        raise Skipped(f"{error.name} is not installed") from None
+    with told_by("Stable-Baselines3's checker"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env_sb3(GymEnv(task, privileged=True), skip_render_check=True)
+
+
+def dm_env_tests(task: Task) -> None:
+    """dm_env's own test mixin passes."""
+    try:
+        from dm_env import test_utils
+    except ModuleNotFoundError as error:
+        raise Skipped(f"{error.name} is not installed") from None
+
+    class Held(test_utils.EnvironmentTestMixin, unittest.TestCase):
+        def make_object_under_test(self) -> DmEnv:
+            return DmEnv(task, seed=0)
+
+        def make_action_sequence(self) -> Iterator[Any]:
+            rng, spec = np.random.default_rng(0), self.environment.action_spec()
+            for _ in range(200):
+                if hasattr(spec, "num_values"):
+                    yield spec.generate_value()
+                else:
+                    yield rng.uniform(-1, 1, spec.shape).astype("f4")
+
+    result = unittest.TestResult()
+    unittest.defaultTestLoader.loadTestsFromTestCase(Held).run(result)
+    for test, trace in result.failures + result.errors:
+        raise AssertionError(f"dm_env's {test.id().split('.')[-1]}: {trace.strip().splitlines()[-1]}")
+    require(result.testsRun >= 4, f"dm_env's mixin ran {result.testsRun} tests; it must be at least 4")
+
+
+def adapters_agree(task: Task) -> None:
+    """The vector env, gymnasium's SyncVectorEnv, single envs and dm_env: same seeds, same bits, resets included."""
+    n = 3
+    ours, theirs = GymVectorEnv(task, n), SyncVectorEnv([lambda: GymEnv(task) for _ in range(n)])
+    dm = DmEnv(task, seed=7)
+    first, _ = ours.reset(seed=7)
+    same(first, theirs.reset(seed=7)[0], "first observations of GymVectorEnv and SyncVectorEnv")
+    same(first[0], dm.reset().observation, "first observations of GymVectorEnv and DmEnv")
+    for at, action in enumerate(actions(task, n, steps=2 * task.horizon + 5), start=1):
+        flat = action[:, 0].astype(int) if task.action_space.shape == () else action
+        mine, other = ours.step(flat), theirs.step(flat)
+        for name, x, y in zip(("observations", "rewards", "terminated", "truncated"), mine, other, strict=False):
+            same(x, y, f"{name} of GymVectorEnv and SyncVectorEnv after {at} steps")
+        step = dm.step(flat[0])
+        same(mine[0][0], step.observation, f"observations of GymVectorEnv and DmEnv after {at} steps")
+        over = mine[2][0] or mine[3][0]
+        require(step.last() == over, f"after {at} steps the episode was over {over} in GymVectorEnv, not so in DmEnv")
+
+
+def time_limit(task: Task) -> None:
+    """Truncation comes at exactly the time limit, if the episode has not ended before."""
+    batch = BatchEnv(task, 64)
+    batch.reset(0)
+    for step, action in enumerate(actions(task, 64, task.horizon), start=1):
+        was_alive = batch.alive
+        _, _, terminated, truncated = batch.step(action)
+        due = was_alive & ~terminated & (step == task.horizon)
+        same(truncated, due, f"truncation at step {step} and what the horizon of {task.horizon} asks for")
+    require(not batch.alive.any(), f"{batch.alive.sum()} of 64 episodes went on after the horizon of {task.horizon}")
+
+
+CHECKS = (gymnasium_env, stable_baselines, dm_env_tests, adapters_agree, time_limit)

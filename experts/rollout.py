@@ -1,0 +1,237 @@
+"""Trials: the data that imitators learn from, the agents that make it, and the loop that runs them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from deconfounded.envs import BatchEnv, InputError, Task
+from deconfounded.envs.batch import generators
+from deconfounded.envs.files import write_atomically
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.experts.policy import Expert
+
+
+@dataclass(frozen=True)
+class Trials:
+    """B trials of E episodes of T steps each, without theta. Arrays are read-only.
+
+    obs [B, E, T + 1, O] float32; action [B, E, T, A] float32; mask [B, E, T] bool, whether step t took place (False
+    once an episode has ended early); actions: the number of discrete actions, or 0 for actions in [-1, 1].
+    Raises InputError for shapes that do not fit each other, NaN, or actions that cannot be.
+    """
+
+    obs: NDArray[np.float32]
+    action: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+    actions: int = 0
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("obs", np.float32), ("action", np.float32), ("mask", bool)):
+            try:
+                array = np.array(getattr(self, name), dtype)
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{name} of Trials must be an array of numbers ({error})") from None
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if not isinstance(self.actions, int | np.integer) or self.actions < 0:
+            raise InputError(f"actions of Trials was {self.actions!r}; it must be how many there are, or 0")
+        b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
+        if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
+            raise InputError(
+                f"Trials of obs {self.obs.shape}, action {self.action.shape}, mask {self.mask.shape}; they must be"
+                " [B, E, T + 1, O], [B, E, T, A] and [B, E, T]"
+            )
+        if not (np.isfinite(self.obs).all() and np.isfinite(self.action).all()):
+            raise InputError("Trials held NaN or infinity; every observation and action must be finite")
+        if not self.mask.any():
+            raise InputError("Trials held no step that took place; their mask must be True somewhere")
+        if self.actions and not np.isin(self.action, np.arange(self.actions)).all():
+            raise InputError(f"Trials held an action that is not one of 0..{self.actions - 1}")
+        if not self.actions and (far := float(np.abs(self.action).max())) > 1:
+            raise InputError(f"Trials held an action of size {far:g}; actions must be in [-1, 1], or `actions` given")
+
+    def __len__(self) -> int:
+        return len(self.mask)
+
+    @property
+    def sha256(self) -> str:
+        """Of shapes and contents: of what is in them, and not of how a file holds it."""
+        digest = hashlib.sha256(f"{self.obs.shape} {self.action.shape} {self.actions}".encode())
+        for array in (self.obs, self.action, self.mask):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    @staticmethod
+    def from_minari(source: Path | str) -> Trials:
+        """The trials of a Minari data set's folder, without their thetas; see `experts.dataset.read`."""
+        from deconfounded.experts import datasets
+
+        return datasets.read(source)[0]
+
+    def save(self, file: Path, made_of: str = "") -> None:
+        """Write an .npz file, atomically. made_of: anything that `load` is to find in it."""
+        buffer, known = io.BytesIO(), {"actions": self.actions, "made_of": made_of}
+        np.savez_compressed(buffer, obs=self.obs, action=self.action, mask=self.mask, **known)  # type: ignore[arg-type]
+        write_atomically(file, buffer.getvalue())
+
+    @staticmethod
+    def load(file: Path, made_of: str | None = None) -> Trials:
+        """Read what `save` wrote. Raises InputError if the file is missing or damaged, or made of something else."""
+        try:
+            with np.load(file, allow_pickle=False) as data:
+                if made_of not in (None, str(data["made_of"])):
+                    raise InputError("it was made of something else")
+                return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
+        except Exception as error:  # a file that is no zip, or half of one, fails in many ways
+            raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
+
+
+def joined(parts: Sequence[Trials]) -> Trials:
+    """The trials of all parts, one after another; they are of the same kind and shape."""
+    obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
+    return Trials(obs, action, mask, parts[0].actions)
+
+
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
+"""Settings that json can hold, and arrays."""
+
+
+class Agent(ABC):
+    """Something that acts in N trials side by side, from its own history alone."""
+
+    @abstractmethod
+    def begin(self, n: int) -> None:
+        """Forget everything: n new trials start, each under a theta of its own."""
+
+    @abstractmethod
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        """An episode starts, the first of new trials or the next of the same: theta stays.
+
+        rngs: its random numbers, one generator for each of equal groups of trials.
+        """
+
+    @abstractmethod
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        """Observation [N, O] -> action [N, A]."""
+
+    def observe(  # noqa: B027 (agents without memory need nothing here)
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        """What followed: one transition a trial; where `alive` [N] is False, the episode had ended before it."""
+
+    def features(self) -> NDArray[np.float32] | None:
+        """What the agent knows now [N, F], for probes of theta in it; None for agents without memory."""
+        return None
+
+    def state(self) -> State:
+        """What `from_state` makes this agent anew from. Raises InputError for one that cannot be kept."""
+        raise InputError(f"{type(self).__name__} cannot be saved; give it `state` and `from_state`")
+
+    @classmethod
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Agent:
+        """The agent that gave this `state`."""
+        raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
+
+
+class ExpertAgent(Agent):
+    """The expert; it reads theta from the environment, or is told another: told [N, L]."""
+
+    def __init__(self, env: BatchEnv, expert: Expert, told: Array | None = None) -> None:
+        self.env, self.expert, self.told = env, expert, told
+
+    def begin(self, n: int) -> None:
+        pass
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        return self.expert.act(obs, self.env.theta if self.told is None else self.told, self._rng)
+
+
+class RandomAgent(Agent):
+    """Uniform actions: the zero of every score."""
+
+    def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
+        self.space = space
+
+    def begin(self, n: int) -> None:
+        pass
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        if isinstance(self.space, spaces.Discrete):
+            return np.floor(self._rng.random((len(obs), 1)) * self.space.n)
+        return 2 * self._rng.random((len(obs), *self.space.shape)) - 1
+
+
+def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
+    """theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
+    rng = Streams([generators(one)[0] for one in trial_seeds(n, seed)])
+    found = [task.sample_theta(rng)]
+    for _ in range(1, episodes):
+        found.append(task.drifted(found[-1], rng) if task.drifts else found[-1])
+    return np.stack(found, 1)
+
+
+def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
+    """The environments' seeds for n trials. Raises InputError where several seeds do not have as many each."""
+    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(one) for one in seed]
+    if n % len(seeds):
+        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
+    return [one + i for one in seeds for i in range(n // len(seeds))]
+
+
+def run_trials(
+    env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
+) -> tuple[Trials, Array]:
+    """N trials of `episodes` episodes each -> Trials and returns [N, E].
+
+    seed: of the environments and, apart from them, of the agent; or one for each of several equal groups of trials, one
+    after another, each of which goes as it would go alone. theta: forced [N, L], else drawn from p(theta).
+    """
+    task, n = env.task, env.n
+    each = trial_seeds(n, seed)
+    seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
+    obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
+    mask = np.zeros((n, episodes, task.horizon), bool)
+    returns = np.zeros((n, episodes))
+    action: NDArray[np.float32] | None = None
+    for e in range(episodes):
+        if e == 0:
+            now = env.reset(each, None if theta is None else {"theta": theta})
+            agent.begin(n)
+        else:
+            now = env.reset(options={"keep_theta": True})
+        agent.reset([np.random.default_rng([one, 1, e]) for one in seeds])
+        obs[:, e, 0] = now
+        for t in range(task.horizon):
+            alive = env.alive
+            chosen = agent.act(now)
+            then, reward, _, _ = env.step(chosen)
+            agent.observe(now, chosen, then, alive)
+            if action is None:
+                action = np.zeros((n, episodes, task.horizon, chosen.shape[-1]), np.float32)
+            obs[:, e, t + 1] = np.where(alive[:, None], then, obs[:, e, t])
+            action[:, e, t] = np.where(alive[:, None], chosen, 0)
+            mask[:, e, t] = alive
+            returns[:, e] += reward
+            now = then
+            if not env.alive.any():
+                obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
+                break
+    assert action is not None
+    discrete = int(task.action_space.n) if isinstance(task.action_space, spaces.Discrete) else 0
+    return Trials(obs, action, mask, discrete), returns

@@ -1,0 +1,87 @@
+"""Agents that last: a folder with agent.json and agent.safetensors, written by `save` and read by `load`; no pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors.numpy import load as from_bytes
+from safetensors.numpy import save as to_bytes
+
+from deconfounded import __version__
+from deconfounded.envs import InputError, outside
+from deconfounded.envs.files import as_json, check_folder, read_sealed, sealed, write_atomically
+from deconfounded.experts.rollout import Agent
+
+ARRAYS = "agent.safetensors"
+CODE = "agent.py"  # of an agent from outside, kept beside its arrays
+
+
+def save(agent: Agent, folder: Path, **about: Any) -> None:
+    """Keep an agent: its class by name, its settings, its arrays; about: what else to say of it, for json.
+
+    Of a class that a file brought from outside, the file is kept too, so that the folder is whole; what else that file
+    imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept, and writes nothing.
+    """
+    cls, file, code = type(agent), folder / "agent.json", None
+    if "." in cls.__qualname__:
+        raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
+    if cls.__module__.startswith("outside_") and (source := outside.source(cls)) is not None:
+        code = source.read_bytes()
+    settings, arrays = agent.state()
+    about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
+    about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
+    try:
+        content = to_bytes(arrays)
+        about["arrays"] = hashlib.sha256(content).hexdigest()
+        described = as_json(file, sealed(about))
+    except InputError:
+        raise
+    except Exception as error:  # whatever its class takes for its state
+        raise InputError(
+            f"{cls.__qualname__} cannot be saved ({outside.told(error)}); its state() must return a dictionary for json"
+            " and one of arrays"
+        ) from None
+    check_folder(folder)
+    if code is not None:
+        write_atomically(folder / CODE, code)
+    write_atomically(folder / ARRAYS, content)
+    write_atomically(file, described)
+
+
+def describe(folder: Path) -> dict[str, Any]:
+    """agent.json. Raises InputError if there is none, or it is damaged."""
+    try:
+        about = read_sealed(folder / "agent.json")
+    except OSError:
+        raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
+    if [type(about.get(key)) for key in ("class", "settings", "arrays")] != [str, dict, str]:
+        raise InputError(f"{folder / 'agent.json'} is of no agent; run the benchmark again")
+    return about
+
+
+def load(folder: Path | str) -> Agent:
+    """The agent kept in a folder, ready for `begin`. Raises InputError if it is missing or damaged.
+
+    The class that agent.json names is imported, so that loading an agent is running its code.
+    """
+    if not isinstance(folder, str | Path):
+        raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
+    folder = Path(folder)
+    about = describe(folder)
+    try:
+        where, _, name = about["class"].rpartition(":")
+        cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
+        if not (inspect.isclass(cls) and issubclass(cls, Agent)):
+            raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
+        content = (folder / ARRAYS).read_bytes()
+        if hashlib.sha256(content).hexdigest() != about["arrays"]:
+            raise InputError(f"{folder / ARRAYS} is damaged, or of another agent; run the benchmark again")
+        return cls.from_state(about["settings"], from_bytes(content))
+    except InputError:
+        raise
+    except Exception as error:  # whatever its class makes of arrays that are not its own
+        raise InputError(f"the agent in {folder} is damaged ({outside.told(error)}); run the benchmark again") from None
