@@ -18,8 +18,10 @@ from deconfounded.envs import outside
 from deconfounded.envs.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
-    from deconfounded.benchmarks.engine.pool import Engine, Finished, Job
+    from deconfounded.benchmarks.engine.jobs import Job
     from deconfounded.benchmarks.engine.presets import Preset
+    from deconfounded.benchmarks.engine.scheduler import Engine
+    from deconfounded.benchmarks.engine.store import Finished
 
 KEPT = "what was finished is kept, and --resume goes on"
 
@@ -113,8 +115,9 @@ def run(
     kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> tuple[Finished, dict[str, Any]]:
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
-    from deconfounded.benchmarks.engine.pool import know_guests, prepare, run_all
     from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import know_guests, prepare
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds

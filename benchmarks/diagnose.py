@@ -79,14 +79,14 @@ class Refit:
         """Measure, and keep it; returns a line that says how it went."""
         import numpy as np
 
-        from deconfounded.benchmarks.engine import pool
+        from deconfounded.benchmarks.engine import progress
         from deconfounded.deconf.diagnosis.measures import measure
 
         start, told = time.time(), 0
 
         def tell(share: float) -> None:
             nonlocal told
-            pool.tick(int(share * self.ticks) - told)
+            progress.tick(int(share * self.ticks) - told)
             told = int(share * self.ticks)
 
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
@@ -105,7 +105,7 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
     explore = None if exploration is None else trials_of(exploration)
     from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import run_jobs
+    from deconfounded.benchmarks.engine.scheduler import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
     from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check, judge
 

@@ -18,7 +18,7 @@ import numpy as np
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
-from deconfounded.benchmarks.engine import jobs
+from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.guest import Stranger
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.methods.cloning import MemorylessAgent
@@ -30,7 +30,7 @@ from deconfounded.experts.rollout import Agent
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
     about, agent = store.describe(folder), deconfounded.load(folder)
-    ours, theirs = jobs.spaces(task), about.get("spaces")
+    ours, theirs = spaces(task), about.get("spaces")
     if theirs not in (None, ours):
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
-from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine import store
 from deconfounded.benchmarks.output import report
 from deconfounded.envs.files import read_sealed
 
@@ -29,7 +29,7 @@ def main() -> None:
         task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
     except (OSError, KeyError):
         raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
-    finished = pool.left_in(folder / "jobs")
+    finished = store.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
     print(report.write(task, about, finished, folder))

@@ -53,7 +53,7 @@ def main() -> None:
     policy.load(task, args.expert)
     if args.track and not find_spec("tensorboard"):
         raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.output import report  # it takes seconds; bad input is told at once
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"

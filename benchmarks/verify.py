@@ -44,10 +44,10 @@ def verdict(record: records.Record, again: records.Record) -> tuple[str, list[st
 
 def rerun(record: records.Record, task: envs.Task, method: str, expert: str | None, device: str) -> records.Record:
     """The same seed, made again in a folder that goes away."""
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import run_all
     from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
 
     settings = changed(preset(record["preset"], task, device), record["set"])
     guest = catalogue.guest(method)

@@ -28,9 +28,9 @@ from torch.overrides import TorchFunctionMode
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, measure
+from deconfounded.benchmarks.engine.benchmark import Recorder
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
-from deconfounded.benchmarks.engine.jobs import Recorder
 from deconfounded.benchmarks.engine.presets import CONFIGS, Preset, preset
 from deconfounded.benchmarks.output import index, score, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures

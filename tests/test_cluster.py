@@ -15,10 +15,10 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.engine import catalogue, identity, pool, sources
-from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+from deconfounded.benchmarks.engine import catalogue, identity, jobs, progress, sources, store
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.local import Local
-from deconfounded.benchmarks.engine.pool import DemonstrationJob, Job
 from deconfounded.deconf.core.agents import Training
 from deconfounded.envs import outside
 from tests.tools import processes, tiny_preset
@@ -68,18 +68,18 @@ class Dawdling(BenchmarkJob):
 
     def run(self) -> str:
         fresh = not self.checkpoint.exists() and ray.get_runtime_context().get_node_id() != self.first_node
-        keep, give_up = pool.JobMonitor.save, time.monotonic() + 120
+        keep, give_up = jobs.JobMonitor.save, time.monotonic() + 120
 
-        def save(monitor: pool.JobMonitor, state: Callable[[], Training]) -> None:
+        def save(monitor: jobs.JobMonitor, state: Callable[[], Training]) -> None:
             keep(monitor, state)
             while fresh and monitor.file.exists() and time.monotonic() < give_up:
                 time.sleep(0.1)
 
-        pool.SAVE_EVERY_S, pool.JobMonitor.save = 0.0, save  # type: ignore[method-assign]
+        jobs.SAVE_EVERY_S, jobs.JobMonitor.save = 0.0, save  # type: ignore[method-assign]
         try:
             return super().run()
         finally:
-            pool.SAVE_EVERY_S, pool.JobMonitor.save = 60.0, keep  # type: ignore[method-assign]
+            jobs.SAVE_EVERY_S, jobs.JobMonitor.save = 60.0, keep  # type: ignore[method-assign]
 
 
 @pytest.fixture
@@ -124,7 +124,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
         folder.mkdir(parents=True)
     preset = replace(tiny_preset(), naive=replace(tiny_preset().naive, updates=40, chunk=300))
     local = [BenchmarkJob("slippery_cartpole", preset, "naive_rnn", (seed,), here) for seed in (0, 1)]
-    pool.tell(queue.Queue())
+    progress.tell(queue.Queue())
     for job in local:
         job.run()
 
@@ -164,7 +164,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     assert [str(error) for error in failed] == ["method my_guest_broken: no luck (ValueError, my_guest.py:18)"]
     spans = []
     for seed, mine, theirs in zip((0, 1), local, dawdling, strict=True):
-        expected, found = pool.read(mine.file(seed)), pool.read(theirs.file(seed))
+        expected, found = store.read(mine.file(seed)), store.read(theirs.file(seed))
         assert expected is not None
         assert found is not None
         for key in expected.keys() - {"meta"}:

@@ -23,7 +23,7 @@ from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
 from deconfounded.benchmarks import certify, commands, data
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
 from deconfounded.benchmarks.studies import cost, publish, site
@@ -216,7 +216,7 @@ class TestSignals:
         assert signal.getsignal(number) is signal.SIG_IGN
 
 
-class Deadly(pool.Job):
+class Deadly(jobs.Job):
     """Sends SIGTERM to the main process, and goes on."""
 
     def run(self) -> str:
@@ -228,12 +228,12 @@ class Deadly(pool.Job):
 def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
     with pytest.raises(SystemExit) as ended, Local() as engine:
-        run_command(lambda: pool.run_jobs([job], "deadly", engine.run), "kept")
+        run_command(lambda: scheduler.run_jobs([job], "deadly", engine.run), "kept")
     assert (ended.value.code, capsys.readouterr().err) == (143, "interrupted; kept\n")
     assert not multiprocessing.active_children()
 
 
-class Told(pool.Job):
+class Told(jobs.Job):
     """Says who does it."""
 
     def run(self) -> str:
@@ -367,7 +367,7 @@ class TestFiles:
 
 def test_cost_locks_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["cost", "--task", "bandit", "--out", str(tmp_path)])
-    monkeypatch.setattr(pool, "run_all", None)
+    monkeypatch.setattr(scheduler, "run_all", None)
     with commands.locked(tmp_path / "0.25"), pytest.raises(envs.InputError, match="another command is at work"):
         cost.main()
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from deconfounded.benchmarks.engine import pool
-from deconfounded.benchmarks.engine.jobs import CurveMonitor
+from deconfounded.benchmarks.engine import jobs, progress
+from deconfounded.benchmarks.engine.benchmark import CurveMonitor
 from tests.faults import flips, inputs
 
 
@@ -19,8 +19,8 @@ def test_odd_calls_are_told() -> None:
 
 def test_flipped_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each kind of file that is read back: noticed, or harmless."""
-    monkeypatch.setattr(pool, "_ticks", None, raising=False)
-    monkeypatch.setattr(pool, "SAVE_EVERY_S", pool.SAVE_EVERY_S)
+    monkeypatch.setattr(progress, "_ticks", None, raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", jobs.SAVE_EVERY_S)
     monkeypatch.setattr(CurveMonitor, "close", CurveMonitor.close)
     for kind, (file, read) in flips.files(tmp_path).items():
         found = flips.flip(file, read, 12, seed=1)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import pool
-from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine import jobs, progress, scheduler
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.studies import paper
 from deconfounded.benchmarks.studies.paper import FigureJob
@@ -48,28 +48,28 @@ KINDS = (
 
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: f"{kind[0].__name__}-{kind[1]}-{kind[2]}")
-def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[pool.Job]:
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[jobs.Job]:
     """A job that ran from beginning to end; it and those that follow keep a checkpoint of each update."""
     kind, task, method, fresh = request.param
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "POINTS", 8)
-        patch.setattr(pool, "SAVE_EVERY_S", 0.0)
-        patch.setattr(pool, "_ticks", queue.Queue(), raising=False)
-        job: pool.Job = kind(task, settings(task, fresh), method, (0, 1), tmp_path_factory.mktemp("whole"))
+        patch.setattr(jobs, "SAVE_EVERY_S", 0.0)
+        patch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        job: jobs.Job = kind(task, settings(task, fresh), method, (0, 1), tmp_path_factory.mktemp("whole"))
         job.run()
         yield job
 
 
 @pytest.mark.parametrize("share", [0.45, 0.8, 0.9])
 def test_interrupted_training_goes_on(
-    whole: pool.Job, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    whole: jobs.Job, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A job that was killed and begun again writes, bit for bit, what it would have written."""
     broken = replace(whole, folder=tmp_path / "broken")
     broken.folder.mkdir()
 
     def unplugged(
-        self: pool.JobMonitor, done: int, total: int, losses: dict[str, float], agent: Agent | None = None
+        self: jobs.JobMonitor, done: int, total: int, losses: dict[str, float], agent: Agent | None = None
     ) -> None:
         tell(self, done, total, losses, agent)
         seen.append(done / total)
@@ -77,8 +77,8 @@ def test_interrupted_training_goes_on(
             raise KeyboardInterrupt
 
     seen: list[float] = []
-    tell = pool.JobMonitor.update
-    monkeypatch.setattr(pool.JobMonitor, "update", unplugged)
+    tell = jobs.JobMonitor.update
+    monkeypatch.setattr(jobs.JobMonitor, "update", unplugged)
     with pytest.raises(KeyboardInterrupt):
         broken.run()
     left = [file for file in broken.folder.iterdir() if not file.name.startswith("demonstrations-")]
@@ -101,12 +101,12 @@ def test_interrupted_training_goes_on(
 
 def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From jobs to figures and table: exact curves by their closed forms, budgets by the settings."""
-    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     task, methods = envs.get("bandit"), ("naive_rnn", "deconfounded")
     for method in methods:
         FigureJob("bandit", settings("bandit", False), method, (0, 1), tmp_path).run()
     like = FigureJob("bandit", settings("bandit", False), "random", (0,), tmp_path)
-    finished = [(job.method, job.seeds[0], job.load(job.seeds[0])) for job in pool.written(like, tmp_path)]
+    finished = [(job.method, job.seeds[0], job.load(job.seeds[0])) for job in scheduler.written(like, tmp_path)]
     assert [(method, seed) for method, seed, _ in finished] == [
         ("deconfounded", 0), ("deconfounded", 1), ("naive_rnn", 0), ("naive_rnn", 1)
     ]  # fmt: skip
@@ -128,7 +128,7 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
     monitor = CurveMonitor(job, 0.8)
     assert monitor.load() is None
@@ -142,7 +142,7 @@ def test_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     (tmp_path / "jobs").mkdir()
     job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path / "jobs", track=True)
     job.run()

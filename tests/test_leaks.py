@@ -12,8 +12,8 @@ import torch
 from torch.distributions import Normal, kl_divergence
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine.benchmark import evaluate
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
-from deconfounded.benchmarks.engine.jobs import evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.agents import LearnedAgent

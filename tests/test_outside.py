@@ -23,10 +23,10 @@ import pytest
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
-from deconfounded.benchmarks.engine import catalogue, identity, pool, presets, sources
+from deconfounded.benchmarks.engine import catalogue, identity, presets, progress, sources
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
-from deconfounded.benchmarks.engine.jobs import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.deconf import wire
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -535,7 +535,7 @@ class TestSaved:
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
     def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
-        monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         (tmp_path / "jobs").mkdir()
         for method in ("deconfounded", "naive_rnn", "deconfounded_discrete", "blind_bc"):
             job = BenchmarkJob(task, tiny_preset(), method, (0, 1), tmp_path / "jobs")

@@ -17,9 +17,9 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import identity, pool, sources
+from deconfounded.benchmarks.engine import identity, progress, scheduler, sources, store
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
-from deconfounded.benchmarks.engine.jobs import BenchmarkJob
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.envs.files import PARTIAL, write_sealed
@@ -31,7 +31,7 @@ from tests.tools import tiny_preset
 @pytest.fixture
 def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkJob:
     """Finished: blind BC on the bandit, seeds 0 and 1."""
-    monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     (tmp_path / "jobs").mkdir()
     made = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0, 1), tmp_path / "jobs")
     made.run()
@@ -132,13 +132,13 @@ class TestKeptFiles:
 
     def spoilt(self, job: BenchmarkJob, **changes: Any) -> str:
         """Why the file of seed 0 is not believed, with these arrays or parts of meta in the place of its own."""
-        found = pool.read(job.file(0))
+        found = store.read(job.file(0))
         assert found is not None
         meta = {**found["meta"], **{key: value for key, value in changes.items() if key in found["meta"]}}
         arrays = {key: changes.get(key, value) for key, value in found.items() if key != "meta"}
         np.savez(job.file(0), meta=np.array(json.dumps(meta)), **arrays)
         assert job.load(0) is None
-        spoilt = pool.read(job.file(0))
+        spoilt = store.read(job.file(0))
         assert spoilt is not None
         return job.unfit(0, spoilt)
 
@@ -149,7 +149,7 @@ class TestKeptFiles:
 
     def test_another_seed(self, job: BenchmarkJob) -> None:
         shutil.copy(job.file(1), job.file(0))
-        found = pool.read(job.file(0))
+        found = store.read(job.file(0))
         assert found is not None
         assert job.unfit(0, found) == "it is of seed 1"
 
@@ -157,7 +157,7 @@ class TestKeptFiles:
         other = replace(job, method="random", seeds=(0,))
         other.run()
         shutil.copy(other.file(0), job.file(0))
-        found = pool.read(job.file(0))
+        found = store.read(job.file(0))
         assert found is not None
         assert job.unfit(0, found) == "it was made with another method"
 
@@ -183,7 +183,7 @@ class TestKeptFiles:
         """blind_bc-00 is not one more seed."""
         shutil.copy(job.file(0), job.folder / "blind_bc-00.npz")
         shutil.copy(job.file(0), job.folder / "nonsense-0.npz")
-        assert [one.seeds for one in pool.written(job, job.folder)] == [(0,), (1,)]
+        assert [one.seeds for one in scheduler.written(job, job.folder)] == [(0,), (1,)]
 
     def test_a_file_over_another_s(self, job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
         """What is shown again of a run has a seed once; demonstrations are those of their seed and expert."""
@@ -196,19 +196,19 @@ class TestKeptFiles:
         assert job.context().has_demonstrations(0)
         assert not replace(job, preset=replace(job.preset, expert_trials=3)).context().has_demonstrations(0)
         shutil.copy(job.file(1), job.file(0))
-        assert [(method, seed) for method, seed, _ in pool.left_in(job.folder)] == [("blind_bc", 1)]
+        assert [(method, seed) for method, seed, _ in store.left_in(job.folder)] == [("blind_bc", 1)]
         assert capsys.readouterr().out == "blind_bc-0.npz is left out: it is of blind_bc-1\n"
 
     @pytest.mark.parametrize("text", ["[]", "{", '{"kind": "BenchmarkJob"}', "\xff", "[" * 100_000])
     def test_settings_of_wrong_shape(self, text: str, tmp_path: Path) -> None:
         (tmp_path / "settings.json").write_text(text, encoding="latin-1")
         with pytest.raises(envs.InputError, match=r"settings\.json is damaged"):
-            pool.prepare(tmp_path, {"kind": "BenchmarkJob"}, resume=True)
+            store.prepare(tmp_path, {"kind": "BenchmarkJob"}, resume=True)
 
     def test_what_a_kill_left_half_written_goes(self, tmp_path: Path) -> None:
         (tmp_path / "jobs").mkdir()
         (tmp_path / "jobs" / f".naive_rnn-0.npz.77{PARTIAL}").write_bytes(b"half")
-        pool.prepare(tmp_path, {}, resume=False)
+        store.prepare(tmp_path, {}, resume=False)
         assert not list((tmp_path / "jobs").iterdir())
 
     def test_flipped_bits(self, job: BenchmarkJob) -> None:
@@ -351,7 +351,7 @@ class TestVerify:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         """A seed run again, alone and in another process, gives the bits of the run; a record that lies does not."""
-        monkeypatch.setattr(pool, "_ticks", queue.Queue(), raising=False)
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         small = ["eval_trials=4", "expert_trials=4", "cloning.updates=3"]
         from deconfounded.benchmarks.engine.presets import changed, preset
 

@@ -17,7 +17,8 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, sources
-from deconfounded.benchmarks.engine.pool import Engine, Job
+from deconfounded.benchmarks.engine.jobs import Job
+from deconfounded.benchmarks.engine.scheduler import Engine
 from deconfounded.benchmarks.engine.worker import Files, Unlike, work
 from deconfounded.envs import outside
 from deconfounded.envs.files import write_atomically

@@ -25,7 +25,7 @@ from deconfounded.benchmarks.engine.sources import ROOT
 from deconfounded.experts import policy
 
 if TYPE_CHECKING:
-    from deconfounded.benchmarks.engine.pool import Job
+    from deconfounded.benchmarks.engine.jobs import Job
 
 PROTOCOL = 1  # of seeding, roll-outs, what methods are handed, and what is measured of an agent
 LIBRARIES = ("dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")

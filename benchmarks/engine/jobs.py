@@ -1,187 +1,187 @@
-"""The benchmark's job: train one method with some seeds, deploy it, and write down what came of it."""
+"""A job: one method with some seeds, its files, its checkpoint, and its progress."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Sequence
+import hashlib
+import io
+import json
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
-from numpy.typing import NDArray
+import torch
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import measure
-from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
-from deconfounded.benchmarks.engine.guest import Guest
-from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.benchmarks.engine.pool import Job, JobMonitor
-from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.envs import outside
-from deconfounded.envs.task import Array
-from deconfounded.experts import store
-from deconfounded.experts.rollout import Agent, run_trials, thetas
+from deconfounded.benchmarks.engine import store
+from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.identity import commit, identity, machine
+from deconfounded.benchmarks.engine.presets import Preset
+from deconfounded.benchmarks.engine.progress import tick
+from deconfounded.deconf.core.agents import Monitor, Training
+from deconfounded.envs.files import write_atomically
+from deconfounded.experts.rollout import Agent
 
-CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
-
-
-class Recorder(Agent):
-    """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
-
-    The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
-    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
-    an action, and each step after it; with what the agent knows then.
-    """
-
-    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
-        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
-
-    def begin(self, n: int) -> None:
-        self.agent.begin(n)
-        self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
-        self.episode = 0
-        self.clip: dict[str, list[Any]] = {}
-
-    def note(self) -> None:
-        """An episode is over."""
-        if (known := self.agent.features()) is not None:
-            self.known.append(known.copy())
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        if self.episode == 0:
-            theta = self.env.theta[: self.env.n // len(rngs), 0]
-            self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
-        else:
-            self.note()
-        self.agent.reset(rngs)
-        self.episode += 1
-        self._film(np.zeros(self.env.task.action_space.shape or (1,)))
-
-    def _film(self, action: Array) -> None:
-        if not self.filmed or self.episode > self.env.task.episodes:
-            return
-        row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
-        if (known := self.agent.features()) is not None:
-            row["known"] = known[self.trial].copy()
-        for kind, value in row.items():
-            self.clip.setdefault(kind, []).append(value)
-
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        return self.agent.act(obs)
-
-    def observe(
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
-        self.agent.observe(obs, action, next_obs, alive)
-        if alive[self.trial]:
-            self._film(action[self.trial])
+SAVE_EVERY_S = 60.0  # a checkpoint within a job
 
 
-class CurveMonitor(JobMonitor):
-    """Keeps the losses of training, at some 400 updates, and shows them to TensorBoard if the job asks for it."""
+@dataclass(frozen=True)
+class Job(ABC):
+    """What to run, and the folder that its files belong in, one a seed; seeds run side by side in one program."""
 
-    def __init__(self, job: Job, share: float) -> None:
-        super().__init__(job, share)
-        self.writer: Any = None
-        if job.track:
-            from torch.utils.tensorboard import SummaryWriter
+    task: str
+    preset: Preset
+    method: str
+    seeds: tuple[int, ...]
+    folder: Path
+    expert: str | None = None  # another than the task's own
+    salt: str = ""  # of evaluation's seeds
+    guest: Method | None = None  # a method from outside
+    track: bool = False  # whether losses go to TensorBoard as they come
 
-            name = f"{job.method}-{'-'.join(map(str, job.seeds))}"
-            self.writer = SummaryWriter(str(job.folder.parent / "tensorboard" / name))
+    @property
+    def about(self) -> Method:
+        """The method's entry in the catalogue."""
+        return self.guest or METHODS[self.method]
 
-    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
-        super().update(done, total, losses, agent)
-        if done % max(total // 400, 1) == 0:
-            for kind, loss in losses.items():
-                self.kept.setdefault(kind, []).append((done, loss))
-                if self.writer is not None:
-                    self.writer.add_scalar(f"loss/{kind}", loss, done)
+    def context(self, monitor: Monitor | None = None) -> Context:
+        """The data and environments of its seeds."""
+        return Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder, self.expert)
 
-    def close(self) -> float:
-        if self.writer is not None:
-            self.writer.close()
-        return super().close()
+    @abstractmethod
+    def run(self) -> str:
+        """Do it, in a worker process, and write the files; returns a line that says how it went."""
+
+    def file(self, seed: int) -> Path:
+        """An .npz file."""
+        return self.folder / f"{self.method}-{seed}.npz"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an interrupted job goes on from."""
+        return self.folder / f".{self.method}-{'-'.join(map(str, self.seeds))}.pt"
+
+    @property
+    def ticks(self) -> int:
+        """Of progress: in proportion to how long a job takes."""
+        return 100 * self.about.cost * len(self.seeds)
+
+    def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
+        """Write the file of a seed, atomically; beside `meta` it holds the seed's budget, and when work went on."""
+        buffer = io.BytesIO()
+        i = self.seeds.index(seed)
+        budget = {kind: each[i] for kind, each in monitor.budget.items()}
+        cpu = round(monitor.cpu() / len(self.seeds), 2)
+        known = {"identity": identity(self), "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
+        known |= {"reference": self.about.reference, "arrays": list(arrays)}
+        whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
+        np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
+        write_atomically(self.file(seed), buffer.getvalue())
+
+    def load(self, seed: int) -> dict[str, Any] | None:
+        """What was written of a seed: arrays, and `meta` decoded. None if there is nothing that fits: see `unfit`."""
+        found = store.read(self.file(seed))
+        return None if found is None or self.unfit(seed, found) else found
+
+    def unfit(self, seed: int, found: dict[str, Any]) -> str:
+        """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
+        if why := store.broken(found):
+            return why
+        meta, expected = found["meta"], json.loads(json.dumps(identity(self)))
+        told = meta["identity"]
+        if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
+            return f"it was made with another {differ[0].replace('_', ' ')}"
+        if meta["seed"] != seed:
+            return f"it is of seed {meta['seed']}"
+        for key, value in found.items():
+            if key.endswith("/returns") and len(value) != self.preset.eval_trials:
+                return f"{key} has shape {value.shape}, for {self.preset.eval_trials} trials"
+        return ""
 
 
-class BenchmarkJob(Job):
-    """Train and evaluate one method with some seeds."""
+class DemonstrationJob(Job):
+    """Makes what all methods imitate with a seed, so that no two of them do."""
+
+    @property
+    def about(self) -> Method:
+        return Method(())
+
+    @property
+    def ticks(self) -> int:
+        return 20
+
+    def file(self, seed: int) -> Path:
+        return self.folder / f"demonstrations-{seed}.npz"
 
     def run(self) -> str:
-        monitor = CurveMonitor(self, 0.8)
-        context = self.context(monitor)
-        with contextlib.ExitStack() as guests:
-            if self.guest is None:
-                agents = MAKERS[self.method](Allowed(context, self.about.uses))
-            else:
-                guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
-                agents = {self.method: guests.enter_context(contextlib.closing(guest))}
-            trained = monitor.worked()
-            found = {
-                name: evaluate(context, agent, self.about.learned, self.salt, name in CLIPPED and 0 in self.seeds)
-                for name, agent in agents.items()
-            }
-            monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
-            notes = [
-                self._keep(name, agent) for name, agent in agents.items()
-            ]  # first: a seed's file says it is finished
-            meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
-            for i, seed in enumerate(self.seeds):
-                rows = context.rows(i)
-                arrays: dict[str, Any] = {}
-                for name, (per_trial, probes, clip) in found.items():
-                    arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
-                    arrays[f"{name}/probe"] = probes[i]
-                    if seed == 0:
-                        arrays.update({f"{name}/{key}": value for key, value in clip.items()})
-                self.save(seed, arrays, monitor, meta)
-        return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
-
-    def _keep(self, name: str, agent: Agent) -> str:
-        """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
-        told = ""
-        for i, seed in enumerate(self.seeds):
-            folder = self.folder.parent / "agents" / f"{name}-{seed}"
-            about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
-            try:
-                if isinstance(agent, Guest):
-                    told = agent.keep(folder, about)
-                elif isinstance(agent, LearnedAgent):
-                    store.save(agent.of_seed(i), folder, **about)
-            except Exception as error:  # the results stand, whatever becomes of the agent
-                told = f"its agent is not kept: {outside.told(error)}"
-        return told
+        start = time.time()
+        trials = self.context().demonstrations
+        tick(self.ticks)
+        return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
 
-def spaces(task: envs.Task) -> dict[str, int]:
-    """What an agent must fit: O, A, and the number of discrete actions or 0."""
-    discrete = int(task.action_space.n) if isinstance(task.action_space, Discrete) else 0
-    return {
-        "observations": len(task.observation),
-        "action": int(np.prod(task.action_space.shape or 1)),
-        "actions": discrete,
-    }
+class JobMonitor(Monitor):
+    """Tells the main process how far a job has come, and keeps a checkpoint of its training beside its files.
 
+    share: of the whole job, that training takes. `kept` goes into the checkpoint, and comes back from it.
+    """
 
-def evaluate(
-    context: Context, agent: Agent, learned: bool, salt: str = "", filmed: bool = False
-) -> tuple[dict[str, Array], Array, dict[str, Array]]:
-    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
-    task, seeds = context.task, context.seeds
-    # Learned agents go on for twice the episodes they were trained on.
-    episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
-    recorder = Recorder(agent, context.env, filmed)
-    streams = [stream(EVALUATION, seed, salt) for seed in seeds]
-    trials, returns = run_trials(context.env, recorder, episodes, streams)
-    recorder.note()
-    theta = thetas(task, context.env.n, episodes, streams)
-    objective = measure.objective(context.expert, trials, theta)
-    encoded = task.encode_theta(theta)
-    groups = map(context.rows, range(len(seeds)))
-    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
-    clip = {key: np.array(value) for key, value in recorder.clip.items()}
-    if filmed:
-        clip["trial"] = np.array(recorder.trial)
-    if "known" in clip:  # theta, as it can be read off at the end of the last episode
-        clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
-    r2 = np.array([[score for score, _ in each] for each in probes])
-    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip
+    def __init__(self, job: Job, share: float) -> None:
+        super().__init__()
+        self.ticks, self.share, self.told = job.ticks, share, 0
+        self.device = job.preset.naive.device
+        self.file = job.checkpoint
+        self.start, self.saved = time.time(), time.monotonic()
+        self.before: list[tuple[float, float]] = []
+        self.cpu_start, self.cpu_before, self.elsewhere = time.process_time(), 0.0, 0.0
+        self.kept: Training = {}
+
+    def spans(self) -> list[tuple[float, float]]:
+        """When the job was at work: from, to."""
+        return [*self.before, (self.start, time.time())]
+
+    def cpu(self) -> float:
+        """CPU seconds of this process, and of a guest's, for all seeds, so far."""
+        return self.cpu_before + time.process_time() - self.cpu_start + self.elsewhere
+
+    def worked(self) -> float:
+        """Seconds of work so far."""
+        return sum(end - start for start, end in self.spans())
+
+    def _tell(self, share: float) -> None:
+        if (now := int(self.ticks * share)) > self.told:
+            tick(now - self.told)
+            self.told = now
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        self._tell(self.share * done / total)
+
+    def save(self, state: Callable[[], Training]) -> None:
+        if time.monotonic() - self.saved >= SAVE_EVERY_S:
+            buffer = io.BytesIO()
+            known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
+            torch.save({"training": state(), **known}, buffer)
+            write_atomically(self.file, hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
+            self.saved = time.monotonic()
+
+    def load(self) -> Training | None:
+        try:
+            content = self.file.read_bytes()
+            if hashlib.sha256(content[32:]).digest() != content[:32]:
+                return None
+            state = torch.load(io.BytesIO(content[32:]), self.device, weights_only=True)
+        except Exception:  # missing, or of other code, which torch tells in many ways: begin again
+            return None
+        self.kept, self.before, self.budget = state["kept"], state["spans"], state["budget"]
+        self.cpu_before = state["cpu"]
+        return state["training"]
+
+    def close(self) -> float:
+        """The job is done, and its checkpoint is of no more use; returns the seconds of work it took."""
+        self._tell(1)
+        self.file.unlink(missing_ok=True)
+        return self.worked()

@@ -14,9 +14,9 @@ from multiprocessing.queues import Queue
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import escape_output
-from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine import progress
 from deconfounded.benchmarks.engine.guest import die_with_parent
-from deconfounded.benchmarks.engine.pool import Engine, Some
+from deconfounded.benchmarks.engine.scheduler import Engine, Some
 from deconfounded.envs.physics import cores
 
 
@@ -24,7 +24,7 @@ def start_worker(ticks: Queue[int]) -> None:
     """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
     die_with_parent()
     escape_output()
-    pool.tell(ticks)
+    progress.tell(ticks)
 
 
 @contextmanager

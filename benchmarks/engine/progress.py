@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any
+from typing import Any, Protocol
 
 
 class Progress:
@@ -41,3 +41,23 @@ class Progress:
         """Take the bar away."""
         if self._bar is not None:
             self._bar.close()
+
+
+class Ticks(Protocol):
+    """Where a worker process tells how far it has come."""
+
+    def put(self, ticks: int) -> None: ...
+
+
+_ticks: Ticks  # of this worker process
+
+
+def tell(ticks: Ticks) -> None:
+    """Let the jobs of this process tell their progress there."""
+    global _ticks
+    _ticks = ticks
+
+
+def tick(ticks: int) -> None:
+    """Work in this process has come so much further."""
+    _ticks.put(ticks)

@@ -18,8 +18,8 @@ from typing import Any
 from ray.exceptions import RayError
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import identity, pool, sources
-from deconfounded.benchmarks.engine.pool import Job
+from deconfounded.benchmarks.engine import identity, progress, sources
+from deconfounded.benchmarks.engine.jobs import Job
 from deconfounded.envs import outside
 from deconfounded.envs.files import write_atomically
 from deconfounded.experts import policy
@@ -49,7 +49,7 @@ def work(
             job = replace(job, expert=str(outside.here(Path(job.expert))))
         check(expected, {**identity.identity(job), "code": sources.package()})
         courier = Courier(folder, number, mailbox)
-        pool.tell(courier)
+        progress.tell(courier)
         try:
             told = job.run()
         finally:

@@ -14,7 +14,7 @@ from matplotlib.colors import ListedColormap
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.engine.pool import Finished, by_method
+from deconfounded.benchmarks.engine.store import Finished, by_method
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.envs.files import save_figure

@@ -16,9 +16,9 @@ from matplotlib.ticker import MaxNLocator
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import sources
+from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
-from deconfounded.benchmarks.engine.jobs import CLIPPED
-from deconfounded.benchmarks.engine.pool import Finished
+from deconfounded.benchmarks.engine.store import Finished
 from deconfounded.benchmarks.output import film, records, score
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template

@@ -66,9 +66,10 @@ def main() -> None:
     task, methods = envs.get(args.task), commands.check(args, LEARNED, LEARNED)
     envs.check_task(task)
     policy.load(task)
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import CONFIGS, changed, preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records, score
 
     folder = args.out or Path("results") / f"cost-{task.name}"

@@ -22,8 +22,9 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.benchmarks.engine.pool import Finished, Job, JobMonitor, by_method
+from deconfounded.benchmarks.engine.store import Finished, by_method
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.output.figures import figure_2, figure_3
 from deconfounded.benchmarks.output.records import covered

@@ -43,9 +43,10 @@ def main() -> None:
     methods = commands.check(args, LEARNED, LEARNED)
     check_names("task", args.tasks, list(noise.BASES))
     from deconfounded.benchmarks.certify import certify
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 

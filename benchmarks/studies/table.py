@@ -23,7 +23,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 
 if TYPE_CHECKING:
-    from deconfounded.benchmarks.engine.pool import Job
+    from deconfounded.benchmarks.engine.jobs import Job
     from deconfounded.benchmarks.output.records import Record
 
 SEEDS, FEWER = 10, 5
@@ -57,9 +57,10 @@ def main() -> None:
     tasks = [envs.get(name) for name in args.tasks]
     asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
     methods = [name for name in METHODS if name in asked]
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.studies.site import DOCS
 

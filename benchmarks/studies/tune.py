@@ -118,9 +118,10 @@ def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
 
 def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:
     """The results of a setting on a task: those of the method and of the references."""
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
 
     own = out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"

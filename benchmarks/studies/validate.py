@@ -102,11 +102,12 @@ def point(task: envs.Task) -> dict[str, Any] | None:
 
 def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, float]:
     """Scores of the last episode: of the records in docs/, of docs/spectrum.json, or of a run made here."""
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
-    from deconfounded.benchmarks.engine.jobs import BenchmarkJob
     from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.pool import prepare, run_all
     from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.benchmarks.engine.scheduler import run_all
+    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
 
     if of := point(task):

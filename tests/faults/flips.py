@@ -21,8 +21,8 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks.engine import pool
-from deconfounded.benchmarks.engine.jobs import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine import jobs, progress, store
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.output import records
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs.files import read_sealed
@@ -50,9 +50,9 @@ def equal(one: Any, other: Any) -> bool:
 
 def files(folder: Path) -> dict[str, tuple[Path, Read]]:
     """One file of each kind, as commands write it, and what reads it: None or InputError if it is not believed."""
-    pool._ticks = queue.Queue()  # type: ignore[assignment]
-    pool.prepare(folder, {"task": "bandit", "seeds": 3, "set": ["seeds=3"], "rate": 1e-3}, resume=False)
-    pool.SAVE_EVERY_S = 0.0
+    progress._ticks = queue.Queue()  # type: ignore[assignment]
+    store.prepare(folder, {"task": "bandit", "seeds": 3, "set": ["seeds=3"], "rate": 1e-3}, resume=False)
+    jobs.SAVE_EVERY_S = 0.0
     job = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", (0,), folder / "jobs")
     kept = folder / "kept.pt"
     close = CurveMonitor.close

@@ -26,9 +26,10 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
+from deconfounded.__main__ import COMMANDS
 from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.context import Context
-from deconfounded.benchmarks.engine.jobs import spaces
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.methods.cloning import CloningConfig, fit
 from deconfounded.experts import policy, store
@@ -36,10 +37,11 @@ from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
 
 REACHED = (  # where a command's work begins
-    *("benchmarks.engine.pool.run_all", "benchmarks.certify.certify", "experts.ppo.train", "benchmarks.speed.measure"),
-    *("benchmarks.growth.cpu", "benchmarks.seeds.Context", "experts.dataset.collect", "benchmarks.rescore.rescore"),
-    *("benchmarks.verify.rerun", "benchmarks.output.report.write", "benchmarks.output.pages.write"),
-    *("benchmarks.publish.keep", "benchmarks.check.check_task"),
+    *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
+    *("benchmarks.studies.speed.measure", "benchmarks.studies.growth.cpu", "benchmarks.studies.seeds.Context"),
+    *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
+    *("benchmarks.output.report.write", "benchmarks.studies.site.write", "benchmarks.studies.publish.keep"),
+    *("benchmarks.check.check_task",),
 )
 MOST = 4 << 30  # bytes of memory, so that what asks for more is seen here
 CONTROL = "slippery_cartpole"
@@ -118,7 +120,7 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
             },
         },
     ),
-    "rescore": (
+    "score": (
         ("--agent", "{agent}", "--task", "bandit"),
         {
             **{"--agent": AGENTS, "--trials": (*COUNTS, "1"), "--seed": SEEDS, "--out": (*FOLDERS, "{folder}")},
@@ -154,7 +156,7 @@ class Reached(BaseException):
 
 def ran(command: str, args: list[str]) -> str:
     """What became of a command with these arguments, in this process: told, accepted, or what else."""
-    main = importlib.import_module(f"deconfounded.benchmarks.{command}").main
+    main = importlib.import_module(f"deconfounded.{COMMANDS[command][0]}").main
     out, err = io.StringIO(), io.StringIO()
     with (
         mock.patch("sys.argv", [command, *args]),

@@ -9,9 +9,9 @@ if __name__ == "__main__":
 
 from deconfounded.benchmarks import commands, run
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import pool
+from deconfounded.benchmarks.engine import jobs
 
-pool.SAVE_EVERY_S = 0.3  # workers run this file too, before their jobs
+jobs.SAVE_EVERY_S = 0.3  # workers run this file too, before their jobs
 
 if __name__ == "__main__":
     run_command(run.main, commands.KEPT)

@@ -1,0 +1,187 @@
+"""The benchmark's job: train one method with some seeds, deploy it, and write down what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.spaces import Discrete
+from numpy.typing import NDArray
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
+from deconfounded.benchmarks.engine.guest import Guest
+from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
+from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.envs import outside
+from deconfounded.envs.task import Array
+from deconfounded.experts import store
+from deconfounded.experts.rollout import Agent, run_trials, thetas
+
+CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
+
+
+class Recorder(Agent):
+    """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
+
+    The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
+    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
+    an action, and each step after it; with what the agent knows then.
+    """
+
+    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
+        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
+
+    def begin(self, n: int) -> None:
+        self.agent.begin(n)
+        self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
+        self.episode = 0
+        self.clip: dict[str, list[Any]] = {}
+
+    def note(self) -> None:
+        """An episode is over."""
+        if (known := self.agent.features()) is not None:
+            self.known.append(known.copy())
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        if self.episode == 0:
+            theta = self.env.theta[: self.env.n // len(rngs), 0]
+            self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
+        else:
+            self.note()
+        self.agent.reset(rngs)
+        self.episode += 1
+        self._film(np.zeros(self.env.task.action_space.shape or (1,)))
+
+    def _film(self, action: Array) -> None:
+        if not self.filmed or self.episode > self.env.task.episodes:
+            return
+        row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
+        if (known := self.agent.features()) is not None:
+            row["known"] = known[self.trial].copy()
+        for kind, value in row.items():
+            self.clip.setdefault(kind, []).append(value)
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        return self.agent.act(obs)
+
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        self.agent.observe(obs, action, next_obs, alive)
+        if alive[self.trial]:
+            self._film(action[self.trial])
+
+
+class CurveMonitor(JobMonitor):
+    """Keeps the losses of training, at some 400 updates, and shows them to TensorBoard if the job asks for it."""
+
+    def __init__(self, job: Job, share: float) -> None:
+        super().__init__(job, share)
+        self.writer: Any = None
+        if job.track:
+            from torch.utils.tensorboard import SummaryWriter
+
+            name = f"{job.method}-{'-'.join(map(str, job.seeds))}"
+            self.writer = SummaryWriter(str(job.folder.parent / "tensorboard" / name))
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        super().update(done, total, losses, agent)
+        if done % max(total // 400, 1) == 0:
+            for kind, loss in losses.items():
+                self.kept.setdefault(kind, []).append((done, loss))
+                if self.writer is not None:
+                    self.writer.add_scalar(f"loss/{kind}", loss, done)
+
+    def close(self) -> float:
+        if self.writer is not None:
+            self.writer.close()
+        return super().close()
+
+
+class BenchmarkJob(Job):
+    """Train and evaluate one method with some seeds."""
+
+    def run(self) -> str:
+        monitor = CurveMonitor(self, 0.8)
+        context = self.context(monitor)
+        with contextlib.ExitStack() as guests:
+            if self.guest is None:
+                agents = MAKERS[self.method](Allowed(context, self.about.uses))
+            else:
+                guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
+                agents = {self.method: guests.enter_context(contextlib.closing(guest))}
+            trained = monitor.worked()
+            found = {
+                name: evaluate(context, agent, self.about.learned, self.salt, name in CLIPPED and 0 in self.seeds)
+                for name, agent in agents.items()
+            }
+            monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
+            notes = [
+                self._keep(name, agent) for name, agent in agents.items()
+            ]  # first: a seed's file says it is finished
+            meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
+            for i, seed in enumerate(self.seeds):
+                rows = context.rows(i)
+                arrays: dict[str, Any] = {}
+                for name, (per_trial, probes, clip) in found.items():
+                    arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
+                    arrays[f"{name}/probe"] = probes[i]
+                    if seed == 0:
+                        arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+                self.save(seed, arrays, monitor, meta)
+        return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
+
+    def _keep(self, name: str, agent: Agent) -> str:
+        """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
+        told = ""
+        for i, seed in enumerate(self.seeds):
+            folder = self.folder.parent / "agents" / f"{name}-{seed}"
+            about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
+            try:
+                if isinstance(agent, Guest):
+                    told = agent.keep(folder, about)
+                elif isinstance(agent, LearnedAgent):
+                    store.save(agent.of_seed(i), folder, **about)
+            except Exception as error:  # the results stand, whatever becomes of the agent
+                told = f"its agent is not kept: {outside.told(error)}"
+        return told
+
+
+def spaces(task: envs.Task) -> dict[str, int]:
+    """What an agent must fit: O, A, and the number of discrete actions or 0."""
+    discrete = int(task.action_space.n) if isinstance(task.action_space, Discrete) else 0
+    return {
+        "observations": len(task.observation),
+        "action": int(np.prod(task.action_space.shape or 1)),
+        "actions": discrete,
+    }
+
+
+def evaluate(
+    context: Context, agent: Agent, learned: bool, salt: str = "", filmed: bool = False
+) -> tuple[dict[str, Array], Array, dict[str, Array]]:
+    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
+    task, seeds = context.task, context.seeds
+    # Learned agents go on for twice the episodes they were trained on.
+    episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
+    recorder = Recorder(agent, context.env, filmed)
+    streams = [stream(EVALUATION, seed, salt) for seed in seeds]
+    trials, returns = run_trials(context.env, recorder, episodes, streams)
+    recorder.note()
+    theta = thetas(task, context.env.n, episodes, streams)
+    objective = measure.objective(context.expert, trials, theta)
+    encoded = task.encode_theta(theta)
+    groups = map(context.rows, range(len(seeds)))
+    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    clip = {key: np.array(value) for key, value in recorder.clip.items()}
+    if filmed:
+        clip["trial"] = np.array(recorder.trial)
+    if "known" in clip:  # theta, as it can be read off at the end of the last episode
+        clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
+    r2 = np.array([[score for score, _ in each] for each in probes])
+    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip

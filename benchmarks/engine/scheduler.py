@@ -1,0 +1,132 @@
+"""Jobs side by side on an engine: those whose files are missing or stale, longest first."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+
+from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
+from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.benchmarks.engine.store import Finished, read
+
+
+class Work(Protocol):
+    """A job, or anything that does its own work and says how it went."""
+
+    @property
+    def method(self) -> str: ...
+    @property
+    def seeds(self) -> tuple[int, ...]: ...
+    @property
+    def ticks(self) -> int: ...
+    def run(self) -> str: ...
+
+
+Some = TypeVar("Some", bound=Work)
+
+
+Run = Callable[[list[Some], Callable[[int], None], Callable[[Some, str | Exception], None]], None]
+"""An engine's `run`."""
+
+
+class Engine(ABC):
+    """Where jobs run, one core or one GPU each. Use it in a `with`: after that nothing of it is left running."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abstractmethod
+    def __exit__(self, *error: object) -> None:
+        """Let it go."""
+
+    @abstractmethod
+    def slots(self, device: str) -> int:
+        """How many jobs that train on such a device to make of a method's seeds."""
+
+    @abstractmethod
+    def run(self, jobs: list[Job], tick: Callable[[int], None], say: Callable[[Job, str | Exception], None]) -> None:
+        """Run them side by side, first come, first served; a job's files are in its folder when it has ended.
+
+        tick: to be told of progress; say: what became of a job, an InputError if it failed: the others go on.
+        """
+
+
+def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tuple[Finished, int]:
+    """Run what has no file yet; returns all that is in the folder now, and how many files were there before.
+
+    every: a job for each method, with all seeds, in one folder.
+    """
+    folder, left = every[0].folder, [list[int]() for _ in every]
+    for job, missing in zip(every, left, strict=True):
+        for seed in job.seeds:
+            found = read(job.file(seed))
+            if found is not None and (why := job.unfit(seed, found)):
+                print(f"{job.file(seed).name} is made again: {why}")
+            if found is None or why:
+                missing.append(seed)
+    parts = [
+        replace(job, seeds=part)
+        for job, missing in zip(every, left, strict=True)
+        for part in groups(job.about, missing, engine.slots(device))
+    ]
+    shown = {seed: job for job in parts if "demonstrations" in job.about.uses for seed in job.seeds}
+    first: list[Job] = [
+        DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
+        for seed, job in sorted(shown.items())
+    ]
+    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine.run)
+    run_jobs(parts, label, engine.run)
+    for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
+        stale.unlink()
+    done = written(every[0], folder)
+    finished = [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
+    return finished, len(finished) - sum(map(len, left))
+
+
+def written(like: Job, folder: Path) -> list[Job]:
+    """A job for each file in the folder, those of other methods and seeds than this command's too; in order."""
+    named = [re.fullmatch(r"(\w+)-(\d+)", file.stem) for file in folder.glob("*.npz")]
+    pairs = [(m[1], int(m[2])) for m in named if m and m[1] in METHODS and m[2] == str(int(m[2]))]
+    order = list(METHODS)
+    pairs.sort(key=lambda pair: (order.index(pair[0]), pair[1]))
+    return [replace(like, method=name, seeds=(seed,), guest=catalogue.guest(name)) for name, seed in pairs]
+
+
+def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]:
+    """Seeds to run side by side: as many groups as there are slots; references and guests share nothing."""
+    if not left:
+        return []
+    alone = not method.learned or method.reference
+    n = len(left) if alone else min(slots, len(left))
+    return [tuple(map(int, part)) for part in np.array_split(left, n)]
+
+
+def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:
+    """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say."""
+    if not jobs:
+        return
+    progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
+
+    def say(job: Some, told: str | Exception) -> None:
+        if isinstance(told, Exception):
+            failed.append(told)
+            told = f"failed: {told}"
+        progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
+
+    run(jobs, progress.update, say)
+    progress.close()
+    if failed:
+        raise failed[0]
+
+
+def listed(seeds: tuple[int, ...]) -> str:
+    """seed 0, or seeds 0, 1, 2."""
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(map(str, seeds))}"

@@ -1,0 +1,116 @@
+"""What jobs leave in a run's folder, one file a (method, seed): what is in it is finished, and kept."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import catalogue
+from deconfounded.envs.files import check_folder, read_sealed, sweep, write_sealed
+
+META: dict[str, Any] = {  # what a file says of itself, and of what types
+    **{"identity": dict, "seed": int, "budget": dict, "spans": list, "cpu_s": (int, float), "arrays": list},
+    **{"machine": str, "commit": (str, type(None))},
+}
+
+
+OF_AGENT = ("returns", "objective", "probe")
+
+
+SCORED = {"agents": list, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
+
+
+def broken(found: dict[str, Any]) -> str:
+    """Why what a file holds cannot be what a job wrote; empty if it can."""
+    meta = found["meta"]
+    wanted = META | (SCORED if "agents" in meta else {})
+    right = all(isinstance(meta.get(key, ...), kind) for key, kind in wanted.items())
+    if not right or not isinstance(meta["identity"].get("method"), str):
+        return "it does not say what it was made of"
+    if not all(isinstance(amount, int) for amount in meta["budget"].values()):
+        return "it does not say what data it used"
+    if lost := {"meta", *meta["arrays"]} ^ set(found):
+        return f"it lacks {', '.join(sorted(lost))}"
+    for name in meta.get("agents", ()):
+        returns, objective, probe = (found.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
+        if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
+            return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
+    for key, value in found.items():
+        if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
+            return f"{key} holds NaN or infinity"
+    return ""
+
+
+def read(file: Path) -> dict[str, Any] | None:
+    """A job's file: arrays, and `meta` decoded. None if it is missing, or damaged (a zip has checksums)."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in data.files}
+        meta = json.loads(str(arrays["meta"]))
+    except Exception:  # damaged, which shows in many ways
+        return None
+    return {**arrays, "meta": meta} if isinstance(meta, dict) else None
+
+
+Finished = list[tuple[str, int, dict[str, Any]]]
+"""Method, seed, and what its job wrote."""
+
+
+def know_guests(folder: Path) -> None:
+    """Make the methods from outside known whose results are in a folder, so that they stay in its tables."""
+    for file in sorted(folder.glob("*-*.npz")):
+        if (found := read(file)) and (reference := found["meta"].get("reference")):
+            try:
+                catalogue.add(str(reference))
+            except envs.InputError as error:
+                print(f"{file.name} is left out: {error}")
+
+
+def left_in(folder: Path) -> Finished:
+    """What jobs left in a folder, whatever code made it: each file is what it says it is."""
+    found = []
+    for file in sorted(folder.glob("*-*.npz")):
+        data = read(file)
+        if data is None or "agents" not in data["meta"]:
+            continue
+        why, meta = broken(data), data["meta"]
+        if not why and file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
+            why = f"it is of {name}"
+        if why:
+            print(f"{file.name} is left out: {why}")
+        else:
+            found.append((meta["identity"]["method"], meta["seed"], data))
+    return found
+
+
+def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
+    """What the jobs of each method wrote, by seed."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for method, _, data in finished:
+        found.setdefault(method, []).append(data)
+    return found
+
+
+def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
+    """Make the output folder, or see that what it holds can be gone on with."""
+    for place in (folder, folder / "jobs"):
+        check_folder(place)
+        sweep(place)
+    file = folder / "settings.json"
+    if not file.exists():
+        if any((folder / "jobs").iterdir()):
+            raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
+        write_sealed(file, settings)
+    elif not resume:
+        raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
+    else:
+        before = read_sealed(file)
+        now = json.loads(json.dumps(settings))
+        if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
+            raise envs.InputError(
+                f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it"
+            )
