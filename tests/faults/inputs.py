@@ -318,7 +318,7 @@ def main() -> None:
 
 ACCEPTED = {  # rightly, though they look odd
     *(
-        "rescore --out '{file}'",
+        "score --out '{file}'",
         "make_vec(episodes=100000000000000000000)",
         "make_dm(seed=[1])",
         "vec.step([0.1, 0.2])",
