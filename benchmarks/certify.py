@@ -36,7 +36,7 @@ from deconfounded.envs.files import check_folder, save_figure, write_json
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 
 EPISODES = 5
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
@@ -94,8 +94,8 @@ def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Arr
     true = np.repeat(levels, j * trials, 0)
     told = np.tile(np.repeat(levels, trials, 0), (j, 1))
     env = envs.BatchEnv(task, j * j * trials)
-    _, returns = run_trials(env, ExpertAgent(env, expert, told), 1, seed, true)
-    _, random = run_trials(env, RandomAgent(task.action_space), 1, seed, true)
+    returns = run_trials(env, ExpertAgent(env, expert, told), 1, seed, true).returns
+    random = run_trials(env, RandomAgent(task.action_space), 1, seed, true).returns
     matrix = returns.reshape(j, j, trials).mean(-1)
     zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
     one = np.diag(matrix)[:, None]
@@ -129,13 +129,13 @@ def certify(
     env = envs.BatchEnv(task, trials)
 
     def returns(agent: Agent) -> Array:
-        return run_trials(env, agent, EPISODES, seed)[1].mean(0)
+        return run_trials(env, agent, EPISODES, seed).returns.mean(0)
 
     witness = Witness(env, expert, Grid(env, expert, grid))
-    one, zero = returns(witness).mean(), returns(RandomAgent(task.action_space)).mean()
+    _, shown, truth = run_trials(env, witness, EPISODES, seed)  # thetas are the same in every run: seeds are shared
+    one, zero = shown.mean(), returns(RandomAgent(task.action_space)).mean()
     if one <= zero:
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
-    truth = thetas(task, trials, EPISODES, seed)  # the same in every run: seeds are shared
     done(STAGES[0])
     beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
     interventional = returns(ExactAgent(env, expert, False, grid))
@@ -147,7 +147,7 @@ def certify(
     done(STAGES[3])
 
     demo_env = envs.BatchEnv(task, 2 * trials)
-    demos, _ = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed))
+    demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed)).trials
     blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
     done(STAGES[4])
 

@@ -45,7 +45,7 @@ def main() -> None:
         "expert": lambda env: ExpertAgent(env, expert),
     }
     env = envs.BatchEnv(task, 64)
-    low, high = (float(run_trials(env, make(env), 1, args.seed)[1].mean()) for make in behaviours.values())
+    low, high = (float(run_trials(env, make(env), 1, args.seed).returns.mean()) for make in behaviours.values())
     kind = "random" if args.explore else "expert"
     seed = stream(EXPLORATION if args.explore else DEMOS, args.seed)
     collected = datasets.collect(task, args.trials, behaviours[kind], seed)

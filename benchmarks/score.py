@@ -59,7 +59,7 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
         ("expert", ExpertAgent(env, expert)),
         ("random", RandomAgent(task.action_space)),
     ):
-        found[name] = run_trials(env, one, task.episodes, seed)[1]
+        found[name] = run_trials(env, one, task.episodes, seed).returns
     best, worst = found["expert"].mean(), found["random"].mean()
     by_trial = score.normalise(found["agent"], worst, best)
     interval = score.bootstrap(by_trial[:, -1])

@@ -56,8 +56,8 @@ def main() -> None:
     file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
     write_atomically(file, to_bytes(weights))
     env = envs.BatchEnv(task, 256)
-    _, returns = run_trials(env, ExpertAgent(env, policy.load(task, file)), 1, seed=args.seed)
-    _, random = run_trials(env, RandomAgent(task.action_space), 1, seed=args.seed)
+    returns = run_trials(env, ExpertAgent(env, policy.load(task, file)), 1, seed=args.seed).returns
+    random = run_trials(env, RandomAgent(task.action_space), 1, seed=args.seed).returns
     card = {
         "task": task.name,
         "task_version": task.version,

@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, Trials, run_trials, thetas
+from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 HORIZON = "deconf_horizon"  # of the data set's metadata: T, which no episode need last
 
@@ -37,8 +37,8 @@ def collect(task: Task, n: int, agent: Any, seed: int) -> tuple[Trials, Array, l
     """n trials of an agent, made for an environment -> Trials, theta [N, E, L], and reward and ends of each step."""
     env = _Noting(task, n)
     made: Agent = agent(env)
-    trials, _ = run_trials(env, made, task.episodes, seed)
-    return trials, thetas(task, n, task.episodes, seed), env.steps
+    trials, _, theta = run_trials(env, made, task.episodes, seed)
+    return trials, theta, env.steps
 
 
 def write(

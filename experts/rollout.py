@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -194,10 +194,21 @@ def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
     return [one + i for one in seeds for i in range(n // len(seeds))]
 
 
+class Rollout(NamedTuple):
+    """N trials of E episodes: what happened, the returns [N, E], and the theta [N, E, L] of each episode.
+
+    Learners are handed `trials` alone; returns and theta are for scoring, and theta for methods that declare it.
+    """
+
+    trials: Trials
+    returns: Array
+    theta: Array
+
+
 def run_trials(
     env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
-) -> tuple[Trials, Array]:
-    """N trials of `episodes` episodes each -> Trials and returns [N, E].
+) -> Rollout:
+    """Run an agent in N trials of `episodes` episodes each.
 
     seed: of the environments and, apart from them, of the agent; or one for each of several equal groups of trials, one
     after another, each of which goes as it would go alone. theta: forced [N, L], else drawn from p(theta).
@@ -208,6 +219,7 @@ def run_trials(
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
+    hidden = np.zeros((n, episodes, len(task.latents)))
     action: NDArray[np.float32] | None = None
     for e in range(episodes):
         if e == 0:
@@ -215,6 +227,7 @@ def run_trials(
             agent.begin(n)
         else:
             now = env.reset(options={"keep_theta": True})
+        hidden[:, e] = env.theta
         agent.reset([np.random.default_rng([one, 1, e]) for one in seeds])
         obs[:, e, 0] = now
         for t in range(task.horizon):
@@ -234,4 +247,4 @@ def run_trials(
                 break
     assert action is not None
     discrete = int(task.action_space.n) if isinstance(task.action_space, spaces.Discrete) else 0
-    return Trials(obs, action, mask, discrete), returns
+    return Rollout(Trials(obs, action, mask, discrete), returns, hidden)

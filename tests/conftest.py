@@ -1,10 +1,22 @@
-"""Which tests are skipped for what is not installed."""
+"""What holds for every test: tasks that it registers are gone after it; those that need dm_control are skipped."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from importlib.util import find_spec
 
 import pytest
+
+from deconfounded import envs
+
+
+@pytest.fixture(autouse=True)
+def _forget_tasks() -> Iterator[None]:
+    """A task from outside that a test registers has its name in that test alone: workers share tests in any order."""
+    before = dict(envs.TASKS)
+    yield
+    for name in envs.TASKS.keys() - before.keys():
+        del envs.TASKS[name]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -171,7 +171,7 @@ def of_method(name: str) -> Numbers:
             for way, agent in made.items():
                 recorder = Recorder(agent, context.env)
                 seeds = [stream(EVALUATION, 0, "fingerprint")]
-                trials, returns = run_trials(context.env, recorder, task.episodes, seeds)
+                trials, returns, _ = run_trials(context.env, recorder, task.episodes, seeds)
                 recorder.note()
                 label = f"{way} on {task.name}"
                 numbers |= {f"actions of {label}": sums(trials.action), f"returns of {label}": sums(returns)}
@@ -186,7 +186,7 @@ def of_protocol(name: str) -> Numbers:
     expert = policy.load(task, CONTROL)
     env = envs.BatchEnv(task, 4)
     seeds = [stream(purpose, seed, salt) for purpose in (1, 2, 3, 4) for seed in (0, 1) for salt in ("", "salt")]
-    trials, returns = run_trials(env, RandomAgent(task.action_space), 2, seeds[:2])
+    trials, returns, _ = run_trials(env, RandomAgent(task.action_space), 2, seeds[:2])
     theta = rng.uniform(-1, 1, (4, 2, 1))
     known = rng.standard_normal((40, 6))
     r2, _ = measure.probe(known, known[:, :2] + 0.3 * rng.standard_normal((40, 2)))

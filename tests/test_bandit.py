@@ -51,7 +51,7 @@ def test_exact_policies(env: envs.BatchEnv, who: str, pulls: float, curve: list[
     """Best-arm pulls of 100 and P(best arm) at t = 1, 5, 10, 20, 50, 100, within 4 standard errors of 20,000 trials."""
     expert = policy.load(env.task)
     agent = ExpertAgent(env, expert) if who == "expert" else ExactAgent(env, expert, who == "conditional")
-    trials, returns = run_trials(env, agent, 1, seed=5)
+    trials, returns, _ = run_trials(env, agent, 1, seed=5)
     assert abs(returns.mean() - pulls) < 4 * returns.std() / np.sqrt(N) + 0.05  # published to one decimal
     best = (trials.action[:, 0, :, 0] == env.theta).mean(0)
     np.testing.assert_allclose(best[[0, 4, 9, 19, 49, 99]], curve, atol=4 * 0.5 / np.sqrt(N) + 0.0005)
@@ -59,7 +59,7 @@ def test_exact_policies(env: envs.BatchEnv, who: str, pulls: float, curve: list[
 
 def test_payouts(env: envs.BatchEnv) -> None:
     """Eq. (4): 3/4 for the best arm, 1/4 for others, 4 standard errors."""
-    trials, _ = run_trials(env, ExpertAgent(env, policy.load(env.task)), 1, seed=6)
+    trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 1, seed=6).trials
     best = trials.action[:, 0, :, 0] == env.theta
     paid = trials.obs[:, 0, 1:, 0]
     assert abs(paid[best].mean() - 0.75) < 4 * 0.5 / np.sqrt(best.sum())

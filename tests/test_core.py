@@ -47,14 +47,14 @@ from tests.tools import tiny_preset
 
 def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.BatchEnv]:
     env = envs.BatchEnv(envs.get(name), n)
-    return run_trials(env, ExpertAgent(env, policy.load(env.task)), episodes, seed=1)[0], env
+    return run_trials(env, ExpertAgent(env, policy.load(env.task)), episodes, seed=1).trials, env
 
 
 def explorer(name: str, n: int, episodes: int = 2) -> deconfounded.Explore:
     def explore(agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
         env = envs.BatchEnv(envs.get(name), n * len(rngs))
         seeds = [int(rng.integers(2**31)) for rng in rngs]
-        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, seeds)[0]
+        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, seeds).trials
 
     return explore
 
@@ -337,7 +337,7 @@ class TestTrials:
     def test_ended_episodes_are_left_out(self) -> None:
         """Batch holds just the steps that took place, in order, each with its own successor."""
         env = envs.BatchEnv(envs.get("slippery_cartpole"), 8)
-        trials, returns = run_trials(env, RandomAgent(env.task.action_space), 3, seed=0)
+        trials, returns, _ = run_trials(env, RandomAgent(env.task.action_space), 3, seed=0)
         data = Batch.of(trials, 2)
         assert 0 < trials.mask.mean() < 0.5
         assert data.mask.sum() == trials.mask.sum()
@@ -461,15 +461,15 @@ class TestMethods:
         rng = np.random.default_rng
         oracle = cloning.fit(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
         blind = cloning.fit(trials, config, rng(0))
-        assert run_trials(score, oracle, 1, 3)[1].mean() == pytest.approx(60, abs=2)
-        assert run_trials(score, blind, 1, 3)[1].mean() == pytest.approx(20, abs=2)
+        assert run_trials(score, oracle, 1, 3).returns.mean() == pytest.approx(60, abs=2)
+        assert run_trials(score, blind, 1, 3).returns.mean() == pytest.approx(20, abs=2)
 
     def test_naive_rnn_is_deluded(self) -> None:
         """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
         trials, env = demonstrations("bandit", 1000, 1)
         config = RecurrentConfig(updates=250, batch=50, chunk=50, learning_rate=5e-3)
         agent = naive_rnn.fit(trials, config, np.random.default_rng(0))
-        assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3)[1].mean() < 42
+        assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3).returns.mean() < 42
 
     @pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
     def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
@@ -488,7 +488,7 @@ class TestMethods:
             deconfounded.fit(trials, explorer("slippery_cartpole", 4), config, np.random.default_rng(0))
             for _ in range(2)
         ]
-        first, second = (run_trials(env, agent, 2, 5)[0].action for agent in agents)
+        first, second = (run_trials(env, agent, 2, 5).trials.action for agent in agents)
         np.testing.assert_array_equal(first, second)
         assert torch.equal(torch.get_rng_state(), state)
 
@@ -509,7 +509,7 @@ class TestMethods:
         for seeds in ((5,), (4, 5, 6)):
             context = Context(task, settings, seeds)
             agent = MAKERS[method](context)[method]
-            trials, _ = run_trials(context.env, agent, task.episodes, list(seeds))
+            trials = run_trials(context.env, agent, task.episodes, list(seeds)).trials
             found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
         np.testing.assert_array_equal(*found)
 

@@ -48,7 +48,7 @@ def test_what_it_says(tmp_path: Path) -> None:
     """Returns, ends, reference scores and trials are Minari's own to read; theta is in the metadata alone."""
     task = envs.get("slippery_cartpole")
     collected = datasets.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
-    _, returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5)
+    returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5).returns
     place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
     found = minari.MinariDataset(place / "data")
     episodes = list(found.iterate_episodes())
@@ -80,4 +80,4 @@ def test_the_standard_sets_are_the_same() -> None:
         env = envs.BatchEnv(envs.get("bandit"), 256)
         expert = ExpertAgent(env, policy.load(env.task))
         agent = expert if kind == "expert" else RandomAgent(env.task.action_space)
-        assert run_trials(env, agent, 1, stream(purpose, 0))[0].sha256 == kept["bandit-v0"][kind]
+        assert run_trials(env, agent, 1, stream(purpose, 0)).trials.sha256 == kept["bandit-v0"][kind]

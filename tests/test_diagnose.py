@@ -173,8 +173,8 @@ class TestJudge:
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
     task = envs.get("bandit")
     env = envs.BatchEnv(task, n)
-    shown, _ = run_trials(env, ExpertAgent(env, policy.load(task)), task.episodes, 0)
-    return shown, run_trials(env, RandomAgent(task.action_space), task.episodes, 1)[0]
+    shown = run_trials(env, ExpertAgent(env, policy.load(task)), task.episodes, 0).trials
+    return shown, run_trials(env, RandomAgent(task.action_space), task.episodes, 1).trials
 
 
 @pytest.mark.parametrize("make", [_bandit, lambda: (trials(), trials(seed=1))], ids=["discrete", "continuous"])

@@ -140,9 +140,9 @@ def test_the_static_filter_loses(name: str) -> None:
     task = envs.get(name)
     expert, env = policy.load(task), envs.BatchEnv(task, 96)
     last = {
-        static: run_trials(env, ExactAgent(env, expert, False, 17, static), task.episodes, [0])[1][:, -1].mean()
+        static: run_trials(env, ExactAgent(env, expert, False, 17, static), task.episodes, [0]).returns[:, -1].mean()
         for static in (False, True)
     }
-    best = run_trials(env, ExpertAgent(env, expert), task.episodes, [0])[1][:, -1].mean()
+    best = run_trials(env, ExpertAgent(env, expert), task.episodes, [0]).returns[:, -1].mean()
     assert last[True] < last[False] - 0.05 * best
     assert last[False] > 0.9 * best

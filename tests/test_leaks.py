@@ -123,7 +123,9 @@ class TestData:
         task, seeds = envs.get(name), [3, 5]
         context = Context(task, tiny_preset(), seeds)
         env = envs.BatchEnv(task, 8)
-        made, _ = run_trials(env, ExpertAgent(env, context.expert), task.episodes, [stream(DEMOS, s) for s in seeds])
+        made = run_trials(
+            env, ExpertAgent(env, context.expert), task.episodes, [stream(DEMOS, s) for s in seeds]
+        ).trials
         np.testing.assert_array_equal(context.demonstrations.obs, made.obs)
         np.testing.assert_array_equal(context.demonstrations.action, made.action)
         np.testing.assert_array_equal(context.demonstrated_theta, np.stack([env.theta] * task.episodes, 1))
@@ -179,7 +181,7 @@ class TestData:
         trials = given[0] if method == "dagger" else given
         env = envs.BatchEnv(task, 4)
         seed = stream(EXPLORATION, int(np.random.default_rng(7).integers(2**31)))
-        plain, _ = run_trials(env, RandomAgent(task.action_space), task.episodes, [seed])
+        plain = run_trials(env, RandomAgent(task.action_space), task.episodes, [seed]).trials
         np.testing.assert_array_equal(trials.obs, plain.obs)
 
     @pytest.mark.parametrize("name", [CONTROL, "tilted_cartpole"])
@@ -216,13 +218,13 @@ class TestData:
         preset = replace(tiny_preset(), expert_trials=400, eval_trials=200)
         context = Context(envs.get("bandit"), replace(preset, cloning=CloningConfig(updates=300)), [0])
         agent = MAKERS["oracle_bc"](context)["oracle_bc"]
-        assert run_trials(context.env, agent, 1, [9])[1].mean() == pytest.approx(60, abs=1.5)
+        assert run_trials(context.env, agent, 1, [9]).returns.mean() == pytest.approx(60, abs=1.5)
 
 
 def make(kind: str, name: str = CONTROL) -> tuple[LatentModel, Batch, Draws, DeconfoundedAgent]:
     """An untrained model of two seeds, expert trials, and the agent that stands on it."""
     env = envs.BatchEnv(envs.get(name), 6)
-    trials, _ = run_trials(env, ExpertAgent(env, policy.load(env.task)), 2, 1)
+    trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 2, 1).trials
     data, draws = Batch.of(trials, 2), Draws([np.random.default_rng(i) for i in range(2)], "cpu")
     sizes = (3, 16, Signature.of(trials), *scalers(data), draws)
     model = DiscreteModel(*sizes) if kind == "discrete" else VariationalModel(kind, *sizes)

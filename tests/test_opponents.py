@@ -343,7 +343,7 @@ class TestGail:
         for task in (CONTROL, "bandit"):
             env, config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
             ppo = gail._ppo(env, config, 0)
-            trials, _ = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0)
+            trials = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0).trials
             signature = Signature.of(trials)
             obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))
             obs.std.fill_(1)
@@ -498,7 +498,7 @@ def test_interrupted_training_goes_on(method: str) -> None:
     whole = made(method, "bandit")
     assert isinstance(whole, LearnedAgent)
     for agent in (whole, made(method, "bandit", monitor=monitor), type(whole).from_state(*whole.state())):
-        found.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1)[0].action)
+        found.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1).trials.action)
     np.testing.assert_array_equal(found[1], found[0])
     np.testing.assert_array_equal(found[2], found[0])
 
@@ -508,6 +508,6 @@ def test_one_seed_of_two_is_kept(method: str) -> None:
     agent = made(method, seeds=(0, 1))
     assert isinstance(agent, LearnedAgent)
     env = envs.BatchEnv(envs.get(CONTROL), 4)
-    both = run_trials(env, agent, 2, [5, 6])[0].action
-    alone = run_trials(envs.BatchEnv(env.task, 2), agent.of_seed(1), 2, [6])[0].action
+    both = run_trials(env, agent, 2, [5, 6]).trials.action
+    alone = run_trials(envs.BatchEnv(env.task, 2), agent.of_seed(1), 2, [6]).trials.action
     np.testing.assert_array_equal(alone, both[2:])

@@ -112,7 +112,6 @@ def test_run_play_score(folder: Path) -> None:
 
 def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """README's task holds the whole contract; one that gives theta away does not."""
-    monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
     assert len((folder / "bent_cartpole.py").read_text().splitlines()) <= 60
     leaky = "from bent_cartpole import BentCartpole\nclass Leaky(BentCartpole):\n    name = 'leaky'\n"
     leaky += "    process_noise = {**BentCartpole.process_noise, 'hinge': (0, 0)}\n"
@@ -139,9 +138,8 @@ def test_loop_of_readme(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_task_from_outside(folder: Path) -> None:
     """It is known by its name from then on, to gymnasium too; its weights are looked for beside it."""
-    monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
     task = envs.get(f"{folder}/{BENT}")
     assert task.name == "bent_cartpole"
     assert task.reference == f"{folder}/{BENT}"
@@ -546,7 +544,7 @@ class TestSaved:
                 for name in wrote["meta"]["agents"]:
                     env, expected = envs.BatchEnv(envs.get(task), 4), wrote[f"{name}/returns"]
                     agent = play.ready(tmp_path / "agents" / f"{name}-{seed}", env.task)
-                    again = run_trials(env, agent, expected.shape[1], stream(EVALUATION, seed))[1]
+                    again = run_trials(env, agent, expected.shape[1], stream(EVALUATION, seed)).returns
                     np.testing.assert_array_equal(again, expected)
 
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
@@ -625,12 +623,12 @@ def fit(given): return Constant(-0.25)
 """
         context, agent = guest(tmp_path, text)
         assert agent.keep(tmp_path / "kept", {"seed": 0}) == ""
-        expected = run_trials(context.env, agent, 1, 3)[1]
+        expected = run_trials(context.env, agent, 1, 3).returns
         agent.close()
         (tmp_path / "mine.py").unlink()
         assert store.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
         again = deconfounded.load(tmp_path / "kept")
-        np.testing.assert_array_equal(run_trials(context.env, again, 1, 3)[1], expected)
+        np.testing.assert_array_equal(run_trials(context.env, again, 1, 3).returns, expected)
 
 
 class TestSentences:

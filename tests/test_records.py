@@ -91,9 +91,8 @@ class TestIdentity:
         monkeypatch.setattr("mujoco.__version__", "4.5.6")
         assert identity.versions() == {"python": platform.python_version(), "mujoco": "4.5.6"}
 
-    def test_an_outside_task_is_its_text(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_an_outside_task_is_its_text(self, tmp_path: Path) -> None:
         """Of its file, modules and packages beside it, its MJCF and what that includes; comments are no matter."""
-        monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
         texts = {
             "base_body.py": "from deconfounded.envs.tasks.bandit import Bandit\nclass Base(Bandit): pass\n",
             "parts/__init__.py": "",

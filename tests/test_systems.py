@@ -50,9 +50,8 @@ def python(*args: object, cwd: Path = ROOT, **environ: str) -> str:
 
 
 @pytest.fixture
-def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> envs.Task:
+def own(tmp_path: Path) -> envs.Task:
     """A task from outside, that this process alone knows by its name."""
-    monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
     (tmp_path / "own.py").write_text(OWN)
     (tmp_path / "own_cartpole.xml").write_bytes((ROOT / "assets" / f"{CONTROL}.xml").read_bytes())
     return envs.get(f"{tmp_path}/own.py:Own")
@@ -342,7 +341,6 @@ class TestText:
     )
     def test_sources_in_other_encodings(self, start: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """As Python reads them: a task, an expert and a method; a method's name is what a record takes."""
-        monkeypatch.setattr(envs.registry, "TASKS", dict(envs.TASKS))
         monkeypatch.setattr(catalogue, "METHODS", dict(catalogue.METHODS))
         (tmp_path / "own.py").write_bytes(start + OWN.encode())
         (tmp_path / "own_cartpole.xml").write_bytes((ROOT / "assets" / f"{CONTROL}.xml").read_bytes())

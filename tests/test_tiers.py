@@ -29,7 +29,7 @@ def scores(env: envs.BatchEnv, agent: Agent) -> Array:
     """Score [E] of an agent: 0 random, 1 the expert that sees theta."""
     expert = policy.load(env.task)
     zero, one, own = (
-        run_trials(env, who, EPISODES, seed=7)[1].mean(0)
+        run_trials(env, who, EPISODES, seed=7).returns.mean(0)
         for who in (RandomAgent(env.task.action_space), ExpertAgent(env, expert), agent)
     )
     return normalise(own, zero.mean(), one.mean())
@@ -87,7 +87,7 @@ def test_who_sees_theta_can_clone(name: str) -> None:
     """What fails there is not the cloning: from as many trials, the oracle does well."""
     env = envs.BatchEnv(envs.get(name), 64)
     expert, encode = policy.load(env.task), env.task.encode_theta
-    trials, _ = run_trials(env, ExpertAgent(env, expert), env.task.episodes, seed=1)
+    trials = run_trials(env, ExpertAgent(env, expert), env.task.episodes, seed=1).trials
     own, shown = envs.BatchEnv(env.task, N), encode(thetas(env.task, 64, env.task.episodes, 1))
     config = CloningConfig(updates=1500)
     oracle = cloning.fit(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
@@ -100,7 +100,7 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
     task = envs.get("bandit")
     context = Context(task, preset("smoke", task, "cpu"), [0])
     agents = MAKERS[method](context)
-    pulls, once = (run_trials(context.env, agents[name], 1, 3)[1].mean() for name in (method, f"{method}_episode"))
+    pulls, once = (run_trials(context.env, agents[name], 1, 3).returns.mean() for name in (method, f"{method}_episode"))
     assert pulls > atleast
     assert once == pytest.approx(20, abs=3)
     assert context.monitor.budget["expert_trials"] == [2000]

@@ -30,7 +30,7 @@ Arrays = dict[str, Array]
 def measure(task: envs.MujocoTask, before: Arrays | None) -> Arrays:
     """All that is compared. before: another version's, for the same actions and the same states."""
     env = envs.BatchEnv(task, N)
-    trials, returns = run_trials(env, ExpertAgent(env, policy.load(task)), 2, SEED)
+    trials, returns, _ = run_trials(env, ExpertAgent(env, policy.load(task)), 2, SEED)
     actions = np.array(trials.action[:, 0], float)
     actions[::2] = np.random.default_rng(SEED).uniform(-1, 1, actions[::2].shape)
     if before is not None:

@@ -20,7 +20,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts import store
-from deconfounded.experts.rollout import Agent, run_trials, thetas
+from deconfounded.experts.rollout import Agent, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
@@ -171,9 +171,8 @@ def evaluate(
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
     recorder = Recorder(agent, context.env, filmed)
     streams = [stream(EVALUATION, seed, salt) for seed in seeds]
-    trials, returns = run_trials(context.env, recorder, episodes, streams)
+    trials, returns, theta = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    theta = thetas(task, context.env.n, episodes, streams)
     objective = measure.objective(context.expert, trials, theta)
     encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))

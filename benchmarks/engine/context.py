@@ -19,7 +19,7 @@ from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Source
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, joined, run_trials, thetas
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Rollout, Trials, joined, run_trials, thetas
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -66,7 +66,7 @@ class Context:
     def _expert_trials(self, n: int, seeds: Sequence[int]) -> Trials:
         env = envs.BatchEnv(self.task, n * len(seeds))
         seeds = [stream(DEMOS, seed) for seed in seeds]
-        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds)[0]
+        return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds).trials
 
     def _kept(self, seed: int) -> tuple[Path, str]:
         """Where a seed's demonstrations are kept, and what they are made of."""
@@ -118,26 +118,31 @@ class Context:
         """For initial weights and batches; the same for every method of a seed."""
         return [np.random.default_rng([seed, 0]) for seed in self.seeds]
 
-    def _roll_out(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, list[int]]:
+    def _roll_out(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Rollout:
         env = envs.BatchEnv(self.task, n * len(rngs))
         self.monitor.spend("exploration_trials", [n] * len(rngs))
         seeds = [stream(EXPLORATION, int(rng.integers(2**31))) for rng in rngs]
         behaviour = agent or RandomAgent(self.task.action_space)
-        return run_trials(env, behaviour, self.task.episodes, seeds)[0], seeds
+        return run_trials(env, behaviour, self.task.episodes, seeds)
 
     def explore(self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None) -> Trials:
         """Trials under fresh thetas, by an agent that knows nothing of them; None: uniformly random actions."""
-        return self._roll_out(n or self.preset.explore_trials, agent, rngs)[0]
+        return self._roll_out(n or self.preset.explore_trials, agent, rngs).trials
+
+    def explore_with_theta(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, Array]:
+        """The same, and the encoded theta [B, E, F] of each episode."""
+        trials, _, theta = self._roll_out(self.preset.explore_trials, agent, rngs)
+        self.monitor.spend("thetas", [len(trials) // len(rngs)] * len(rngs))
+        return trials, self.task.encode_theta(theta)
 
     def query(
         self, agent: Agent | None, rngs: Sequence[np.random.Generator], n: int | None = None
     ) -> tuple[Trials, NDArray[np.float32]]:
         """Such trials, and what the expert, which sees theta, would have done at each step [B, E, T, A]."""
-        trials, seeds = self._roll_out(n or self.preset.query_trials, agent, rngs)
+        trials, _, theta = self._roll_out(n or self.preset.query_trials, agent, rngs)
         self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
-        theta = thetas(self.task, len(trials), self.task.episodes, seeds)
         random = Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
         labels = [self.expert.act(obs[:, t], theta[:, t // shape[2]], random) for t in range(obs.shape[1])]
         return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
@@ -157,6 +162,8 @@ class Allowed:
 
     def __init__(self, context: Context, uses: Sequence[str]) -> None:
         self._context, self._open = context, {*self.FREE, *(name for use in uses for name in self.OPENS[use])}
+        if {"exploration", "theta"} <= set(uses):
+            self._open.add("explore_with_theta")
 
     def __getattr__(self, name: str) -> Any:
         if name not in self._open:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.benchmarks.engine.context import EXPLORATION, Allowed, Context, stream
@@ -26,8 +24,7 @@ from deconfounded.deconf.methods import (
     rma,
 )
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.envs.task import Array
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, thetas, trial_seeds
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, trial_seeds
 
 if TYPE_CHECKING:
     from deconfounded.deconf.methods.practice import Practice
@@ -70,18 +67,11 @@ def _clone(context: Context | Allowed, name: str, fit: Callable[..., Agent], con
 
 
 def _rma(context: Context | Allowed) -> dict[str, Agent]:
-    encode, task = context.task.encode_theta, context.task
-
-    def tell(agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, Array]:
-        """Explorations, and their thetas, drawn once more from the seeds that `explore` is about to draw."""
-        seeds = [stream(EXPLORATION, int(copy.deepcopy(rng).integers(2**31))) for rng in rngs]
-        trials = context.explore(agent, rngs)
-        context.monitor.spend("thetas", [len(trials) // len(rngs)] * len(rngs))
-        return trials, encode(thetas(task, len(trials), task.episodes, seeds))
-
     context.monitor.spend("thetas", [context.preset.expert_trials] * len(context.seeds))
-    theta = encode(context.demonstrated_theta)
-    agent = rma.fit(context.demonstrations, theta, tell, context.preset.rma, context.rngs, context.monitor)
+    theta = context.task.encode_theta(context.demonstrated_theta)
+    agent = rma.fit(
+        context.demonstrations, theta, context.explore_with_theta, context.preset.rma, context.rngs, context.monitor
+    )
     return {"rma": agent}
 
 

@@ -43,7 +43,7 @@ def figure_2(task: envs.Task, file: Path, rolled: int = 5) -> None:
     figure, panels = plt.subplots(3, 1, figsize=(8, 4.4), layout="constrained", sharex=True)
     colours = ListedColormap(COLOURS_OF_ARMS)
     for panel, (name, agent) in zip(panels, agents.items(), strict=True):
-        trials, _ = run_trials(env, agent, 1, seed=3)
+        trials = run_trials(env, agent, 1, seed=3).trials
         shifted = (trials.action[:, 0, :, 0] - env.theta) % len(COLOURS_OF_ARMS)  # 0: the best arm
         panel.imshow(shifted, cmap=colours, vmin=-0.5, vmax=4.5, aspect="auto", interpolation="nearest")
         panel.set(title=name, yticks=[])

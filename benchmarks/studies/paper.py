@@ -112,7 +112,7 @@ class FigureJob(Job):
         context = Context(task, self.preset, self.seeds, monitor, self.folder)
         env = envs.BatchEnv(task, few * len(self.seeds))
         seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
-        trials, _ = run_trials(env, ExpertAgent(env, context.expert), 1, seeds)
+        trials = run_trials(env, ExpertAgent(env, context.expert), 1, seeds).trials
         monitor.watch(context, Batch.of(trials, len(seeds), self.preset.naive.device), few)
         agent = MAKERS[self.method](context)[self.method]
         trained = monitor.worked()
@@ -132,7 +132,7 @@ class FigureJob(Job):
 def online(context: Context, agent: Agent, n: int) -> tuple[NDArray[np.bool_], Array]:
     """Deploy in n trials a seed: whether each step's arm was the best [S n, T], and pulls of it [S n]."""
     env = envs.BatchEnv(context.task, n * len(context.seeds))
-    trials, returns = run_trials(env, agent, 1, [stream(EVALUATION, seed) for seed in context.seeds])
+    trials, returns, _ = run_trials(env, agent, 1, [stream(EVALUATION, seed) for seed in context.seeds])
     return trials.action[:, 0, :, 0] == env.theta, returns[:, 0]
 
 
@@ -142,9 +142,9 @@ def exact(task: envs.Task, n: int = 40_000) -> dict[str, dict[str, Any]]:
     for name in ("interventional", "conditional"):
         env = envs.BatchEnv(task, n)
         agent = Known(env, expert, name == "conditional")
-        _, returns = run_trials(env, agent, 1, seed=0)
+        returns = run_trials(env, agent, 1, seed=0).returns
         found[name] = {"online": np.mean(agent.best, 1), "pulls": float(returns.mean())}
-        trials, _ = run_trials(env, Onlooker(agent, ExpertAgent(env, expert)), 1, seed=1)
+        trials = run_trials(env, Onlooker(agent, ExpertAgent(env, expert)), 1, seed=1).trials
         arms = np.take_along_axis(np.stack(agent.policy, 1), trials.action[:, 0].astype(int), -1)
         found[name] |= {"on_expert": np.mean(agent.best, 1), "loss": float(-np.log(arms).mean())}
     probs = task.expert_probs(np.zeros((1, 1)), np.zeros((1, 1)))
