@@ -148,7 +148,7 @@ def certify(
 
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed)).trials
-    blind = returns(cloning.fit(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
+    blind = returns(cloning.train(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
     done(STAGES[4])
 
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}

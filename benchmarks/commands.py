@@ -33,7 +33,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
         "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
     )
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
-    made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive.updates=500")
+    made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive_rnn.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     made.add_argument(
@@ -50,7 +50,7 @@ def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str]
     methods = [name for one in asked for name in (known if one == "all" else [one])]
     if guests:
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
-        known = [*known, *(name for name, method in METHODS.items() if method.reference)]
+        known = [*known, *METHODS.outside]
     catalogue.check(args.preset, methods, args.seeds, known)
     if args.cluster is None:
         check_device(args.device)
@@ -85,6 +85,7 @@ def about(
     salt: str = "",
 ) -> dict[str, Any]:
     """What a folder is for: whoever asks for another one is not to write there. What else matters, each job checks."""
+    ours = {method: values for method, values in settings.configs.items() if method not in METHODS.outside}
     return {
         "kind": kind.__name__,
         "task": task.name,
@@ -92,7 +93,7 @@ def about(
         "reference": task.reference,
         "preset": name,
         "set": list(changes),
-        "settings": asdict(settings),
+        "settings": {**asdict(settings), "configs": ours},
         "versions": identity.versions(),
         **identity.expert(task, expert),
         "salt": salt,

@@ -49,7 +49,7 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
 
-    settings = changed(preset(record["preset"], task, device), record["set"])
+    settings = changed(preset(record["preset"], task, device, [method]), record["set"])
     guest = catalogue.guest(method)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "jobs"
@@ -58,21 +58,21 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
         with Local() as engine:
             finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
         every = records.of_run(finished, record["preset"], record["set"], task.episodes)
-        made = [one for one in every if one["method"] == record["method"]]
+        made = [one for one in every if one["deployment"] == record["deployment"]]
     if not made:
-        raise envs.InputError(f"{method} left no {record['method']} to compare with")
+        raise envs.InputError(f"{method} left no {records.named(record)} to compare with")
     return made[0]
 
 
 def pick(file: Path, method: str, seed: int) -> records.Record:
     """The record of a method and seed in a file. Raises InputError if there is none, or if there are several."""
     every = records.read(file)
-    fitting = [record for record in every if (record["method"], record["seed"]) == (method, seed)]
+    fitting = [record for record in every if (records.named(record), record["seed"]) == (method, seed)]
     if not fitting:
-        methods = dict.fromkeys(record["method"] for record in every)
+        methods = dict.fromkeys(map(records.named, every))
         if method not in methods:
             raise envs.closest("method", method, list(methods), f" in {file}")
-        seeds = sorted(record["seed"] for record in every if record["method"] == method)
+        seeds = sorted(record["seed"] for record in every if records.named(record) == method)
         raise envs.InputError(f"seed of {method} was {seed}; {file} has {', '.join(map(str, seeds))}")
     if len(fitting) > 1:  # of another preset, or other thetas
         raise envs.InputError(
@@ -96,14 +96,14 @@ def main() -> None:
     file = args.records or ROOT / "docs" / "records"
     file = file / records.place(task.name) if file.is_dir() else file
     record = pick(file, method, args.seed)
-    if record["job"] not in METHODS:
-        raise envs.InputError(f"method {record['job']} is not ours; give it as path/file.py:fit")
+    if record["method"] not in METHODS:
+        raise envs.InputError(f"method {record['method']} is not ours; give it as path/file.py:fit")
     if (task.name, task.version) != (record["task"], record["task_version"]):
         raise envs.InputError(
             f"the record is of {record['task']} v{record['task_version']}; here is {task.name} v{task.version}"
         )
     commands.check_device(args.device)
-    said, differs = verdict(record, rerun(record, task, record["job"], args.expert, args.device))
+    said, differs = verdict(record, rerun(record, task, record["method"], args.expert, args.device))
     print(f"{task.name} {method} {args.seed}: {said}" + "".join(f"\n    {line}" for line in differs))
     if said == "not the same":
         raise SystemExit(1)

@@ -1,114 +1,116 @@
-"""What a method from outside is handed: the data it declared that it uses, and nothing else.
+"""What a method is handed: the data that it declares that it uses, and nothing else.
 
-The method runs in a process of its own. Environments, their seeds, theta and the expert are in another one, and come no
-nearer than the arrays that this object asks for; what it asks for is counted. That keeps theta from who does not look
-for it, and from who walks through all that is at hand; it is no prison: files on the disk are not out of reach, and the
-seeds of a run without a salt are everybody's.
+Environments, their seeds, theta and the expert are out of its reach: it holds arrays, and a function that asks for
+more of them. A method from outside runs in a process of its own. This prevents accidental leakage, not cheating: files
+on the disk can be read, and the seeds of a run without a salt are public.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable
-from multiprocessing.connection import Connection
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.deconf.wire import pack
+from deconfounded.envs.streams import Array
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
-ANSWERED = ("act", "features")
-USES = {
-    "demonstrations": "expert trials, without theta",
-    "exploration": "roll-outs of a behaviour that is blind to theta",
-    "queries": "what the expert would do at each step of such a roll-out",
-    "theta": "the theta of each demonstration, in training",
-}
+if TYPE_CHECKING:
+    from deconfounded.deconf.core.agents import Monitor
+
+FloatArray = NDArray[np.float32]
 
 
-def uses(*kinds: str) -> Callable[[Callable[[Given], Agent]], Callable[[Given], Agent]]:
-    """Declares what a method may use, some of USES: `@uses("demonstrations")`. Raises InputError for anything else."""
-    check_uses(kinds)
+class Ask(Protocol):
+    """Asks for data of a kind; `agent` is rolled out for it. Raises InputError for what was not declared."""
 
-    def declare(fit: Callable[[Given], Agent]) -> Callable[[Given], Agent]:
-        fit.uses = kinds  # type: ignore[attr-defined]
-        return fit
-
-    return declare
-
-
-def check_uses(kinds: Iterable[str]) -> None:
-    """Raises InputError for what is not one of USES."""
-    if wrong := [kind for kind in kinds if kind not in USES]:
-        raise InputError(f"a method uses {wrong[0]!r}; it may use {', '.join(USES)}")
+    def __call__(self, kind: str, *what: Any, agent: Agent | None = None) -> Any: ...
 
 
 class Given:
-    """What one seed of a method may use.
+    """The data of one or more seeds, which are trained side by side.
 
     observations: O, the width of an observation. action_space: Box in [-1, 1], or Discrete. episodes: of a trial.
-    horizon: steps of an episode, at most. rng: its random numbers. Raises InputError for what was not declared.
+    horizon: steps of an episode, at most. config: the method's amounts, an object of the class that it declared. rngs:
+    a generator a seed. monitor: what training reports to. Trials are in as many equal groups as there are seeds, one
+    after another. Every method and property raises InputError for what was not declared.
     """
 
-    def __init__(self, channel: Connection, about: dict[str, Any]) -> None:
-        self._channel: Connection | None = channel
+    def __init__(
+        self, ask: Ask, about: Mapping[str, Any], config: Any, rngs: Sequence[np.random.Generator], monitor: Monitor
+    ) -> None:
+        self._ask, self.config, self.rngs, self.monitor = ask, config, list(rngs), monitor
         self.observations: int = about["observations"]
         self.action_space: spaces.Box | spaces.Discrete = about["action_space"]
         self.episodes: int = about["episodes"]
         self.horizon: int = about["horizon"]
-        self.rng = np.random.default_rng(about["rng"])
+        self._fresh: bool = about["fresh"]
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """The first seed's random numbers. A method from outside has one seed at a time."""
+        return self.rngs[0]
 
     @property
     def demonstrations(self) -> Trials:
-        """Expert trials, without theta; the same whenever it is asked for."""
+        """Expert trials, without theta; the same whenever they are asked for."""
         return self._ask("demonstrations")
 
     @property
-    def theta(self) -> NDArray[np.float64]:
+    def source(self) -> Trials | Callable[[], Trials]:
+        """The demonstrations; or, where a preset says so, a function that draws fresh ones."""
+        return (lambda: self._ask("fresh demonstrations")) if self._fresh else self.demonstrations
+
+    @property
+    def theta(self) -> Array:
         """The encoded theta [B, E, F] of each demonstration's episodes, about unit size."""
         return self._ask("theta")
 
     def explore(self, agent: Agent | None = None, trials: int | None = None) -> Trials:
-        """Roll an agent out under fresh thetas; None: uniformly random actions. trials: default, the preset's."""
-        return self._ask("exploration", agent, trials)
+        """Roll an agent out under fresh thetas; None: random actions. trials: for each seed; None: the preset's."""
+        return self._ask("exploration", trials, agent=agent)
 
-    def query(self, agent: Agent | None = None, trials: int | None = None) -> tuple[Trials, NDArray[np.float32]]:
+    def explore_with_theta(self, agent: Agent | None = None) -> tuple[Trials, Array]:
+        """The same, and the encoded theta [B, E, F] of each episode."""
+        return self._ask("exploration with theta", None, agent=agent)
+
+    def query(self, agent: Agent | None = None, trials: int | None = None) -> tuple[Trials, FloatArray]:
         """Such roll-outs, and what the expert would have done at each step [B, E, T, A]."""
-        return self._ask("queries", agent, trials)
+        return self._ask("queries", trials, agent=agent)
+
+    def environments(self, seed: int, n: int) -> Environments:
+        """n environments of the seed of that index, to explore in step by step, under fresh thetas."""
+        return Environments(self._ask, self._ask("environments", seed, n), n)
+
+    def acting_theta(self) -> Array:
+        """The encoded theta [N, F] of the environments that the agent acts in: for an oracle that is deployed."""
+        return self._ask("acting theta")
+
+    @property
+    def environment(self) -> Any:
+        """The environments that evaluation steps, and the expert: for reference policies alone."""
+        return self._ask("environment")
 
     def progress(self, share: float, **losses: float) -> None:
-        """So much of the training is done, from 0 to 1; losses are for the learning curve."""
-        if self._channel is not None:
-            self._channel.send_bytes(pack(["progress", share, losses]))
-
-    def _ask(self, kind: str, agent: Agent | None = None, *rest: Any) -> Any:
-        channel, self._channel = self._channel, None
-        if channel is None:
-            raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
-        try:
-            channel.send_bytes(pack([kind, agent is not None, *rest]))
-            return serve(channel, agent)
-        finally:
-            self._channel = channel
-
-    def close(self) -> None:
-        """Fitting is over."""
-        self._channel = None
+        """Report the share of the training that is done, from 0 to 1, and losses for the learning curve."""
+        if not np.isfinite([share, *losses.values()]).all():
+            raise InputError(f"progress was {share}, {losses}; it must be finite numbers")
+        self.monitor.update(round(1000 * min(max(share, 0), 1)), 1000, losses)
 
 
-def serve(channel: Connection, agent: Agent | None) -> Any:
-    """Be the agent for whoever is at the other end, until told that it is over; returns what came with that."""
-    while True:
-        asked, *given = channel.recv()
-        if asked == "over":
-            return given[0]
-        if asked == "refused":
-            raise InputError(given[0])
-        if asked == "reset":
-            given = [[np.random.default_rng(seed) for seed in given[0]]]
-        answer = getattr(agent, asked)(*given)
-        channel.send_bytes(pack(["done", answer if asked in ANSWERED else None, time.process_time()]))
+class Environments:
+    """n environments in trials of several episodes; theta stays for a trial, and is not to be seen."""
+
+    def __init__(self, ask: Ask, number: int, n: int) -> None:
+        self._ask, self._number, self.n = ask, number, n
+
+    def reset(self) -> FloatArray:
+        """Start trials; returns observations [n, O]."""
+        return self._ask("reset", self._number)
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Actions [n, A] -> what followed [n, O], what to act on next [n, O], which episodes and which trials ended."""
+        return self._ask("step", self._number, action)

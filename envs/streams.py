@@ -40,3 +40,10 @@ class Streams:
         """U(low, high) for bounds [K], a row a generator: K columns [K, groups], to be unpacked."""
         low, high = np.broadcast_arrays(np.asarray(low, float), high)
         return (low + (high - low) * self.random((self.groups, len(low)))).T
+
+
+def unseeded(rng: np.random.Generator) -> np.random.Generator:
+    """A generator in the same state, that does not hold the seed from which this state came."""
+    made = np.random.Generator(type(rng.bit_generator)(0))
+    made.bit_generator.state = rng.bit_generator.state
+    return made

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.batch import generators
 from deconfounded.envs.files import write_atomically
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Streams, unseeded
 from deconfounded.experts.policy import Expert
 
 
@@ -228,7 +228,7 @@ def run_trials(
         else:
             now = env.reset(options={"keep_theta": True})
         hidden[:, e] = env.theta
-        agent.reset([np.random.default_rng([one, 1, e]) for one in seeds])
+        agent.reset([unseeded(np.random.default_rng([one, 1, e])) for one in seeds])  # not the environments' seeds
         obs[:, e, 0] = now
         for t in range(task.horizon):
             alive = env.alive

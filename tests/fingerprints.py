@@ -15,8 +15,8 @@ import contextlib
 import datetime
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,8 +30,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, measure
 from deconfounded.benchmarks.engine.benchmark import Recorder
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
-from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
-from deconfounded.benchmarks.engine.presets import CONFIGS, Preset, preset
+from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.engine.presets import Preset, preset
 from deconfounded.benchmarks.output import index, score, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.envs.files import write_atomically
@@ -52,7 +52,7 @@ FEW = {  # updates, rounds, batches and widths of every method: a second each
     **dict.fromkeys(("batch", "inference_batch", "offline_batch", "online_batch", "synthetic"), 4),
     **dict.fromkeys(("imitation_batch", "inference_steps", "online_steps", "steps", "samples"), 16),
     **dict.fromkeys(("teacher_batch", "minibatch", "discriminator_batch"), 16),
-    **{"chunk": 5, "width": 8, "ahead": 3, "offline_steps": 10},
+    **{"chunk": 5, "width": 8, "ahead": 3, "offline_steps": 10, "grid": 5},
 }
 
 
@@ -140,43 +140,39 @@ def of_expert(name: str) -> Numbers:
     return numbers
 
 
-def few(amounts: Any, parts: Sequence[str]) -> Any:
-    """The same with parts that have few updates, and all else as it is."""
-    small = {}
-    for name in parts:
-        config = getattr(amounts, name)
-        small[name] = replace(config, **{one.name: FEW[one.name] for one in fields(config) if one.name in FEW})
-    return replace(amounts, **small)
+def few(values: dict[str, Any]) -> dict[str, Any]:
+    """A configuration with few updates, and all else as it is."""
+    return {name: FEW.get(name, value) for name, value in values.items()}
 
 
 def small(amounts: Preset) -> Preset:
     """A preset with few trials and updates."""
-    trials = {"expert_trials": 5, "explore_trials": 4, "query_trials": 4, "eval_trials": 4}
-    return replace(few(amounts, CONFIGS), **trials, grid=5)
+    configs = {name: few(values) for name, values in amounts.configs.items()}
+    return replace(amounts, expert_trials=5, explore_trials=4, query_trials=4, eval_trials=4, configs=configs)
 
 
 def of_method(name: str) -> Numbers:
     """A few updates on each toy task; what the agent then does there, and what it remembers."""
-    from deconfounded.benchmarks.engine.methods import MAKERS
+    from deconfounded.benchmarks.engine.catalogue import label
+    from deconfounded.benchmarks.engine.provider import deployed, fit
 
     numbers: Numbers = {}
     for task in (toys.Push(), toys.Arms(), toys.Drift()):
-        amounts, part = small(preset("default", task, "cpu")), METHODS[name].part
-        if task.drifts and not (name in EXACT or hasattr(getattr(amounts, part, None), "drifts")):
+        amounts = small(preset("default", task, "cpu", [name]))
+        if task.drifts and name not in EXACT and "drifts" not in amounts.configs.get(name, {}):
             continue
         source = None if isinstance(task.action_space, spaces.Discrete) else CONTROL
         with double():
             context = Context(task, amounts, (0,), expert=source)
-            made = MAKERS[name](Allowed(context, METHODS[name].uses))
-            for way, agent in made.items():
+            for way, agent in deployed(name, fit(context, name)).items():
                 recorder = Recorder(agent, context.env)
                 seeds = [stream(EVALUATION, 0, "fingerprint")]
                 trials, returns, _ = run_trials(context.env, recorder, task.episodes, seeds)
                 recorder.note()
-                label = f"{way} on {task.name}"
-                numbers |= {f"actions of {label}": sums(trials.action), f"returns of {label}": sums(returns)}
+                where = f"{label(name, way)} on {task.name}"
+                numbers |= {f"actions of {where}": sums(trials.action), f"returns of {where}": sums(returns)}
                 if recorder.known:
-                    numbers[f"memory of {label}"] = sums(np.stack(recorder.known))
+                    numbers[f"memory of {where}"] = sums(np.stack(recorder.known))
     return numbers
 
 
@@ -210,6 +206,8 @@ def of_scores(name: str) -> Numbers:
         records = {
             method: [
                 {
+                    "method": method,
+                    "deployment": "",
                     "seed": seed,
                     "returns": (mean + 0.1 * (one - zero) * rng.standard_normal(4)).tolist(),
                     "objective": rng.standard_normal(4).tolist(),
@@ -249,8 +247,10 @@ def of_diagnosis(name: str) -> Numbers:
     with double():
         context = Context(task, replace(small(preset("default", task, "cpu")), expert_trials=12), (0,), expert=CONTROL)
         trials, explored = context.demonstrations, context.explore(None, context.rngs, 12)
-        amounts = few(diagnose.DiagnoseConfig().amounts, ("cloning", "naive", "offline", "exploring"))
-        amounts = replace(amounts, rivals=4, dreams=8)
+        amounts = diagnose.DiagnoseConfig().amounts
+        parts = {part: getattr(amounts, part) for part in ("cloning", "naive", "offline", "exploring")}
+        less = {part: replace(config, **few(asdict(config))) for part, config in parts.items()}
+        amounts = replace(amounts, **less, rivals=4, dreams=8)
         measured = {
             label: measures.measure(trials, exploration, amounts, np.random.default_rng(5))
             for label, exploration in (("with exploration", explored), ("of expert trials alone", None))
@@ -276,7 +276,7 @@ KINDS: dict[str, Kind] = {
         of_method,
         lambda name: METHODS[name].version,
         list(METHODS),
-        "`version` of its entry in benchmarks/engine/catalogue.py",
+        "`version` in its file in deconf/methods",
     ),
     "protocol": (of_protocol, lambda name: identity.PROTOCOL, ["all"], "PROTOCOL in benchmarks/engine/identity.py"),
     "scores": (of_scores, lambda name: score.VERSION, ["all"], "VERSION in benchmarks/output/score.py"),

@@ -6,7 +6,7 @@ import os
 import queue
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ GUEST = """
 from pathlib import Path
 
 import beside
-from deconfounded.deconf.given import uses
+from deconfounded.deconf.method import uses
 from deconfounded.experts.rollout import RandomAgent
 
 
@@ -117,12 +117,12 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     (home / "my_guest.py").write_text(GUEST.format(home=str(home)))
     (home / "beside.py").write_text("from pathlib import Path\nFOLDER = Path(__file__).parent.name\n")
     names = [catalogue.add(f"{home}/my_guest.py:{function}") for function in ("fit", "broken")]
-    request.addfinalizer(lambda: [catalogue.METHODS.pop(name) for name in names])  # other tests count them
+    request.addfinalizer(catalogue.METHODS.outside.clear)  # other tests count them
     assert names == ["my_guest", "my_guest_broken"]
     here, there = tmp_path / "here" / "jobs", tmp_path / "there" / "jobs"
     for folder in (here, there):
         folder.mkdir(parents=True)
-    preset = replace(tiny_preset(), naive=replace(tiny_preset().naive, updates=40, chunk=300))
+    preset = tiny_preset().configured("naive_rnn", updates=40, chunk=300)
     local = [BenchmarkJob("slippery_cartpole", preset, "naive_rnn", (seed,), here) for seed in (0, 1)]
     progress.tell(queue.Queue())
     for job in local:

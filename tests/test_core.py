@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import measure
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
@@ -35,9 +35,9 @@ from deconfounded.deconf.equations import (
     reparametrise,
 )
 from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
-from deconfounded.deconf.methods import cloning, deconfounded, naive_rnn, offline
+from deconfounded.deconf.methods import cloning, deconfounded, deconfounded_offline, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
@@ -50,11 +50,11 @@ def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.B
     return run_trials(env, ExpertAgent(env, policy.load(env.task)), episodes, seed=1).trials, env
 
 
-def explorer(name: str, n: int, episodes: int = 2) -> deconfounded.Explore:
-    def explore(agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Trials:
-        env = envs.BatchEnv(envs.get(name), n * len(rngs))
-        seeds = [int(rng.integers(2**31)) for rng in rngs]
-        return run_trials(env, agent or RandomAgent(env.task.action_space), episodes, seeds).trials
+def explorer(name: str, n: int, rng: np.random.Generator, episodes: int = 2) -> deconfounded.Explore:
+    def explore(agent: Agent | None) -> Trials:
+        env = envs.BatchEnv(envs.get(name), n)
+        behaviour = agent or RandomAgent(env.task.action_space)
+        return run_trials(env, behaviour, episodes, int(rng.integers(2**31))).trials
 
     return explore
 
@@ -255,7 +255,7 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
         return sample(obs, action, theta_hat, draws)
 
     model.dynamics.sample = spy  # type: ignore[method-assign]
-    offline.synthesise(model, policy_, latents, data, data.obs[:, :, 0], 2, config, draws)
+    deconfounded_offline.synthesise(model, policy_, latents, data, data.obs[:, :, 0], 2, config, draws)
     action, wanted = taken[0]
     assert set(action.tolist()) == {0.0, 1.0}  # the policy does read its latent
     assert abs(np.corrcoef(action, wanted)[0, 1]) < 4 / np.sqrt(400)
@@ -276,12 +276,12 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
         return offline_loss(log_next, log_policy, kl, beta, weight)
 
     monkeypatch.setattr(VariationalModel, "last", last)
-    monkeypatch.setattr(offline, "offline_loss", loss)
+    monkeypatch.setattr(deconfounded_offline, "offline_loss", loss)
     step = np.tile(np.arange(11, dtype="f4"), (3, 1, 1))[..., None]
     trials = Trials(step, np.zeros((3, 1, 10, 1), "f4"), np.ones((3, 1, 10), bool))
     draws = Draws([np.random.default_rng(0)], "cpu")
     config = OfflineConfig(width=8, offline_updates=3, offline_batch=2, offline_steps=asked)
-    offline.explain(Batch.of(trials, 1), Signature.of(trials), config, draws, Monitor())
+    deconfounded_offline.explain(Batch.of(trials, 1), Signature.of(trials), config, draws, Monitor())
     assert [len(set(steps.tolist())) for steps in seen] == [read] * 3
     assert (len({tuple(sorted(steps.tolist())) for steps in seen}) > 1) == (read < 10)
     assert all(weight.sum(-1).tolist() == [[pytest.approx(10)] * 2] for weight in weights)
@@ -299,7 +299,7 @@ def test_synthetic_episodes_end_where_no_expert_acted() -> None:
     model = VariationalModel("evidence", 1, 8, signature, *scalers(data), draws)
     policy_, latents = ActionHead(signature.obs + 1, 8, signature, draws), torch.zeros(2, 2, 1)
     config = OfflineConfig(synthetic=8)
-    synthetic = offline.synthesise(model, policy_, latents, data, starts, mask.shape[2], config, draws)
+    synthetic = deconfounded_offline.synthesise(model, policy_, latents, data, starts, mask.shape[2], config, draws)
     for s, own in enumerate(np.split(trials.obs[:, :, :-3], 2)):
         low, high = own.min((0, 1, 2)), own.max((0, 1, 2))
         acted, then = synthetic.obs[s].numpy(), synthetic.next_obs[s].numpy()
@@ -459,8 +459,8 @@ class TestMethods:
         encode, config = env.task.encode_theta, cloning.CloningConfig(updates=300)
         score = envs.BatchEnv(env.task, 500)
         rng = np.random.default_rng
-        oracle = cloning.fit(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
-        blind = cloning.fit(trials, config, rng(0))
+        oracle = cloning.train(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
+        blind = cloning.train(trials, config, rng(0))
         assert run_trials(score, oracle, 1, 3).returns.mean() == pytest.approx(60, abs=2)
         assert run_trials(score, blind, 1, 3).returns.mean() == pytest.approx(20, abs=2)
 
@@ -468,7 +468,7 @@ class TestMethods:
         """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
         trials, env = demonstrations("bandit", 1000, 1)
         config = RecurrentConfig(updates=250, batch=50, chunk=50, learning_rate=5e-3)
-        agent = naive_rnn.fit(trials, config, np.random.default_rng(0))
+        agent = naive_rnn.train(trials, config, np.random.default_rng(0))
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3).returns.mean() < 42
 
     @pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
@@ -485,8 +485,8 @@ class TestMethods:
         )
         state = torch.get_rng_state()
         agents = [
-            deconfounded.fit(trials, explorer("slippery_cartpole", 4), config, np.random.default_rng(0))
-            for _ in range(2)
+            deconfounded.train(trials, explorer("slippery_cartpole", 4, rng), config, rng)
+            for rng in (np.random.default_rng(0), np.random.default_rng(0))
         ]
         first, second = (run_trials(env, agent, 2, 5).trials.action for agent in agents)
         np.testing.assert_array_equal(first, second)
@@ -502,13 +502,11 @@ class TestMethods:
         settings = tiny_preset()
         if method == "paper":  # deconfounded as in that preset: its belief, fresh trials each round
             method = "deconfounded"
-            settings = replace(
-                settings, fresh=4, deconfounded=replace(settings.deconfounded, model="gru", accumulate=False)
-            )
+            settings = replace(settings, fresh=4).configured("deconfounded", model="gru", accumulate=False)
         task, found = envs.get(name), []
         for seeds in ((5,), (4, 5, 6)):
             context = Context(task, settings, seeds)
-            agent = MAKERS[method](context)[method]
+            agent = fit(context, method)
             trials = run_trials(context.env, agent, task.episodes, list(seeds)).trials
             found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
         np.testing.assert_array_equal(*found)
@@ -521,7 +519,7 @@ class TestMethods:
             for step in (0.01, 1.0)
         )
         config = DeconfoundedConfig(rounds=1, inference_updates=1, imitation_updates=1, final_updates=1)
-        model = deconfounded.fit(fast, lambda agent, rngs: slow, config, rng).model
+        model = deconfounded.train(fast, lambda agent: slow, config, rng).model
         assert isinstance(model, VariationalModel)
         data = Batch.of(fast, 1)
         assert 0.5 < model.dynamics.change(data.next_obs - data.obs).std() < 2
@@ -534,7 +532,8 @@ class TestMethods:
             **{"rounds": 2, "inference_updates": 150, "inference_batch": 8, "inference_rate": 3e-3, "latent": 2},
             **{"imitation_updates": 100, "final_updates": 100},
         )
-        agent = deconfounded.fit(trials, explorer("tilted_cartpole", 32), config, np.random.default_rng(0))
+        rng = np.random.default_rng(0)
+        agent = deconfounded.train(trials, explorer("tilted_cartpole", 32, rng), config, rng)
         mean = agent.model.point(deconfounded.final_belief(agent.model, Batch.of(trials, 1)))[0]
         inputs = np.c_[mean.numpy(), np.ones(len(mean))]
         residual = theta - inputs @ np.linalg.lstsq(inputs, theta, rcond=None)[0]

@@ -14,6 +14,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import data
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
 from deconfounded.deconf.methods import naive_rnn
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.experts import datasets, policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
@@ -37,7 +38,8 @@ def test_the_same_in_another_process(
     assert done.stdout.strip() == shown.sha256, done.stderr
     trials, theta = datasets.read(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
-    one, other = (naive_rnn.fit(given, tiny_preset().naive, context.rngs) for given in (shown, trials))
+    config = RecurrentConfig(updates=2, batch=4)
+    one, other = (naive_rnn.train(given, config, context.rngs) for given in (shown, trials))
     for key, array in one.state()[1].items():
         np.testing.assert_array_equal(array, other.state()[1][key])
     with pytest.raises(envs.InputError, match="is there already"):

@@ -18,7 +18,7 @@ from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.envs.task import InputError
 from deconfounded.experts import policy

@@ -6,7 +6,6 @@ import functools
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 
 from deconfounded import envs
 from deconfounded.deconf import equations
-from deconfounded.deconf.methods import offline
+from deconfounded.deconf.methods import deconfounded_offline
 from tests import fingerprints
 
 LEARNED = ("deconfounded", "deconfounded_offline", "dagger", "naive_rnn", "blind_bc")
@@ -77,7 +76,9 @@ class TestChangesAreNoticed:
 
     def test_a_mask_that_is_ignored(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(
-            offline, "offline_loss", lambda *given: equations.offline_loss(*given[:-1], torch.ones_like(given[-1]))
+            deconfounded_offline,
+            "offline_loss",
+            lambda *given: equations.offline_loss(*given[:-1], torch.ones_like(given[-1])),
         )
         assert moved("method:deconfounded_offline", "method:deconfounded") == {"method:deconfounded_offline"}
 
@@ -87,7 +88,8 @@ class TestChangesAreNoticed:
 
         def other(*given: Any) -> Any:
             made = amounts(*given)
-            return replace(made, offline=replace(made.offline, beta=1.1 * made.offline.beta))
+            config = made.configs.get("deconfounded_offline")
+            return made.configured("deconfounded_offline", beta=1.1 * config["beta"]) if config else made
 
         monkeypatch.setattr(fingerprints, "preset", other)
         assert moved("method:deconfounded_offline", "method:deconfounded") == {"method:deconfounded_offline"}
@@ -132,7 +134,7 @@ def test_what_is_said() -> None:
     said = fingerprints.problem(label, other)
     assert said.startswith(f"{label} v{entry['version']} does otherwise than since {entry['since']}: {key} was ")
     assert said.endswith(
-        "Undo that; or, if it is meant, raise `version` of its entry in benchmarks/engine/catalogue.py, which"
+        "Undo that; or, if it is meant, raise `version` in its file in deconf/methods, which"
         " supersedes its records, and run `python -m tests.fingerprints --write method:naive_rnn`"
     )
     assert "is v1 now, and its fingerprint" in fingerprints.problem(label, {**entry, "version": 0})

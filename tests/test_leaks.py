@@ -14,7 +14,7 @@ from torch.distributions import Normal, kl_divergence
 from deconfounded import envs
 from deconfounded.benchmarks.engine.benchmark import evaluate
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, EXPLORATION, Context, stream
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature
@@ -24,16 +24,14 @@ from deconfounded.deconf.methods import (
     dagger,
     deconfounded,
     deconfounded_mean,
+    deconfounded_offline,
     gail,
     naive_obs,
     naive_rnn,
     naive_transformer,
-    offline,
     palr,
 )
-from deconfounded.deconf.methods.cloning import CloningConfig
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
-from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
@@ -152,7 +150,7 @@ class TestData:
         task = envs.get(name)
         modules = {
             "deconfounded": deconfounded,
-            "deconfounded_offline": offline,
+            "deconfounded_offline": deconfounded_offline,
             "deconfounded_mean": deconfounded_mean,
             "gail": gail,
             "naive_rnn": naive_rnn,
@@ -167,20 +165,20 @@ class TestData:
             handed.extend((given, *rest))
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(modules[method], "fit", spy)
+        monkeypatch.setattr(modules[method], "train", spy)
         context = Context(task, tiny_preset(), [0])
         with pytest.raises(KeyboardInterrupt):
-            MAKERS[method](context)
+            fit(context, method)
         if method != "dagger":
             np.testing.assert_array_equal(handed[0].obs, Context(task, tiny_preset(), [0]).demonstrations.obs)
             assert handed[0].obs.shape[-1] == len(task.observation)
         if method not in ("deconfounded", "deconfounded_mean", "dagger"):
             return
         roll_out = handed[0] if method == "dagger" else handed[1]
-        given = roll_out(None, [np.random.default_rng(7)])
+        given = roll_out(None)
         trials = given[0] if method == "dagger" else given
         env = envs.BatchEnv(task, 4)
-        seed = stream(EXPLORATION, int(np.random.default_rng(7).integers(2**31)))
+        seed = stream(EXPLORATION, int(context.rngs[0].integers(2**31)))
         plain = run_trials(env, RandomAgent(task.action_space), task.episodes, [seed]).trials
         np.testing.assert_array_equal(trials.obs, plain.obs)
 
@@ -216,8 +214,9 @@ class TestData:
     def test_the_oracle_is_told_the_truth(self) -> None:
         """On the bandit it pulls the best arm as the expert does, 60 of 100, with four standard errors."""
         preset = replace(tiny_preset(), expert_trials=400, eval_trials=200)
-        context = Context(envs.get("bandit"), replace(preset, cloning=CloningConfig(updates=300)), [0])
-        agent = MAKERS["oracle_bc"](context)["oracle_bc"]
+        preset = preset.configured("oracle_bc", updates=300, batch=1024)
+        context = Context(envs.get("bandit"), preset, [0])
+        agent = fit(context, "oracle_bc")
         assert run_trials(context.env, agent, 1, [9]).returns.mean() == pytest.approx(60, abs=1.5)
 
 
@@ -278,7 +277,7 @@ class TestLatents:
 
 def test_naive_memory_outlives_the_episode() -> None:
     context = Context(envs.get(CONTROL), tiny_preset(), [0])
-    agent = MAKERS["naive_rnn"](context)["naive_rnn"]
+    agent = fit(context, "naive_rnn")
     assert isinstance(agent, LearnedAgent)
     run_trials(context.env, agent, 1, [0])
     known = agent.features()
@@ -310,9 +309,9 @@ def test_kl_is_of_the_posterior_from_the_prior() -> None:
 def test_offline_kl_is_of_the_posterior_from_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eq. (7) hands posterior and prior over in that order: the prior is N(0, 1), the posterior is not."""
     seen: list[tuple[torch.Tensor, ...]] = []
-    real = offline.gaussian_kl
-    monkeypatch.setattr(offline, "gaussian_kl", lambda *given: (seen.append(given), real(*given))[1])
-    MAKERS["deconfounded_offline"](Context(envs.get(CONTROL), tiny_preset(), [0]))
+    real = deconfounded_offline.gaussian_kl
+    monkeypatch.setattr(deconfounded_offline, "gaussian_kl", lambda *given: (seen.append(given), real(*given))[1])
+    fit(Context(envs.get(CONTROL), tiny_preset(), [0]), "deconfounded_offline")
     for mean, std, prior_mean, prior_std in seen:
         assert mean.std() > 0
         assert std.std() > 0
@@ -334,11 +333,10 @@ def watch_betas(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return betas
 
 
-def fitted(config: DeconfoundedConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentModel, list[float]]:
+def fitted(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> tuple[LatentModel, list[float]]:
     """A model trained on next to nothing, and the beta of each of its updates."""
     betas = watch_betas(monkeypatch)
-    context = Context(envs.get(CONTROL), replace(tiny_preset(), deconfounded=config), [0])
-    agent = MAKERS["deconfounded"](context)["deconfounded"]
+    agent = fit(Context(envs.get(CONTROL), tiny_preset().configured("deconfounded", **changes), [0]), "deconfounded")
     assert isinstance(agent, DeconfoundedAgent)
     return agent.model, betas
 
@@ -346,22 +344,21 @@ def fitted(config: DeconfoundedConfig, monkeypatch: pytest.MonkeyPatch) -> tuple
 @pytest.mark.parametrize("warm_up", [0.5, 0.0])
 def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Linearly from 0 over the warm-up's share of all updates, and then it stays."""
-    config = replace(tiny_preset().deconfounded, inference_updates=4, warm_up=warm_up, beta=0.1)
-    _, betas = fitted(config, monkeypatch)
+    _, betas = fitted(monkeypatch, inference_updates=4, warm_up=warm_up, beta=0.1)
     rising = [0, 0.025, 0.05, 0.075] if warm_up else [0.1] * 4
     assert betas == pytest.approx([*rising, 0.1, 0.1, 0.1, 0.1])
 
 
 def test_offline_beta_rises(monkeypatch: pytest.MonkeyPatch) -> None:
     betas = watch_betas(monkeypatch)
-    config = OfflineConfig(offline_updates=1, online_updates=8, online_batch=4, synthetic=4, online_steps=64, beta=0.1)
-    MAKERS["deconfounded_offline"](Context(envs.get(CONTROL), replace(tiny_preset(), offline=config), [0]))
+    preset = tiny_preset().configured("deconfounded_offline", offline_updates=1, online_updates=8, beta=0.1)
+    fit(Context(envs.get(CONTROL), preset, [0]), "deconfounded_offline")
     assert betas == pytest.approx([0, 0.025, 0.05, 0.075, 0.1, 0.1, 0.1, 0.1])
 
 
 @pytest.mark.parametrize("fit_prior", [True, False])
 def test_prior_is_fitted_if_asked_for(fit_prior: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    model, _ = fitted(replace(tiny_preset().deconfounded, fit_prior=fit_prior), monkeypatch)
+    model, _ = fitted(monkeypatch, fit_prior=fit_prior)
     assert isinstance(model, VariationalModel)
     same = bool((model.encoder.prior_mean == 0).all() and (model.encoder.prior_std == 1).all())
     assert same != fit_prior

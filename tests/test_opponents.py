@@ -15,22 +15,24 @@ from numpy.typing import NDArray
 from torch.distributions import Normal, kl_divergence
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.catalogue import METHODS
-from deconfounded.benchmarks.engine.context import Allowed, Context
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.provider import Provider, Vector, fit
 from deconfounded.deconf.core.agents import LearnedAgent, Monitor, Training
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.nets import Adam, Scaler, scalers
+from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.gail import Discriminator, GailAgent, GailConfig
-from deconfounded.deconf.methods.naive_obs import DroppingAgent, ObsAgent, ObsMemory
+from deconfounded.deconf.methods.naive_dropout import DroppingAgent
+from deconfounded.deconf.methods.naive_obs import ObsAgent, ObsMemory
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
 from deconfounded.deconf.methods.practice import WholePolicy
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials, trial_seeds
+from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from deconfounded.experts.train import train
 from tests.tools import tiny_preset
 
@@ -66,7 +68,7 @@ def test_tiers() -> None:
         **dict.fromkeys(("deconfounded_mean", "gail"), "2"),
         "rma": "sees theta",
     }
-    assert not any(METHODS[name].default for name in NEW)
+    assert not set(DEFAULT) & set(NEW)
 
 
 class TestActionsAside:
@@ -279,7 +281,7 @@ class TestMean:
 def made(method: str, task: str = CONTROL, seeds: tuple[int, ...] = (0,), monitor: Monitor | None = None) -> Agent:
     """Trained on next to nothing, and handed what it declares that it uses."""
     context = Context(envs.get(task), tiny_preset(), seeds, monitor)
-    return MAKERS[method](Allowed(context, METHODS[method].uses))[method]
+    return fit(context, method)
 
 
 class TestRma:
@@ -291,11 +293,11 @@ class TestRma:
             handed.extend(given)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(rma, "fit", spy)
+        monkeypatch.setattr(rma, "train", spy)
         context = Context(envs.get("bandit"), replace(tiny_preset(), explore_trials=100), [0, 1])
         with pytest.raises(KeyboardInterrupt):
-            MAKERS["rma"](Allowed(context, METHODS["rma"].uses))
-        trials, theta = handed[2](None, [np.random.default_rng(i) for i in range(2)])
+            fit(context, "rma")
+        trials, theta = handed[2](None)
         assert theta.shape == (200, 1, 5)
         best = trials.action[:, 0, :, 0] == theta[:, 0].argmax(-1)[:, None]
         paid = trials.obs[:, 0, 1:, 0]
@@ -328,20 +330,23 @@ class TestRma:
         np.testing.assert_array_equal(*chosen)
 
 
-def practice(n: int = 3, task: str = CONTROL, reward: Any = None) -> Any:
+def practice(n: int = 3, task: str = CONTROL) -> tuple[Any, Vector]:
+    """What GAIL practises in, and the environments behind it."""
     from deconfounded.deconf.methods.practice import Practice
 
-    about = envs.get(task)
-    width = len(about.observation)
+    context = Context(envs.get(task), tiny_preset(), [0])
+    provider, width = Provider(context, ["exploration"], context.rngs), len(context.task.observation)
+    environments = Environments(provider, provider("environments", 0, n), n)
     none: Callable[..., NDArray[np.float32]] = lambda obs, action, then: np.zeros(len(obs), np.float32)  # noqa: E731
-    return Practice(about, n, trial_seeds(n, 3), np.zeros(width), np.ones(width), reward or none)
+    made = Practice(environments, context.task.action_space, np.zeros(width), np.ones(width), none)
+    return made, provider._vectors[0]
 
 
 class TestGail:
     def test_the_agent_is_what_ppo_trained(self) -> None:
         """Step by step the same distribution of actions as Stable-Baselines3's policy; to 1e-5."""
         for task in (CONTROL, "bandit"):
-            env, config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
+            (env, _), config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
             ppo = gail._ppo(env, config, 0)
             trials = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0).trials
             signature = Signature.of(trials)
@@ -404,10 +409,10 @@ class TestGail:
 
     def test_practice_is_blind_to_theta(self) -> None:
         """What is observed is the task's own observation, the action before, and whether an episode begins."""
-        vec = practice()
+        vec, behind = practice()
         obs, width = vec.reset(), len(envs.get(CONTROL).observation)
         plain = envs.BatchEnv(envs.get(CONTROL), 3)
-        np.testing.assert_array_equal(obs[:, :width], plain.reset(trial_seeds(3, 3)))
+        np.testing.assert_array_equal(obs[:, :width], plain.reset(behind.seeds))
         assert obs.shape == (3, width + 2)
         assert obs[:, width:].tolist() == [[0, 1]] * 3
         action = np.full((3, 1), 0.25)
@@ -419,21 +424,21 @@ class TestGail:
 
     def test_a_trial_is_an_episode_of_ppo(self) -> None:
         """theta stays, and is another one as soon as `done` says so, after as many episodes as the task has."""
-        vec = practice()
+        vec, behind = practice()
         vec.reset()
-        episodes, theta, ended = np.zeros(3, int), vec._batch.theta.copy(), 0
+        episodes, theta, ended = np.zeros(3, int), behind.batch.theta.copy(), 0
         for action in 2 * np.random.default_rng(0).random((400, 3, 1)) - 1:
             obs, _, done, infos = vec.step(action)
             episodes += obs[:, -1] == 1
-            kept = (vec._batch.theta == theta).all(-1)
+            kept = (behind.batch.theta == theta).all(-1)
             np.testing.assert_array_equal(kept, ~done)
             assert (episodes[done] == envs.get(CONTROL).episodes).all()
             for i in np.flatnonzero(done):
                 assert infos[i]["terminal_observation"].shape == obs[i].shape
             episodes[done], ended = 0, ended + int(done.sum())
-            theta = vec._batch.theta.copy()
+            theta = behind.batch.theta.copy()
         assert ended > 3
-        assert vec.begun == 3 + ended
+        assert behind.context.monitor.budget["exploration_trials"] == [3 + ended]
 
     def test_interactions_are_counted(self) -> None:
         """Two rounds of 32 steps in 2 environments, for each seed; and none is left of the task's own reward."""
@@ -463,11 +468,9 @@ def test_stable_baselines_leaves_no_folders(monkeypatch: pytest.MonkeyPatch, tmp
 
 @pytest.mark.parametrize("method", ["deconfounded_mean", "gail", "rma"])
 def test_no_rounds_is_one_line(method: str) -> None:
-    part = {"deconfounded_mean": "mean"}.get(method, method)
-    preset = tiny_preset()
-    settings = replace(preset, **{part: replace(getattr(preset, part), rounds=0)})
+    settings = tiny_preset().configured(method, rounds=0)
     with pytest.raises(envs.InputError, match=r"^rounds was 0; it must be at least 1$"):
-        MAKERS[method](Context(envs.get("bandit"), settings, [0]))
+        fit(Context(envs.get("bandit"), settings, [0]), method)
 
 
 class Unplugged(Monitor):

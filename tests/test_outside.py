@@ -12,29 +12,33 @@ import queue
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
 from deconfounded.benchmarks.engine import catalogue, identity, presets, progress, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
-from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Allowed, Context, stream
+from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
-from deconfounded.benchmarks.engine.methods import MAKERS
-from deconfounded.deconf import wire
+from deconfounded.benchmarks.engine.provider import Provider, fit
+from deconfounded.deconf import methods, wire
 from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import naive_rnn
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.envs import outside
 from deconfounded.envs.files import write_sealed
 from deconfounded.experts import policy, store
-from deconfounded.experts.rollout import Trials, run_trials
+from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -71,13 +75,13 @@ def deconf(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
 def test_run_play_score(folder: Path) -> None:
     """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
     assert len([line for line in (folder / "my_rnn.py").read_text().splitlines() if line]) <= 40
-    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "cloning.updates=5")
+    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "blind_bc.updates=5")
     mine = ("--task", BENT, "--expert", "linear.py:control")
     done = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small)
     assert done.returncode == 0, done.stderr
     run = folder / "results" / "bent_cartpole-smoke"
     results = json.loads((run / "results.json").read_text())
-    assert results["set"] == ["eval_trials=4", "expert_trials=8", "cloning.updates=5"]
+    assert results["set"] == ["eval_trials=4", "expert_trials=8", "blind_bc.updates=5"]
     assert results["expert"] == sources.digest([folder / "linear.py"], "control")
     assert results["methods"]["my_rnn"]["tier"] == "1"
     assert results["methods"]["my_rnn"]["budget"] == {"expert_trials": 8}
@@ -129,7 +133,7 @@ def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 def test_loop_of_readme(tmp_path: Path) -> None:
     """Ten lines that deploy an agent."""
-    agent = MAKERS["deconfounded"](Context(envs.get(CONTROL), tiny_preset(), [0]))["deconfounded"]
+    agent = fit(Context(envs.get(CONTROL), tiny_preset(), [0]), "deconfounded")
     assert isinstance(agent, LearnedAgent)
     agent.save(tmp_path / "results" / "slippery_cartpole-default" / "agents" / "deconfounded-0")
     (code,) = (code for code in snippets("python") if "deconfounded.load" in code)
@@ -237,7 +241,7 @@ def test_a_bad_expert_is_one_line(tmp_path: Path, code: str, says: str) -> None:
 
 HEAD = """
 import numpy as np
-from deconfounded.deconf.given import uses
+from deconfounded.deconf.method import uses
 from deconfounded.experts.rollout import Agent
 
 class Still(Agent):
@@ -347,7 +351,7 @@ class TestWire:
 
 
 def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(catalogue, "METHODS", dict(catalogue.METHODS))
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
     (tmp_path / "mine.py").write_text("def fit(given): pass")
     with pytest.raises(envs.InputError, match=r"must be a function declared with @uses"):
         catalogue.add(f"{tmp_path}/mine.py:fit")
@@ -358,7 +362,7 @@ def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.Monke
         (tmp_path / f"{name}.py").write_text(HEAD + "@uses()\ndef fit(given): pass")
         with pytest.raises(envs.InputError, match=f"would be called {name}, which there is already"):
             catalogue.add(f"{tmp_path}/{name}.py:fit")
-    (tmp_path / "plain.py").write_text("def fit(given): pass\nfit.uses = ('environment',)")
+    (tmp_path / "plain.py").write_text(HEAD + "@uses('environment')\ndef fit(given): pass")
     with pytest.raises(envs.InputError, match="a method uses 'environment'"):
         catalogue.add(f"{tmp_path}/plain.py:fit")
     (tmp_path / "naive_rnn.py").write_text(HEAD + "@uses()\ndef fit(given): pass")
@@ -404,7 +408,7 @@ import collections, sys, types
 
 OURS = ("deconfounded", "outside_", "__mp_main__", "tests")
 
-def hunt(start, limit=100_000):
+def hunt(start, skipped=(), limit=100_000):
     # Every number within reach, nearest first: attributes, containers, closures, globals, frames, our modules.
     seen, found, kinds, queue = {}, [], set(), collections.deque(start)
     while queue and len(seen) < limit:
@@ -428,7 +432,8 @@ def hunt(start, limit=100_000):
         elif isinstance(thing, (type, types.FunctionType)) and not (thing.__module__ or "").startswith(OURS):
             continue
         else:
-            for name in {*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "cell_contents"}:
+            names = {*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "cell_contents"}
+            for name in names - {*skipped}:
                 try:
                     queue.append(getattr(thing, name))
                 except Exception:
@@ -464,16 +469,7 @@ def fit(given):
     write(hunt([given, fit, sys._getframe(), *sys.modules.values()]), "fit")
     return Spy(given)
 """
-    seeds, thetas, reset = [], [], envs.BatchEnv.reset
-
-    def watched(self: envs.BatchEnv, seed: Any = None, *rest: Any, **more: Any) -> Any:
-        obs = reset(self, seed, *rest, **more)
-        if seed is not None:
-            seeds.append(np.ravel(seed))
-            thetas.append(self.theta.ravel().copy())
-        return obs
-
-    monkeypatch.setattr(envs.BatchEnv, "reset", watched)
+    seeds, thetas = watch_resets(monkeypatch)
     monkeypatch.setattr("sys.argv", ["run", "--salt", "4242424242"])
     context, agent = guest(tmp_path, text, CONTROL, "demonstrations", "exploration", "queries")
     evaluate(context, agent, True)
@@ -487,12 +483,76 @@ def fit(given):
             assert not HIDDEN & set(hunted["kinds"])
             assert not np.isin(hidden, hunted["found"]).any()
             assert "--salt" not in hunted["words"]
-    space: dict = {}
-    exec("import numpy as np\n" + HUNTER, space)
-    found, kinds = space["hunt"]([context, Allowed(context, ["theta"]), stream(EVALUATION, 0)])
+    found, kinds = hunter()([context, Provider(context, ["theta"], []), stream(EVALUATION, 0)])
     assert np.isin(context.env.theta, found).all()
     assert np.isin(stream(EVALUATION, 0), found).all()
     assert HIDDEN - {"Simulator"} <= kinds
+
+
+def test_a_hunter_finds_no_theta_in_what_ours_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that a method of ours is handed, or its agent, refers to theta, seeds, environments or the expert.
+
+    It stands in the process that holds them: globals of modules and frames of callers are left out.
+    """
+    hunt, hidden_from = hunter(), ("__globals__", "__builtins__", "f_back", "f_globals")
+    hunted: list[tuple[list[float], set[str]]] = []
+
+    class Spy(RandomAgent):
+        def __init__(self, given: Given) -> None:
+            super().__init__(given.action_space)
+            self.given, self.acts = given, 0
+
+        def act(self, obs: NDArray[np.float32]) -> NDArray[np.float64]:
+            self.acts += 1
+            if self.acts in (40, 80):
+                hunted.append(hunt([self, obs], hidden_from))
+            return super().act(obs)
+
+    @uses("demonstrations", "exploration", "queries")
+    def spying(given: Given) -> Agent:
+        demonstrated = given.demonstrations, given.explore(), given.query(), given.source
+        environments = given.environments(0, 4)
+        environments.reset()
+        environments.step(np.zeros((4, 1), np.float32))
+        hunted.append(hunt([given, demonstrated, environments], hidden_from))
+        return Spy(given)
+
+    seeds, thetas = watch_resets(monkeypatch)
+    preset = tiny_preset()
+    monkeypatch.setattr(methods, "load", lambda name: spying)
+    context = Context(envs.get(CONTROL), preset, [917])
+    agent = fit(context, "spying")
+    evaluate(context, agent, True, "salt")
+    hidden = np.concatenate([*thetas, *seeds, [917, stream(EVALUATION, 917, "salt"), stream(DEMOS, 917)]])
+    assert len({tuple(each) for each in seeds}) == 5
+    assert len(hunted) == 3
+    for (found, kinds), least in zip(hunted, (1000, 20, 20), strict=True):
+        assert len(found) > least
+        assert {"Given", "Generator"} <= kinds
+        assert not HIDDEN & kinds
+        assert not np.isin(hidden, found).any()
+
+
+def hunter() -> Callable[..., tuple[list[float], set[str]]]:
+    """The hunter, in this process."""
+    space: dict[str, Any] = {}
+    exec("import numpy as np\n" + HUNTER, space)
+    return space["hunt"]
+
+
+def watch_resets(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list[Any]]:
+    """Lists that grow by the seeds and the thetas of every reset of environments with seeds."""
+    seeds, thetas, reset = [], [], envs.BatchEnv.reset
+
+    def watched(self: envs.BatchEnv, seed: Any = None, *rest: Any, **more: Any) -> Any:
+        obs = reset(self, seed, *rest, **more)
+        if seed is not None:
+            seeds.append(np.ravel(seed))
+            thetas.append(self.theta.ravel().copy())
+        return obs
+
+    monkeypatch.setattr(envs.BatchEnv, "reset", watched)
+    return seeds, thetas
 
 
 def test_salt_draws_other_thetas() -> None:
@@ -501,13 +561,29 @@ def test_salt_draws_other_thetas() -> None:
     assert len({stream(EVALUATION, 0, salt) for salt in ("", "a", "b", "ab")}) == 4
 
 
-def test_ours_see_what_they_declare() -> None:
-    """Makers are handed a context that opens what the catalogue says, and nothing else."""
+def test_ours_get_what_they_declare() -> None:
+    """A provider opens what a method declares, and nothing else; and no data after training."""
     context = Context(envs.get(CONTROL), tiny_preset(), [0])
-    for use, opens in (("demonstrations", "demonstrations"), ("exploration", "explore"), ("theta", "env")):
-        assert getattr(Allowed(context, [use]), opens) is not None
-        with pytest.raises(AttributeError, match="does not declare"):
-            getattr(Allowed(context, []), opens)
+    every = {
+        **{"demonstrations": ("demonstrations",), "exploration": ("exploration", None), "queries": ("queries", None)},
+        **{"theta": ("theta",), "environment": ("environment",)},
+    }
+    for use, asked in every.items():
+        provider = Provider(context, [use], context.rngs)
+        assert provider(*asked) is not None
+        for other in every.keys() - {use}:
+            with pytest.raises(
+                envs.InputError, match=f"it asked for {every[other][0]}, and declares that it uses {use}"
+            ):
+                provider(*every[other])
+        with pytest.raises(envs.InputError, match="it asked for exploration with theta, and declares"):
+            provider("exploration with theta", None)
+        provider.fitted = True
+        if use != "environment":
+            with pytest.raises(envs.InputError, match=f"it asked for {use} after training"):
+                provider(*asked)
+    trials, theta = Provider(context, ["exploration", "theta"], context.rngs)("exploration with theta", None)
+    assert len(trials) == len(theta) == 4
 
 
 class TestSaved:
@@ -551,7 +627,7 @@ class TestSaved:
     def test_in_another_process(self, task: str, tmp_path: Path) -> None:
         """One plain gymnasium environment: the agent of a fit and, over there, the loaded one return the same bits."""
         context = Context(envs.get(task), tiny_preset(), [0])
-        agent = MAKERS["deconfounded"](context)["deconfounded"]
+        agent = fit(context, "deconfounded")
         assert isinstance(agent, LearnedAgent)
         agent.save(tmp_path)
         returns, _ = play.play(agent, envs.make(task), 2, 5)
@@ -564,7 +640,7 @@ class TestSaved:
 
     def test_oracles_need_to_be_told(self, tmp_path: Path) -> None:
         context = Context(envs.get(CONTROL), tiny_preset(), [0])
-        oracle = MAKERS["oracle_bc"](context)["oracle_bc"]
+        oracle = fit(context, "oracle_bc")
         assert isinstance(oracle, LearnedAgent)
         oracle.save(tmp_path)
         with pytest.raises(envs.InputError, match="is an oracle"):
@@ -582,7 +658,7 @@ class TestSaved:
             raise importlib.metadata.PackageNotFoundError(name)
 
         monkeypatch.setattr(importlib.metadata, "distribution", missing)
-        agent = MAKERS["blind_bc"](Context(envs.get("bandit"), tiny_preset(), [0]))["blind_bc"]
+        agent = fit(Context(envs.get("bandit"), tiny_preset(), [0]), "blind_bc")
         assert isinstance(agent, LearnedAgent)
         agent.save(tmp_path)
         assert store.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
@@ -635,7 +711,7 @@ class TestSentences:
     """What is used out of order, or is not what it should be, is told in a line."""
 
     def agent(self) -> LearnedAgent:
-        agent = MAKERS["naive_rnn"](Context(envs.get(CONTROL), tiny_preset(), [0]))["naive_rnn"]
+        agent = fit(Context(envs.get(CONTROL), tiny_preset(), [0]), "naive_rnn")
         assert isinstance(agent, LearnedAgent)
         return agent
 
@@ -657,7 +733,7 @@ class TestSentences:
 
     def test_generators(self) -> None:
         with pytest.raises(envs.InputError, match="random numbers were to come from 0; give"):
-            naive_rnn.fit(Context(envs.get(CONTROL), tiny_preset(), [0]).demonstrations, tiny_preset().naive, 0)  # type: ignore[arg-type]
+            naive_rnn.train(Context(envs.get(CONTROL), tiny_preset(), [0]).demonstrations, RecurrentConfig(), 0)  # type: ignore[arg-type]
 
     def test_trials(self) -> None:
         fine = {"obs": [[[[0.0], [1.0]]]], "action": [[[[0.5]]]], "mask": [[[True]]]}
@@ -671,15 +747,15 @@ class TestSentences:
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ("naive.updates=many", "--set naive.updates was 'many'; it must be like 1500"),
-        ("naive.update=5", "did you mean 'naive.updates'"),
-        ("naiv.updates=5", "--set part 'naiv' is unknown; did you mean 'naive'"),
+        ("naive_rnn.updates=many", "--set naive_rnn.updates was 'many'; it must be like 1500"),
+        ("naive_rnn.update=5", "did you mean 'naive_rnn.updates'"),
+        ("naiv_rnn.updates=5", "--set method 'naiv_rnn' is unknown; did you mean 'naive_rnn'"),
         ("seeds=1.5", "--set seeds was '1.5'; it must be like 3"),
         ("seeds=-1", "--set seeds was '-1'"),
-        ("naive.cooled=1", "must be like true"),
+        ("naive_rnn.cooled=1", "must be like true"),
         ("seeds=0", "must be like 3"),
-        ("cloning.learning_rate=NaN", "must be like"),
-        ("cloning.device=tpu", "amount 'cloning.device' is unknown"),
+        ("blind_bc.learning_rate=NaN", "must be like"),
+        ("blind_bc.device=tpu", "amount 'blind_bc.device' is unknown"),
     ],
 )
 def test_bad_amounts_are_one_line(change: str, says: str) -> None:
@@ -689,6 +765,8 @@ def test_bad_amounts_are_one_line(change: str, says: str) -> None:
 
 def test_amounts() -> None:
     full = presets.preset("default", envs.get(CONTROL), "cpu")
-    made = presets.changed(full, ["seeds=10", "naive.learning_rate=1e-3", "deconfounded.inference_batch=null"])
-    assert (made.seeds, made.naive.learning_rate, made.deconfounded.inference_batch) == (10, 1e-3, None)
-    assert made.dagger == full.dagger
+    made = presets.changed(full, ["seeds=10", "naive_rnn.learning_rate=1e-3", "deconfounded.inference_batch=null"])
+    assert made.seeds == 10
+    assert made.configs["naive_rnn"]["learning_rate"] == 1e-3
+    assert made.configs["deconfounded"]["inference_batch"] is None
+    assert made.configs["dagger"] == full.configs["dagger"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -43,13 +42,15 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The preset's amount so many times is tried; of settings that score nearly alike, the cheaper is chosen."""
     for method, changes in tune.TRIED.items():
         for task in map(envs.get, tune.TASKS):
-            config = getattr(preset("default", task, "cpu"), METHODS[method].part)
-            config = tune.other(config, tune.BEFORE.get(method, {}))
-            tried = [config, *(tune.other(config, change) for change in changes)]
-            assert len(set(tried)) == 4, f"{method} on {task.name}: the same number of settings each"
-    mean = preset("default", envs.get("bandit"), "cpu").mean
-    config = tune.other(mean, {"latent": 0.5, "beta": 2, "model": "evidence"})
-    assert (config.latent, config.beta, config.model) == (2, 0.02, "evidence")
+            began = tune.other(preset("default", task, "cpu", [method]), method, tune.BEFORE.get(method, {}))
+            tried = [began, *(tune.other(began, method, change) for change in changes)]
+            assert len({str(each.configs[method]) for each in tried}) == 4, (
+                f"{method} on {task.name}: the same number of settings each"
+            )
+    amounts = preset("default", envs.get("bandit"), "cpu", ["deconfounded_mean"])
+    changed = tune.other(amounts, "deconfounded_mean", {"latent": 0.5, "beta": 2, "model": "evidence"})
+    config = changed.configs["deconfounded_mean"]
+    assert (config["latent"], config["beta"], config["model"]) == (2, 0.02, "evidence")
     assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
     about = {"machine": "m", "versions": {"torch": "2"}, "commit": None}
     for method, setting, scores, cpu in (
@@ -77,11 +78,12 @@ def test_presets_are_what_tuning_chose() -> None:
             continue
         assert [row["setting"] for row in of] == [tune.title(change) for change in tried]
         for task in map(envs.get, tune.TASKS):
-            config = getattr(preset("default", task, "cpu"), METHODS[method].part)
-            assert asdict(config) == site.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
-            began = tune.other(config, tune.BEFORE.get(method, {}))
+            today = preset("default", task, "cpu", [method])
+            assert today.configs[method] == site.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
+            began = tune.other(today, method, tune.BEFORE.get(method, {}))
             for row, change in zip(of, tried, strict=True):
-                assert asdict(tune.other(began, change)) == pytest.approx(row["amounts"][task.name])
+                changed = tune.other(began, method, change).configs[method]
+                assert changed == pytest.approx(row["amounts"][task.name])
 
 
 @pytest.mark.parametrize(
@@ -204,7 +206,8 @@ def entry(last: float, interval: float | None = 0.01, tier: str = "1", known: bo
     """What `outcome` reads of a method."""
     seeds = [0] if interval is None else [0, 1, 2]
     band = None if interval is None else [last - interval, last + interval]
-    return {"score_last": last, "ci95": band, "tier": tier, "theta_r2": [0.5] if known else [], "seeds": seeds}
+    about = {"tier": tier, "theta_r2": [0.5] if known else [], "seeds": seeds, "deployment": ""}
+    return {"score_last": last, "ci95": band, **about}
 
 
 class TestOutcome:
@@ -215,7 +218,7 @@ class TestOutcome:
             {
                 **self.EXACT,
                 **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5), "mute": entry(0.4, known=False)},
-                **{"good_episode": entry(0.1), "oracle": entry(1, tier="sees theta")},
+                **{"good_episode": {**entry(0.1), "deployment": "episode"}, "oracle": entry(1, tier="sees theta")},
             }
         )
         assert found == (
@@ -253,7 +256,7 @@ class TestIndex:
         }
         for row in made["rows"]:
             returns = {
-                name: [one["returns"] for one in lines[row["task"]] if one["method"] == name]
+                name: [one["returns"] for one in lines[row["task"]] if records.named(one) == name]
                 for name in (row["method"], "random", "expert")
             }
             assert row["n"] == len(returns[row["method"]])
@@ -444,7 +447,7 @@ def test_commands_of_numbers() -> None:
     """Another way to deploy an agent is of its method's job; a method from outside is named by its file."""
     task = envs.get("bandit")
     found = records.of_task(DOCS / "records", "bandit")
-    outside = [{**one, "method": "mine", "job": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
+    outside = [{**one, "method": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
     results = records.gather([*found, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"
     assert site.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"

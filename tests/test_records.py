@@ -22,6 +22,7 @@ from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table as table_command
+from deconfounded.deconf.methods import dagger
 from deconfounded.envs.files import PARTIAL, write_sealed
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Trials
@@ -69,7 +70,7 @@ class TestIdentity:
         monkeypatch.setattr(type(envs.get("curling")), "version", 7)
         assert stale() == [True, True, False, False]
         monkeypatch.undo()
-        monkeypatch.setitem(METHODS, "dagger", replace(METHODS["dagger"], version=7))
+        monkeypatch.setattr(dagger.fit, "method", replace(METHODS["dagger"], version=7))
         assert stale() == [False, True, False, True]
         monkeypatch.undo()
         monkeypatch.setattr(identity, "PROTOCOL", 7)
@@ -120,7 +121,7 @@ class TestIdentity:
     def test_settings_are_the_methods_own(self) -> None:
         """Another amount of dagger's training is none of naive_rnn's business."""
         preset = tiny_preset()
-        other = replace(preset, dagger=replace(preset.dagger, updates=9), query_trials=9, grid=9)
+        other = replace(preset.configured("dagger", updates=9).configured("interventional", grid=9), query_trials=9)
         for name, same in (("naive_rnn", True), ("dagger", False), ("interventional", False)):
             one, two = (BenchmarkJob("bandit", p, name, (0,), Path()) for p in (preset, other))
             assert (identity.identity(one) == identity.identity(two)) == same
@@ -351,7 +352,7 @@ class TestVerify:
     ) -> None:
         """A seed run again, alone and in another process, gives the bits of the run; a record that lies does not."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-        small = ["eval_trials=4", "expert_trials=4", "cloning.updates=3"]
+        small = ["eval_trials=4", "expert_trials=4", "blind_bc.updates=3"]
         from deconfounded.benchmarks.engine.presets import changed, preset
 
         settings = changed(preset("smoke", envs.get("bandit"), "cpu"), small)

@@ -24,10 +24,10 @@ picture = env.render()
 assert "torch" not in sys.modules, "pictures alone need no torch"
 
 from deconfounded.benchmarks.engine.context import Context
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.provider import fit
 from tests.tools import tiny_preset
 
-MAKERS["naive_rnn"](Context(env.task, tiny_preset(), [0]))
+fit(Context(env.task, tiny_preset(), [0]), "naive_rnn")
 import triton  # as torch's optimizers do, at the latest
 np.testing.assert_array_equal(env.render(), picture)
 print("rendered, trained, rendered")

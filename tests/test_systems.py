@@ -341,12 +341,12 @@ class TestText:
     )
     def test_sources_in_other_encodings(self, start: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """As Python reads them: a task, an expert and a method; a method's name is what a record takes."""
-        monkeypatch.setattr(catalogue, "METHODS", dict(catalogue.METHODS))
+        monkeypatch.setattr(catalogue.METHODS, "outside", {})
         (tmp_path / "own.py").write_bytes(start + OWN.encode())
         (tmp_path / "own_cartpole.xml").write_bytes((ROOT / "assets" / f"{CONTROL}.xml").read_bytes())
         (tmp_path / "expert.py").write_bytes(start + b"def control(obs, theta): return obs[:, :1]\n")
         (tmp_path / "caf\u00e9.py").write_bytes(
-            start + b"from deconfounded.deconf.given import uses\n@uses()\ndef fit(given): 1 / 0\n"
+            start + b"from deconfounded.deconf.method import uses\n@uses()\ndef fit(given): 1 / 0\n"
         )
         task, expert = envs.get(f"{tmp_path}/own.py:Own"), f"{tmp_path}/expert.py:control"
         policy.load(task, expert)

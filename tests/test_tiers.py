@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,12 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.context import Context
-from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.deconf.methods import cloning
 from deconfounded.deconf.methods.cloning import CloningConfig
-from deconfounded.deconf.methods.dagger import DaggerConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.envs.task import Array
 from deconfounded.experts import policy
@@ -68,17 +67,18 @@ def test_exact_policies_at_the_fork() -> None:
     assert scores(env, ExactAgent(env, expert, True))[-1] < 0.7
 
 
-def trained(name: str, method: str, **amounts: Any) -> Agent:
-    """A method's agent, from the default preset but for `amounts`."""
+def trained(name: str, method: str, config: dict[str, Any], **amounts: Any) -> Agent:
+    """A method's agent, from the default preset but for `config` of the method, and `amounts`."""
     task = envs.get(name)
-    return MAKERS[method](Context(task, replace(preset("default", task, "cpu"), **amounts), [0]))[method]
+    settings = replace(preset("default", task, "cpu"), **amounts).configured(method, **config)
+    return fit(Context(task, settings, [0]), method)
 
 
 @pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
 def test_tier_2_fails(name: str) -> None:
     """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
-    config = DeconfoundedConfig(rounds=2, inference_updates=300, imitation_updates=300, final_updates=500)
-    agent = trained(name, "deconfounded", expert_trials=64, explore_trials=32, deconfounded=config)
+    config = asdict(DeconfoundedConfig(rounds=2, inference_updates=300, imitation_updates=300, final_updates=500))
+    agent = trained(name, "deconfounded", config, expert_trials=64, explore_trials=32)
     assert scores(envs.BatchEnv(envs.get(name), N), agent)[-1] < 0.6
 
 
@@ -90,7 +90,7 @@ def test_who_sees_theta_can_clone(name: str) -> None:
     trials = run_trials(env, ExpertAgent(env, expert), env.task.episodes, seed=1).trials
     own, shown = envs.BatchEnv(env.task, N), encode(thetas(env.task, 64, env.task.episodes, 1))
     config = CloningConfig(updates=1500)
-    oracle = cloning.fit(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
+    oracle = cloning.train(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
     assert scores(own, oracle)[-1] > 0.9
 
 
@@ -99,8 +99,8 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
     """Best-arm pulls of 100: exact 54 and 32; with one latent a trial, which never hears of the pay-outs, 20."""
     task = envs.get("bandit")
     context = Context(task, preset("smoke", task, "cpu"), [0])
-    agents = MAKERS[method](context)
-    pulls, once = (run_trials(context.env, agents[name], 1, 3).returns.mean() for name in (method, f"{method}_episode"))
+    agents = deployed(method, fit(context, method))
+    pulls, once = (run_trials(context.env, agents[way], 1, 3).returns.mean() for way in ("", "episode"))
     assert pulls > atleast
     assert once == pytest.approx(20, abs=3)
     assert context.monitor.budget["expert_trials"] == [2000]
@@ -109,5 +109,5 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
 
 def test_tier_3_works_at_the_fork() -> None:
     """forked_path: who is told what the expert would do at the bump learns to go where its push points."""
-    agent = trained("forked_path", "dagger", dagger=DaggerConfig())
+    agent = trained("forked_path", "dagger", {})
     assert scores(envs.BatchEnv(envs.get("forked_path"), N), agent)[-1] > 0.7

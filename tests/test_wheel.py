@@ -115,7 +115,7 @@ def test_what_needs_a_checkout_says_so(built: Path, empty: Path) -> None:
 def test_commands_work_as_installed(built: Path, empty: Path) -> None:
     """They read and write nothing but the folder they are in; data there and in a checkout are known to be the same."""
     before = files(built / "site")
-    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "cloning.updates=5")
+    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "blind_bc.updates=5")
     deconf(built, empty, "run", "--task", "bandit", "--methods", "blind_bc", *small)
     agent = ("--agent", "results/bandit-smoke/agents/blind_bc-0", "--task", "bandit")
     assert "returns" in deconf(built, empty, "play", *agent)

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import measure
-from deconfounded.benchmarks.engine.context import EVALUATION, Allowed, Context, stream
+from deconfounded.benchmarks.engine.catalogue import label
+from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
@@ -111,20 +112,22 @@ class BenchmarkJob(Job):
         context = self.context(monitor)
         with contextlib.ExitStack() as guests:
             if self.guest is None:
-                agents = MAKERS[self.method](Allowed(context, self.about.uses))
+                agents = deployed(self.method, fit(context, self.method))
             else:
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
-                agents = {self.method: guests.enter_context(contextlib.closing(guest))}
-            trained = monitor.worked()
+                agents = {"": guests.enter_context(contextlib.closing(guest))}
+            trained, filmed = monitor.worked(), self.method in CLIPPED and 0 in self.seeds
+            ways = {label(self.method, way): way for way in agents}
+            agents = {name: agents[way] for name, way in ways.items()}
             found = {
-                name: evaluate(context, agent, self.about.learned, self.salt, name in CLIPPED and 0 in self.seeds)
+                name: evaluate(context, agent, self.about.learned, self.salt, filmed and name == self.method)
                 for name, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
             notes = [
                 self._keep(name, agent) for name, agent in agents.items()
             ]  # first: a seed's file says it is finished
-            meta = {"agents": list(agents), "curve": monitor.kept, "tier": self.about.tier}
+            meta = {"agents": ways, "curve": monitor.kept, "tier": self.about.tier}
             for i, seed in enumerate(self.seeds):
                 rows = context.rows(i)
                 arrays: dict[str, Any] = {}

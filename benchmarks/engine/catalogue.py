@@ -3,68 +3,37 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 from deconfounded import envs
+from deconfounded.deconf import methods
+from deconfounded.deconf.method import ENVIRONMENT, USES, Method
 from deconfounded.envs import outside
 
 
-@dataclass(frozen=True)
-class Method:
-    """uses: what it is handed (`deconf.given.USES`); references are handed the environment.
+class Methods(Mapping[str, Method]):
+    """Methods by name, ours and those from outside. The module of a method is imported when it is first looked at."""
 
-    part: of a preset, that has its configuration. cost: about, where blind
-    BC is 1, for the ETA alone. default: whether it runs if nobody asks for it. reference: where one from outside is.
-    version: raised by hand when its numbers change; 0 for one from outside, which has none.
-    """
+    def __init__(self) -> None:
+        self.outside: dict[str, Method] = {}
 
-    uses: tuple[str, ...] = ("demonstrations",)
-    part: str = ""
-    cost: int = 1
-    default: bool = True
-    exact: bool = False
-    reference: str = ""
-    version: int = 1
+    def __getitem__(self, name: str) -> Method:
+        if name in methods.METHODS:
+            return methods.load(name).method  # type: ignore[attr-defined]
+        return self.outside[name]
 
-    @property
-    def learned(self) -> bool:
-        """Whether it is trained, on data."""
-        return bool(self.uses) and "environment" not in self.uses
+    def __iter__(self) -> Iterator[str]:
+        yield from (*methods.METHODS, *self.outside)
 
-    @property
-    def tier(self) -> str:
-        """Of the paper: 1, demonstrations; 2, exploration too; 3, queries of the expert. Or what else it sees."""
-        if not self.learned:
-            return "sees theta" if self.uses and not self.exact else "reference"
-        if "theta" in self.uses:
-            return "sees theta"
-        return "3" if "queries" in self.uses else "2" if "exploration" in self.uses else "1"
+    def __len__(self) -> int:
+        return len(methods.METHODS) + len(self.outside)
+
+    def __contains__(self, name: object) -> bool:
+        return name in methods.METHODS or name in self.outside
 
 
-_EXPLORES = ("demonstrations", "exploration")
-METHODS = {
-    "deconfounded": Method(_EXPLORES, "deconfounded", 4),
-    "deconfounded_gru": Method(_EXPLORES, "deconfounded", 14, default=False),
-    "deconfounded_discrete": Method(_EXPLORES, "discrete", 7, default=False),
-    "deconfounded_offline": Method(part="offline", cost=7, default=False),
-    "deconfounded_mean": Method(_EXPLORES, "mean", 8, default=False),
-    "dagger": Method(("queries",), "dagger", 4, default=False),
-    "gail": Method(_EXPLORES, "gail", 60, default=False),
-    "rma": Method((*_EXPLORES, "theta"), "rma", 4, default=False),
-    "naive_transformer": Method(part="transformer", cost=30, default=False),
-    "naive_obs": Method(part="obs", cost=2, default=False),
-    "naive_dropout": Method(part="dropout", cost=2, default=False),
-    "palr": Method(part="palr", cost=4, default=False),
-    "naive_rnn": Method(part="naive", cost=2),
-    "oracle_bc": Method(("demonstrations", "theta"), "cloning"),
-    "blind_bc": Method(part="cloning"),
-    "conditional": Method(("environment",), exact=True),
-    "interventional": Method(("environment",), exact=True),
-    "expert": Method(("environment",)),
-    "random": Method(()),
-}
-"""Longest first, so that the last ones to run are short. A method may score several ways of deploying one agent."""
+METHODS = Methods()
 
 
 def add(reference: str) -> str:
@@ -73,29 +42,41 @@ def add(reference: str) -> str:
     That is the file's, and the function's unless it is `fit`. Raises InputError if it cannot be run.
     """
     fit = outside.find("method", reference)
-    if not callable(fit) or not isinstance(getattr(fit, "uses", None), tuple):
+    if not callable(fit) or not isinstance(getattr(fit, "method", None), Method):
         raise envs.InputError(f"method {reference!r} must be a function declared with @uses(...) of what it may use")
-    from deconfounded.deconf.given import check_uses
-
-    check_uses(fit.uses)
+    if ENVIRONMENT in fit.method.uses:
+        raise envs.InputError(f"a method uses {ENVIRONMENT!r}; it may use {', '.join(USES)}")
     where, _, function = reference.rpartition(":")
     stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
     name = re.sub(r"[^A-Za-z0-9_]", "_", stem if function == "fit" else f"{stem}_{function}")
-    made = Method(fit.uses, cost=4, default=False, reference=outside.absolute(reference), version=0)
-    taken = {"all", "demonstrations", *(f"{known}_episode" for known in METHODS)}
-    if name in taken or METHODS.setdefault(name, made) != made:
+    made = replace(fit.method, reference=outside.absolute(reference), version=0, exact=False, ways={})
+    taken = {"all", "demonstrations", *labels(methods.METHODS)}
+    if name in taken or METHODS.outside.setdefault(name, made).reference != made.reference:
         raise envs.InputError(f"method {reference!r} would be called {name}, which there is already; rename its file")
     return name
 
 
+def labels(names: Iterable[str]) -> list[str]:
+    """What the agents of methods are called in tables, by way of deployment."""
+    return [label(name, way) for name in names for way in ("", *METHODS[name].ways)]
+
+
+def label(method: str, deployment: str) -> str:
+    """What a method's agent is called in tables: the method's name, and a further way of deploying it."""
+    return f"{method}_{deployment}" if deployment else method
+
+
 def guest(name: str) -> Method | None:
-    """The method's entry if it is from outside, for jobs: another process does not know it."""
-    return METHODS[name] if METHODS[name].reference else None
+    """A method's declaration if it is from outside, for jobs: another process does not know it."""
+    if name not in METHODS.outside:
+        return None
+    known = METHODS[name]
+    return Method(known.uses, known.version, known.cost, reference=known.reference)
 
 
-DEFAULT = tuple(name for name, method in METHODS.items() if method.default)  # the paper's comparison
-EXACT = tuple(name for name, method in METHODS.items() if method.exact)
+EXACT = ("conditional", "interventional")
 REFERENCES = ("random", "expert")  # always run: they are the 0 and 1 of every score
+DEFAULT = ("deconfounded", "naive_rnn", "oracle_bc", "blind_bc", *EXACT, "expert", "random")  # the paper's comparison
 
 MOST_SEEDS = 1000
 PRESETS = {

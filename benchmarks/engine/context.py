@@ -1,14 +1,11 @@
-"""What methods are handed: data of one task and some seeds, made when first asked for, and no more than they declare.
-
-Learned methods get trials without theta; only the oracle gets theta, and only references get the environment.
-"""
+"""The data of one task and some seeds, made when first asked for. What of it a method is handed: see provider.py."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +13,6 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity
 from deconfounded.deconf.core.agents import Monitor
-from deconfounded.deconf.core.data import Source
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Rollout, Trials, joined, run_trials, thetas
@@ -109,10 +105,6 @@ class Context:
         self.monitor.spend("expert_trials", [self.preset.fresh] * len(rngs))
         return self._expert_trials(self.preset.fresh, [int(rng.integers(2**31)) for rng in rngs])
 
-    def source(self, fresh: bool) -> Source:
-        """What there is to imitate: the fixed set of trials, or what draws fresh ones."""
-        return self.demonstrate if fresh else self.demonstrations
-
     @property
     def rngs(self) -> list[np.random.Generator]:
         """For initial weights and batches; the same for every method of a seed."""
@@ -146,26 +138,3 @@ class Context:
         random = Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
         labels = [self.expert.act(obs[:, t], theta[:, t // shape[2]], random) for t in range(obs.shape[1])]
         return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)
-
-
-class Allowed:
-    """A context of which a method gets what it declares that it uses."""
-
-    FREE = ("preset", "rngs", "monitor", "seeds", "task")
-    OPENS: ClassVar[dict[str, tuple[str, ...]]] = {
-        "demonstrations": ("demonstrations", "source"),
-        "exploration": ("explore",),
-        "queries": ("query",),
-        "theta": ("demonstrated_theta", "env"),
-        "environment": ("env", "expert"),
-    }
-
-    def __init__(self, context: Context, uses: Sequence[str]) -> None:
-        self._context, self._open = context, {*self.FREE, *(name for use in uses for name in self.OPENS[use])}
-        if {"exploration", "theta"} <= set(uses):
-            self._open.add("explore_with_theta")
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in self._open:
-            raise AttributeError(f"a method asked for {name}, and does not declare that it uses it")
-        return getattr(self._context, name)

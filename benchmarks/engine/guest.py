@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
+from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs import outside
 from deconfounded.envs.task import Array
@@ -47,7 +48,9 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     """The guest's process: fit, then be the agent until the channel is closed."""
     die_with_parent()
     escape_output()
-    from deconfounded.deconf.given import Given, serve
+    from deconfounded.deconf.channel import ChannelAsk, ChannelMonitor, serve
+    from deconfounded.deconf.given import Given
+    from deconfounded.deconf.method import Method
     from deconfounded.deconf.wire import pack
     from deconfounded.experts.store import save
 
@@ -56,9 +59,10 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
             channel.send_bytes(pack(list(what)))
 
     try:
-        given = Given(channel, about)
-        agent = outside.find("method", reference)(given)
-        given.close()
+        fit, ask, rngs = outside.find("method", reference), ChannelAsk(channel), [np.random.default_rng(about["rng"])]
+        config = getattr(fit, "method", Method(())).config(about["config"])
+        agent = fit(Given(ask, about, config, rngs, ChannelMonitor(channel)))
+        ask.close()
         if not isinstance(agent, Agent):
             raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
         say("fitted")
@@ -77,23 +81,18 @@ class Guest(Agent):
     """The agent of one seed of a method from outside; it acts over there. `close` it in the end."""
 
     def __init__(self, context: Context, name: str, reference: str, uses: Sequence[str]) -> None:
-        self.context, self.name, self.uses, self.cpu = context, name, uses, 0.0
+        self.context, self.name, self.cpu = context, name, 0.0
+        self.provider = Provider(context, uses, context.rngs)
+        self.provider.open -= {"acting theta"}
         here, there = (made := multiprocessing.get_context("spawn")).Pipe()
-        task = context.task
-        about = {
-            "observations": len(task.observation),
-            "action_space": task.action_space,
-            "episodes": task.episodes,
-            "horizon": task.horizon,
-            "rng": stream(GUEST, context.seeds[0]),
-        }
+        config = context.preset.configs.get(name, {})
+        about = {**self.provider.about(), "config": config, "rng": stream(GUEST, context.seeds[0])}
         self.channel: Connection = here
         self.process = made.Process(target=live, args=(reference, there, about), daemon=True)
         line, sys.argv = sys.argv, sys.argv[:1]  # which a new process gets, and evaluation's salt is in it
         self.process.start()
         sys.argv = line
         there.close()
-        self._rngs = context.rngs
         try:
             self._fit()
         except BaseException:
@@ -121,11 +120,8 @@ class Guest(Agent):
                 return
             if asked == "progress":
                 self._progress(*rest)
-            elif asked not in self.uses:
-                told = f"it asked for {asked}, and declares that it uses {', '.join(self.uses) or 'nothing'}"
-                self.channel.send(("refused", told))
             else:
-                self.channel.send(("over", self._data(asked, *rest)))
+                self._provide(asked, *rest)
 
     def _progress(self, share: Any, losses: Any) -> None:
         values = [share, *(losses.values() if isinstance(losses, dict) else [None])]
@@ -133,21 +129,12 @@ class Guest(Agent):
             raise envs.InputError(f"method {self.name}: progress was {share}, {losses}; it must be finite numbers")
         self.context.monitor.update(round(1000 * min(max(share, 0), 1)), 1000, losses)
 
-    def _data(self, kind: str, has_agent: bool, trials: Any = None) -> Any:
-        context, agent = self.context, self if has_agent else None
-        if trials is not None and not (isinstance(trials, int) and trials > 0):
-            raise envs.InputError(f"method {self.name} asked for {trials!r} trials; it must be a number from 1 up")
-        if kind == "demonstrations":
-            return context.demonstrations
-        if kind == "theta":
-            theta = context.task.encode_theta(context.demonstrated_theta)
-            context.monitor.budget["thetas"] = [len(theta)]  # the same ones, however often
-            return theta
-        if kind == "exploration":
-            return context.explore(agent, self._rngs, trials)
-        if kind == "queries":
-            return context.query(agent, self._rngs, trials)
-        raise envs.InputError(f"method {self.name} asked for {kind!r}, which there is not")
+    def _provide(self, kind: str, has_agent: Any = None, *what: Any) -> None:
+        try:
+            answer = ("over", self.provider(kind, *what, agent=self if has_agent else None))
+        except envs.InputError as error:
+            answer = ("refused", str(error))
+        self.channel.send(answer)
 
     def _do(self, what: str, *given: Any) -> Any:
         self.channel.send((what, *given))

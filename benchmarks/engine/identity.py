@@ -13,7 +13,6 @@ import json
 import os
 import platform
 import subprocess
-from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -33,14 +32,14 @@ AMOUNTS = {  # of a preset, by what a method uses
     "demonstrations": ("expert_trials", "fresh"),
     "exploration": ("explore_trials",),
     "queries": ("query_trials",),
-    "environment": ("grid",),
 }
 
 
 def identity(job: Job) -> dict[str, Any]:
     """All that the results of a job's seeds depend on, but for the seed. `outside` is empty where all is ours."""
-    task, method, settings = envs.get(job.task), job.about, asdict(job.preset)
-    amounts = [name for use in method.uses for name in AMOUNTS.get(use, ())]
+    task, method, preset = envs.get(job.task), job.about, job.preset
+    amounts = ["eval_trials", *(name for use in method.uses for name in AMOUNTS.get(use, ()))]
+    settings = {name: getattr(preset, name) for name in amounts}
     texts = {"task": sources.of_task(task)}
     if method.reference:
         texts["method"] = sources.of_reference(method.reference)
@@ -51,7 +50,7 @@ def identity(job: Job) -> dict[str, Any]:
         "task_version": task.version,
         "method": job.method,
         "method_version": method.version,
-        "settings": {name: settings[name] for name in ("eval_trials", *amounts, *([method.part] * bool(method.part)))},
+        "settings": settings | ({"config": preset.configs[job.method]} if job.method in preset.configs else {}),
         **expert(task, job.expert),
         "salt": job.salt,
         "versions": versions(),

@@ -133,7 +133,7 @@ class JobMonitor(Monitor):
     def __init__(self, job: Job, share: float) -> None:
         super().__init__()
         self.ticks, self.share, self.told = job.ticks, share, 0
-        self.device = job.preset.naive.device
+        self.device = job.preset.device
         self.file = job.checkpoint
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []

@@ -21,7 +21,7 @@ META: dict[str, Any] = {  # what a file says of itself, and of what types
 OF_AGENT = ("returns", "objective", "probe")
 
 
-SCORED = {"agents": list, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
+SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
 
 
 def broken(found: dict[str, Any]) -> str:

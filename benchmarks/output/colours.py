@@ -22,6 +22,5 @@ OTHERS = ("#5254a3", "#637939", "#8c6d31", "#ad494a", "#7b4173", "#3182bd", "#e6
 
 
 def colour(method: str) -> str:
-    """A method's own, or one that its name decides; another way to deploy an agent has the agent's."""
-    base = method.removesuffix("_episode")
-    return COLOURS.get(base, OTHERS[zlib.crc32(base.encode()) % len(OTHERS)])
+    """A method's own, or one that its name decides."""
+    return COLOURS.get(method, OTHERS[zlib.crc32(method.encode()) % len(OTHERS)])

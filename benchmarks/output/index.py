@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import score, statistics
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
 from deconfounded.benchmarks.output.colours import colour
@@ -160,10 +160,10 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
             made = row(task, name, entry, scores[task.name])
             rows.append({**made, "command": command(task, results, name)})
             kind = "exact" if name in EXACT else "reference" if name in REFERENCES else entry["tier"]
-            hue = "var(--ink)" if name == "expert" else colour(name)
+            hue = "var(--ink)" if name == "expert" else colour(entry["method"])
             methods.setdefault(name, {"tier": entry["tier"], "kind": kind, "colour": hue})
-    rank = {name: i for i, name in enumerate(METHODS)}
-    order = sorted(methods, key=lambda name: rank.get(name.removesuffix("_episode"), len(rank)))
+    rank = {name: i for i, name in enumerate(labels(METHODS))}
+    order = sorted(methods, key=lambda name: rank.get(name, len(rank)))
     return {
         "tasks": sorted(tasks, key=lambda task: (task["tier"] == "none", task["tier"])),
         "methods": {name: methods[name] for name in order},

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.benchmarks.engine.catalogue import REFERENCES
+from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
 from deconfounded.benchmarks.output import score
 from deconfounded.envs.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
@@ -27,7 +27,7 @@ MADE_OF = (  # what makes a record stale when it changes
     *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
     *("salt", "versions", "outside"),
 )
-SLOT = ("preset", "set", "salt", "method", "seed")  # of which a task's file holds one record
+SLOT = ("preset", "set", "salt", "method", "deployment", "seed")  # of which a task's file holds one record
 
 
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
@@ -35,17 +35,17 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     meta = data["meta"]
     made = meta["identity"]
     found = []
-    for name in meta["agents"]:
+    for name, deployment in meta["agents"].items():
         returns = data[f"{name}/returns"]
         curve = {"curve": thinned(meta["curve"])} if meta["curve"] else {}
         found.append(
             {
-                "schema": 2,
+                "schema": 3,
                 "task": made["task"],
                 "task_version": made["task_version"],
-                "method": name,
+                "method": made["method"],
                 "method_version": made["method_version"],
-                "job": made["method"],
+                "deployment": deployment,
                 "seed": meta["seed"],
                 "preset": preset,
                 "set": list(changes),
@@ -163,9 +163,14 @@ def read(file: Path) -> list[Record]:
         if place(record["task"]) != file.name:
             raise InputError(f"{where} is of {record['task']}, which belongs in {place(record['task'])}")
         if (slot := _slot(record)) in records:
-            raise InputError(f"{where} is a second record of {record['method']} with seed {record['seed']}")
+            raise InputError(f"{where} is a second record of {named(record)} with seed {record['seed']}")
         records[slot] = record
     return list(records.values())
+
+
+def named(record: Record) -> str:
+    """What the record's agent is called in tables."""
+    return label(record["method"], record["deployment"])
 
 
 def _slot(record: Record) -> str:
@@ -214,11 +219,11 @@ def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
     file = folder / place(task)
     found = [one for one in (read(file) if file.exists() else ()) if one["preset"] == preset and not one["set"]]
     found = _newest([one for one in found if not one["salt"]], "task_version")
-    by_job: dict[str, list[Record]] = {}
+    by_method: dict[str, list[Record]] = {}
     for record in found:
-        by_job.setdefault(record["job"], []).append(record)
-    newest = [record for job in by_job.values() for record in _newest(job, "method_version")]
-    return sorted(newest, key=lambda record: (record["method"], record["seed"]))
+        by_method.setdefault(record["method"], []).append(record)
+    newest = [record for of in by_method.values() for record in _newest(of, "method_version")]
+    return sorted(newest, key=lambda record: (named(record), record["seed"]))
 
 
 def _newest(records: list[Record], version: str) -> list[Record]:
@@ -243,11 +248,11 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
             raise InputError(f"records of two versions of {record['method']} do not belong in one table")
     if missing := [name for name in REFERENCES if name not in {record["method"] for record in records}]:
         raise InputError(f"records of {first['task']} are without those of {missing[0]}, which scores need")
-    by_method: dict[str, list[Record]] = {}
+    by_agent: dict[str, list[Record]] = {}
     for record in records:
-        by_method.setdefault(record["method"], []).append(record)
+        by_agent.setdefault(named(record), []).append(record)
     rank = {name: i for i, name in enumerate(order)}
-    names = sorted(by_method, key=lambda name: rank.get(name.removesuffix("_episode"), len(rank)))
+    names = sorted(by_agent, key=lambda name: rank.get(by_agent[name][0]["method"], len(rank)))
     return {
         **{key: first[key] for key in COMMON if first[key] not in ("", [])},
         "seeds": sorted({record["seed"] for record in records}),
@@ -255,7 +260,7 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         "versions": first["versions"],
         "machine": "; ".join(sorted({record["machine"] for record in records})),
         "wall_s": round(covered([(begin, end) for record in records for begin, end in record["spans"]]), 1),
-        "methods": score.summarise({name: by_method[name] for name in names}, first["episodes"]),
+        "methods": score.summarise({name: by_agent[name] for name in names}, first["episodes"]),
     }
 
 

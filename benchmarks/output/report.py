@@ -74,13 +74,13 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     for name, entry in results["methods"].items():
         values = entry["score"] + entry.get("score_beyond", [])
         trained, at = len(entry["score"]), range(1, len(values) + 1)
-        base = name.removesuffix("_episode")  # dotted: another way to deploy the same agent
-        style = ":" if base != name else "--" if name in (*EXACT, *REFERENCES) else "-"
-        axes.plot(at, values, style, marker="o", ms=4, color=colour(name), label=name)
+        # Dotted: another way of deploying the same agent.
+        style = ":" if entry["deployment"] else "--" if name in (*EXACT, *REFERENCES) else "-"
+        axes.plot(at, values, style, marker="o", ms=4, color=colour(entry["method"]), label=name)
         if entry["band"]:
-            axes.fill_between(at, *np.transpose(entry["band"]), color=colour(name), alpha=0.12, lw=0)
+            axes.fill_between(at, *np.transpose(entry["band"]), color=colour(entry["method"]), alpha=0.12, lw=0)
             if len(values) == 1:
-                axes.vlines(at, *np.transpose(entry["band"]), color=colour(name))
+                axes.vlines(at, *np.transpose(entry["band"]), color=colour(entry["method"]))
     longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
     if longest > trained:
         axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
@@ -97,7 +97,7 @@ def learning(results: dict[str, Any], file: Path) -> None:
     curves = {
         name: entry["curve"]
         for name, entry in results["methods"].items()
-        if "curve" in entry and not (name.endswith("_episode") and name.removesuffix("_episode") in results["methods"])
+        if "curve" in entry and not entry["deployment"]
     }
     kinds = list(dict.fromkeys(kind for curve in curves.values() for kind in curve))
     if not kinds:

@@ -82,6 +82,8 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
         scores = normalise(returns, random, expert)
         band = bootstrap(scores)
         methods[name] = {
+            "method": seeds[0]["method"],
+            "deployment": seeds[0]["deployment"],
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
@@ -116,7 +118,7 @@ def outcome(methods: dict[str, Any]) -> str:
 
     seeds = max(len(entry["seeds"]) for entry in methods.values())
     of = "of one seed" if seeds == 1 else f"means of {seeds} seeds"
-    judged = [name for name, entry in methods.items() if entry["tier"] in "123" and not name.endswith("_episode")]
+    judged = [name for name, entry in methods.items() if entry["tier"] in "123" and not entry["deployment"]]
     judged.sort(key=lambda name: -methods[name]["score_last"])
     if not judged or not {"conditional", "interventional"} <= set(methods):
         scored = (

@@ -11,7 +11,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +28,9 @@ SHARES = (0.25, 0.5, 1.0)
 LEARNED = tuple(name for name, method in METHODS.items() if method.learned and name != "deconfounded_gru")
 
 
-def scaled(config: Any, share: float) -> Any:
-    """A method's configuration with so much of its updates."""
-    counts = [field.name for field in fields(config) if field.name.endswith("updates")]
-    return replace(config, **{name: max(1, round(getattr(config, name) * share)) for name in counts})
+def scaled(config: dict[str, Any], share: float) -> dict[str, Any]:
+    """A method's configuration with that share of its updates."""
+    return {name: max(1, round(of * share)) if name.endswith("updates") else of for name, of in config.items()}
 
 
 def picture(task: str, found: dict[str, Any], file: Path) -> None:
@@ -67,7 +66,7 @@ def main() -> None:
     envs.check_task(task)
     policy.load(task)
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.engine.presets import CONFIGS, changed, preset
+    from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
     from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records, score
@@ -76,7 +75,7 @@ def main() -> None:
     full = changed(preset(args.preset, task, args.device), args.set)
     found: dict[str, Any] = {method: {} for method in methods}
     for share in SHARES:
-        settings = replace(full, **{part: scaled(getattr(full, part), share) for part in CONFIGS})
+        settings = replace(full, configs={name: scaled(config, share) for name, config in full.configs.items()})
         own = folder / f"{share:g}"
         label = f"{task.name}, {share:g} of the updates"
         wanted = [*REFERENCES, *methods]

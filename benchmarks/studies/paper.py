@@ -23,7 +23,7 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
-from deconfounded.benchmarks.engine.methods import MAKERS
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.benchmarks.engine.store import Finished, by_method
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.output.figures import figure_2, figure_3
@@ -113,8 +113,8 @@ class FigureJob(Job):
         env = envs.BatchEnv(task, few * len(self.seeds))
         seeds = [stream(EVALUATION, seed) + n for seed in self.seeds]
         trials = run_trials(env, ExpertAgent(env, context.expert), 1, seeds).trials
-        monitor.watch(context, Batch.of(trials, len(seeds), self.preset.naive.device), few)
-        agent = MAKERS[self.method](context)[self.method]
+        monitor.watch(context, Batch.of(trials, len(seeds), self.preset.device), few)
+        agent = fit(context, self.method)
         trained = monitor.worked()
         best, pulls = online(context, agent, n)
         onlooker = Onlooker(agent, ExpertAgent(context.env, context.expert))

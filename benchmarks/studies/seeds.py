@@ -23,8 +23,8 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.context import Context
-from deconfounded.benchmarks.engine.methods import MAKERS
 from deconfounded.benchmarks.engine.presets import Preset, preset
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.agents import Monitor
 from deconfounded.experts.rollout import Agent
 
@@ -54,16 +54,9 @@ def few(full: Preset) -> Preset:
     """The preset's networks and batches, on little data and for few updates."""
     small: dict[str, Any] = {"rounds": 1, "final_updates": 0}
     small |= {"inference_updates": UPDATES, "imitation_updates": UPDATES}
-    return replace(
-        full,
-        expert_trials=128,
-        explore_trials=128,
-        eval_trials=1,
-        fresh=0,
-        deconfounded=replace(full.deconfounded, **small),
-        discrete=replace(full.discrete, **small),
-        naive=replace(full.naive, updates=UPDATES, chunk=min(full.naive.chunk, 50)),
-    )
+    little = replace(full, expert_trials=128, explore_trials=128, eval_trials=1, fresh=0)
+    little = little.configured("deconfounded", **small).configured("deconfounded_discrete", **small)
+    return little.configured("naive_rnn", updates=UPDATES, chunk=min(full.configs["naive_rnn"]["chunk"], 50))
 
 
 def main() -> None:
@@ -84,7 +77,7 @@ def main() -> None:
         alone: dict[str, float] = {}
         for seeds in sorted({1, *args.seeds}):
             clock = Clock()
-            MAKERS[method](Context(task, settings, range(seeds), clock))
+            fit(Context(task, settings, range(seeds), clock), method)
             for kind, seconds in clock.seconds().items():
                 ratio = seconds / alone.setdefault(kind, seconds)
                 print(f"{method:22} {kind:10} {seeds:3} seeds {1000 * seconds:8.1f} ms an update, {ratio:5.2f} of one")

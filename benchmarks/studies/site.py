@@ -65,7 +65,7 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
     seeds = len(results["seeds"])
     if method and method not in REFERENCES:
         seeds = len(results["methods"][method]["seeds"])
-        base = method.removesuffix("_episode")
+        base = results["methods"][method]["method"]
         named = f" --methods {base if base in METHODS else f'path/{base}.py:fit'}"
     chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
@@ -104,7 +104,7 @@ def outdated(task: envs.Task, results: dict[str, Any]) -> list[str]:
     """What of a task's results is of an older version than today's of the task or a method, and of which."""
     older = [f"the task, v{results['task_version']} of v{task.version}"] * (results["task_version"] != task.version)
     for name, entry in results["methods"].items():
-        method = METHODS.get(name.removesuffix("_episode"))
+        method = METHODS.get(entry["method"])
         if method is not None and entry["version"] != method.version:
             older.append(f"{name}, v{entry['version']} of v{method.version}")
     return older

@@ -43,7 +43,7 @@ def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
     there = {
         record["seed"]
         for record in kept
-        if (record["job"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
+        if (record["method"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
     }
     return tuple(seed for seed in job.seeds if seed not in there)
 

@@ -13,7 +13,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 import json
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,19 +56,20 @@ BEFORE: dict[str, Change] = {
 """What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
 
 
-def other(config: Any, change: Change) -> Any:
-    """A method's configuration with the change."""
+def other(settings: Preset, method: str, change: Change) -> Preset:
+    """The amounts with a change of a method's configuration."""
     values = {}
     for name, by in change.items():
-        now = getattr(config, name)
+        now = settings.configs[method][name]
         values[name] = by if isinstance(by, str) else round(now * by) if isinstance(now, int) else now * by
-    return replace(config, **values)
+    return settings.configured(method, **values)
 
 
 def began(today: Preset) -> Preset:
     """The amounts that the search begins with."""
-    undone = {METHODS[name].part: change for name, change in BEFORE.items()}
-    return replace(today, **{part: other(getattr(today, part), change) for part, change in undone.items()})
+    for method, change in BEFORE.items():
+        today = other(today, method, change)
+    return today
 
 
 def title(change: Change) -> str:
@@ -106,12 +106,12 @@ def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
     """Of a method's setting: what each task's run has of everything, and what its row is known by."""
     from deconfounded.benchmarks.engine.presets import preset
 
-    part, settings, versions = METHODS[name].part, {}, {}
+    settings, versions = {}, {}
     for task in map(envs.get, TASKS):
         start = began(preset("default", task, "cpu"))
-        settings[task.name] = replace(start, **{part: other(getattr(start, part), change)})
+        settings[task.name] = other(start, name, change)
         versions[task.name] = task.version
-    amounts = {task: asdict(getattr(one, part)) for task, one in settings.items()}
+    amounts = {task: one.configs[name] for task, one in settings.items()}
     of = {"method_version": METHODS[name].version, "task_versions": versions}
     return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
 

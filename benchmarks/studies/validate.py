@@ -74,6 +74,7 @@ def predicted(told: Diagnosis) -> float:
 def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:
     """Files of expert trials, and of exploration: half at random, half by a clone without memory that tries things."""
     from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.catalogue import METHODS
     from deconfounded.benchmarks.engine.context import Context
     from deconfounded.benchmarks.engine.presets import preset
     from deconfounded.deconf.diagnosis import exploration
@@ -88,7 +89,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
         Trials.load(file, made_of)
     except envs.InputError:
         rngs = context.rngs  # once: each exploration draws thetas of its own
-        wanderer = exploration.fit(shown, settings.cloning, rngs)
+        wanderer = exploration.fit(shown, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
         joined([context.explore(agent, rngs) for agent in (None, wanderer)]).save(file, made_of)
     return folder / f"demonstrations-{SEED}.npz", file
 

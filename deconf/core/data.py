@@ -18,8 +18,8 @@ from deconfounded.experts.rollout import Trials
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""
 
-Source = Trials | Callable[[Sequence[np.random.Generator]], Trials]
-"""Trials, or what draws fresh ones: as many for each generator."""
+Source = Trials | Callable[[], Trials]
+"""Trials, or a function that draws fresh ones; in as many equal groups as there are seeds."""
 
 
 def listed(rng: Rngs) -> list[np.random.Generator]:
@@ -30,9 +30,9 @@ def listed(rng: Rngs) -> list[np.random.Generator]:
     return list(rngs)
 
 
-def drawn(source: Source, rngs: Sequence[np.random.Generator]) -> Trials:
+def drawn(source: Source) -> Trials:
     """The trials, or fresh ones."""
-    return source if isinstance(source, Trials) else source(rngs)
+    return source if isinstance(source, Trials) else source()
 
 
 class Draws:

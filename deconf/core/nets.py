@@ -31,6 +31,9 @@ def prepare_torch() -> None:
         torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
 
 
+prepare_torch()
+
+
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to go with tensors [S, ..., F]."""
     return statistic.reshape(len(statistic), *[1] * (like.dim() - 2), -1)

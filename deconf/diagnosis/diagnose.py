@@ -35,20 +35,20 @@ class Next(NamedTuple):
 
 CLONE = Next(
     "Clone it; memory does no harm here.",
-    "naive_rnn.fit(trials, naive_rnn.RecurrentConfig(), np.random.default_rng(0))",
+    "naive_rnn.train(trials, naive_rnn.RecurrentConfig(), np.random.default_rng(0))",
 )
 EXPLORE = Next(
     "Tier 2, Algorithm 1: explore the world, blind to what the expert knows.",
-    "deconfounded.fit(trials, explore, deconfounded.DeconfoundedConfig(), np.random.default_rng(0))",
+    "deconfounded.train(trials, explore, deconfounded.DeconfoundedConfig(), np.random.default_rng(0))",
 )
 ASK = Next(
     "Tier 3: ask the expert what it would do in states that the clone comes to.",
-    "dagger.fit(query, dagger.DaggerConfig(), np.random.default_rng(0))",
+    "dagger.train(query, dagger.DaggerConfig(), np.random.default_rng(0))",
 )
 TRY = Next(
     "Explore a little, with a clone without memory that tries things (deconf/diagnosis/exploration.py), and diagnose"
     " again; or try Tier 1, Algorithm 3, which needs no more.",
-    "offline.fit(trials, offline.OfflineConfig(), np.random.default_rng(0))",
+    "deconfounded_offline.train(trials, deconfounded_offline.OfflineConfig(), np.random.default_rng(0))",
 )
 VARY = Next("Record trials under other circumstances too, and diagnose again.")
 WIDER = Next("Explore where the expert goes, by any behaviour that is blind to what it knows, and diagnose again.")

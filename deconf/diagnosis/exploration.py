@@ -21,5 +21,5 @@ class Wanderer(MemorylessAgent):
 
 def fit(trials: Trials, config: CloningConfig, rng: Rngs) -> Wanderer:
     """Clone the expert's trials as in `cloning.fit`, to explore with."""
-    clone = cloning.fit(trials, config, rng)
+    clone = cloning.train(trials, config, rng)
     return Wanderer(clone.policy, clone.scaler, None)

@@ -15,10 +15,10 @@ from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.diagnosis.learned_env import known_range
 from deconfounded.deconf.equations import masked_mean
-from deconfounded.deconf.methods import offline
+from deconfounded.deconf.methods import deconfounded_offline
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig, final_belief
-from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Trials
 
@@ -46,7 +46,7 @@ class Explanation(NamedTuple):
 def alone(shown: Trials, how: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
     """Of expert trials: a latent that explains actions and answers, Eq. (7)."""
     data = Batch.of(shown, 1)
-    model, _, policy = offline.explain(data, Signature.of(shown), how, draws, monitor)
+    model, _, policy = deconfounded_offline.explain(data, Signature.of(shown), how, draws, monitor)
     return Explanation(model, policy, model.sample(final_belief(model, data), draws))
 
 

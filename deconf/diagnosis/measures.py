@@ -29,7 +29,7 @@ from deconfounded.deconf.diagnosis.learned_env import Actor, Clone, Expert, Filt
 from deconfounded.deconf.methods import cloning, naive_rnn
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.offline import OfflineConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.experts.rollout import Agent, Trials
 
@@ -124,8 +124,8 @@ def measure(
     amounts = amounts.fitting(trials.obs.shape[-1])
     expert, rngs = split(trials, amounts.held_out, rng), [rng]
     shown, held = expert
-    blind = cloning.fit(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
-    recurrent = naive_rnn.fit(shown, amounts.naive, rng, Part(tell, 0.1, 0.25))
+    blind = cloning.train(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
+    recurrent = naive_rnn.train(shown, amounts.naive, rng, Part(tell, 0.1, 0.25))
     draws = Draws(rngs, "cpu")
     if explore is None:
         found = latent.alone(shown, amounts.offline, draws, Part(tell, 0.25, 0.8))

@@ -1,1 +1,41 @@
-"""One file a method, and the training loops that several share."""
+"""One file a method, and the training loops that several share. A line of METHODS registers a method.
+
+A method is a function that is declared with `uses` (deconf/method.py): `fit` of the module, or the one that is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+
+from deconfounded.deconf.given import Given
+from deconfounded.experts.rollout import Agent
+
+METHODS = {
+    "deconfounded": "deconfounded:fit",
+    "deconfounded_gru": "deconfounded_gru:fit",
+    "deconfounded_discrete": "deconfounded_discrete:fit",
+    "deconfounded_offline": "deconfounded_offline:fit",
+    "deconfounded_mean": "deconfounded_mean:fit",
+    "dagger": "dagger:fit",
+    "gail": "gail:fit",
+    "rma": "rma:fit",
+    "naive_transformer": "naive_transformer:fit",
+    "naive_obs": "naive_obs:fit",
+    "naive_dropout": "naive_dropout:fit",
+    "palr": "palr:fit",
+    "naive_rnn": "naive_rnn:fit",
+    "oracle_bc": "oracle_bc:fit",
+    "blind_bc": "blind_bc:fit",
+    "conditional": "references:conditional",
+    "interventional": "references:interventional",
+    "expert": "references:expert",
+    "random": "references:random",
+}
+"""In the order of tables, and of a run: the longest first."""
+
+
+def load(name: str) -> Callable[[Given], Agent]:
+    """The function of a registered method; its module is imported now."""
+    module, function = METHODS[name].split(":")
+    return getattr(import_module(f"{__name__}.{module}"), function)

@@ -49,7 +49,7 @@ def clone(
     the expert's observations. teach: makes what trains it, on trials of so many steps.
     """
     rngs, monitor = listed(rng), monitor or Monitor()
-    shown = drawn(trials, rngs)
+    shown = drawn(trials)
     data, draws = Batch.of(shown, len(rngs), config.device), Draws(rngs, config.device)
     agent = start(Signature.of(shown), Scaler(data.obs, data.mask), draws)
     learner = teach(agent, data.mask.shape[2], monitor)
@@ -60,7 +60,7 @@ def clone(
         if shown is trials:
             batch = data.draw_trials(config.batch, draws)
         else:
-            batch = Batch.of(drawn(trials, rngs), len(rngs), config.device)
+            batch = Batch.of(drawn(trials), len(rngs), config.device)
         learner.learn(batch, batch.action)
         checkpoint.save(done=learner.done)
     return agent

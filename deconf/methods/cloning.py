@@ -57,7 +57,7 @@ class MemorylessAgent(LearnedAgent):
         return self.policy.sample(features, self._draws)
 
 
-def fit(
+def train(
     trials: Trials,
     config: CloningConfig,
     rng: Rngs,

@@ -29,11 +29,13 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed,
 from deconfounded.deconf.core.drift import apart
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
-Query = Callable[[Agent | None, Sequence[np.random.Generator]], tuple[Trials, NDArray[np.float32]]]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each generator.
+Query = Callable[[Agent | None], tuple[Trials, NDArray[np.float32]]]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each seed.
 
 Returns trials, and beside them what the expert would have done at each step [B, E, T, A]."""
 
@@ -117,7 +119,7 @@ class DaggerAgent(LearnedAgent):
         return self.loss(batch, batch.action, None, self._draws)
 
 
-def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> DaggerAgent:
+def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> DaggerAgent:
     """Label roll-outs, train on all labels so far, and again. Raises InputError for less than one round."""
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
@@ -126,7 +128,7 @@ def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None =
 
     def labelled(behaviour: DaggerAgent | None) -> tuple[Signature, Batch, Tensor]:
         """Roll-outs, and their labels [S, B, T, A], joined as the trials' own actions are."""
-        trials, labels = query(behaviour, rngs)
+        trials, labels = query(behaviour)
         each = apart if config.drifts else lambda trials: trials
         told = Trials(trials.obs, labels, trials.mask, trials.actions)
         acted, meant = (Batch.of(each(some), len(rngs), config.device) for some in (trials, told))
@@ -152,3 +154,16 @@ def fit(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None =
             done += 1
             monitor.update(done, sum(updates), {"imitation": loss.mean().item()}, agent)
     return agent
+
+
+@uses(
+    "queries",
+    cost=4,
+    on_control=DaggerConfig(),
+    on_bandit=DaggerConfig(batch=64, shortest=1.0, updates=1000),
+    smoke={"updates": 60, "rounds": 4},
+    smoke_bandit={"updates": 500, "rounds": 4},
+)
+def fit(given: Given) -> DaggerAgent:
+    """The same, on what is given."""
+    return train(given.query, given.config, given.rngs, given.monitor)

@@ -23,12 +23,15 @@ from deconfounded.deconf.core.drift import apart, choose_kept
 from deconfounded.deconf.core.models import LatentModel
 from deconfounded.deconf.core.models import new as new_model
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
-Explore = Callable[[Agent | None, Sequence[np.random.Generator]], Trials]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each generator."""
+Explore = Callable[[Agent | None], Trials]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each seed."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +159,7 @@ class Explorer(DeconfoundedAgent):
         return self.policy.signature.randomise(super().choose(obs), self.random_share, self._draws)
 
 
-def fit(
+def train(
     trials: Source, explore: Explore, config: DeconfoundedConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> DeconfoundedAgent:
     """Algorithm 1.
@@ -170,7 +173,7 @@ def fit(
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
     each = apart if config.drifts else lambda trials: trials
-    shown, first = each(drawn(trials, rngs)), explore(None, rngs)
+    shown, first = each(drawn(trials)), explore(None)
     episodes, first = first.mask.shape[1], each(first)
     signature = Signature.of(shown)
     if Signature.of(first) != signature:
@@ -207,10 +210,10 @@ def fit(
     for i in range(begin, config.rounds):
         if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
-            new = Batch.of(each(explore(explorer, rngs)), seeds, device)
+            new = Batch.of(each(explore(explorer)), seeds, device)
             seen = seen.joined(new) if config.accumulate else new
             if not config.accumulate:
-                expert = Batch.of(each(drawn(trials, rngs)), seeds, device)
+                expert = Batch.of(each(drawn(trials)), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
             beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
@@ -241,3 +244,75 @@ def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
     """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
     indices = torch.arange(len(trials), device=trials.mask.device).split(part)
     return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))
+
+
+ON_CONTROL = DeconfoundedConfig(
+    inference_updates=500,
+    inference_rate=3e-3,
+    imitation_updates=250,
+    final_updates=2000,
+    imitation_rate=2e-3,
+)
+ON_BANDIT = DeconfoundedConfig(
+    rounds=2,
+    latent=5,
+    beta=5e-3,
+    inference_updates=1200,
+    inference_batch=64,
+    inference_steps=3200,
+    inference_rate=3e-3,
+    shortest=1.0,  # its trials are short, and on the beginnings of few the latent is ignored for too long
+    imitation_updates=800,
+    final_updates=3200,
+    imitation_rate=3e-3,
+    random_share=1.0,
+)
+PAPER = DeconfoundedConfig(  # appendix D and table 1; what they leave open is in docs/paper.md
+    model="gru",
+    width=256,
+    latent=256,
+    beta=1e-3,
+    rounds=5000,
+    shortest=1.0,
+    inference_updates=1,
+    inference_batch=None,
+    inference_steps=2048,
+    inference_rate=1e-4,
+    imitation_updates=1,
+    final_updates=0,
+    imitation_batch=2048,
+    imitation_rate=1e-3,
+    cooled=False,
+    accumulate=False,
+    fit_prior=False,
+    random_share=1.0,
+)
+SMOKE = {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100}
+SMOKE_BANDIT = {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800}
+
+
+def many(config: DeconfoundedConfig) -> dict[str, Any]:
+    """Changes where much is observed: theta is inferred longer, at a lower rate (3e-3: ant_goal is worse)."""
+    return {"latent": SPACIOUS, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
+
+
+def once(agent: DeconfoundedAgent) -> DeconfoundedAgent:
+    """The same agent, whose theta_hat is drawn once an episode."""
+    return DeconfoundedAgent(agent.model, agent.policy, "episode")
+
+
+@uses(
+    *("demonstrations", "exploration"),
+    cost=4,
+    on_control=ON_CONTROL,
+    on_bandit=ON_BANDIT,
+    smoke=SMOKE,
+    smoke_bandit=SMOKE_BANDIT,
+    paper=PAPER,
+    many=many,
+    ways={"episode": once},
+)
+def fit(given: Given) -> DeconfoundedAgent:
+    """Algorithm 1, on explorations of all rounds; or on each round's alone, with fresh demonstrations."""
+    trials = given.demonstrations if given.config.accumulate else given.source
+    return train(trials, given.explore, given.config, given.rngs, given.monitor)

@@ -18,7 +18,10 @@ from deconfounded.deconf.core.agents import Checkpoint, Monitor
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explore
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Trials
@@ -118,7 +121,7 @@ def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tens
     return torch.cat([model.encoder.posterior(model.encoder(trials[:, i])[:, :, :-1])[0] for i in indices], 1)
 
 
-def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
+def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
     """trials: of the expert, without theta, in as many equal groups as there are generators in rng.
 
     explore: called once a round. Raises InputError for less than one round.
@@ -126,7 +129,7 @@ def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
-    first, draws = explore(None, rngs), Draws(rngs, device)
+    first, draws = explore(None), Draws(rngs, device)
     expert, seen = Batch.of(trials, len(rngs), device), Batch.of(first, len(rngs), device)
     obs, change = scalers(seen.joined(expert))
     agent = MeanAgent.new(config.model, config.latent, config.width, Signature.of(trials), obs, change, draws)
@@ -155,7 +158,7 @@ def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor
 
     for i in range(begin, config.rounds):
         if i > 0:
-            seen = seen.joined(Batch.of(explore(agent, rngs), len(rngs), device))
+            seen = seen.joined(Batch.of(explore(agent), len(rngs), device))
         for j in range(config.inference_updates):
             beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
             model.train()
@@ -170,3 +173,31 @@ def fit(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor
     final = Adam([policy], config.imitation_rate, config.final_updates)
     imitate(config.final_updates, final, done)
     return agent
+
+
+@uses(
+    *("demonstrations", "exploration"),
+    cost=8,
+    on_control=MeanConfig(model="evidence"),
+    on_bandit=MeanConfig(
+        model="evidence",
+        latent=5,
+        beta=0.01,
+        ahead=1,
+        rounds=2,
+        inference_updates=600,
+        inference_batch=64,
+        shortest=1.0,
+        inference_steps=6400,
+        inference_rate=3e-3,
+        imitation_updates=800,
+        final_updates=3200,
+        imitation_rate=3e-3,
+    ),
+    smoke={"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 20},
+    smoke_bandit={"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 400},
+    many=lambda config: {"latent": SPACIOUS},
+)
+def fit(given: Given) -> MeanAgent:
+    """The same, on what is given."""
+    return train(given.demonstrations, given.explore, given.config, given.rngs, given.monitor)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -27,16 +28,19 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
+from deconfounded.deconf.given import Environments, Given
+from deconfounded.deconf.method import uses
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Trials
 
 if TYPE_CHECKING:
     from sb3_contrib import RecurrentPPO
 
-    from deconfounded.deconf.methods.practice import Practice, Reward
+    from deconfounded.deconf.methods.practice import Practice
 
-Practise = Callable[[int, int, NDArray[Any], NDArray[Any], "Reward"], "Practice"]
-"""n environments from a seed, that scale observations by mean and std [O], with that reward."""
+Space = spaces.Box | spaces.Discrete
+Open = Callable[[int, int], Environments]
+"""Environments of a seed, by its index, and how many."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +211,13 @@ class Player:
         self.ppo.policy.optimizer.load_state_dict(state["adam"])
 
 
-def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monitor: Monitor | None = None) -> GailAgent:
-    """trials: of the expert, in as many equal groups as there are generators in rng; practise: in what it trains.
+def train(
+    trials: Trials, environments: Open, space: Space, config: GailConfig, rng: Rngs, monitor: Monitor | None = None
+) -> GailAgent:
+    """Adversarial imitation, in rounds of PPO and of the discriminator.
+
+    trials: of the expert, in as many equal groups as there are generators in rng. environments: to practise in. space:
+    of actions.
 
     Raises InputError for less than one round, or where sb3-contrib is not installed.
     """
@@ -225,25 +234,25 @@ def fit(trials: Trials, practise: Practise, config: GailConfig, rng: Rngs, monit
     agent = GailAgent.blank({"width": config.width}, signature, obs, draws)
     mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
 
-    def environments(i: int) -> Practice:
-        return practise(config.envs, int(rngs[i].integers(2**31)), mean[i], std[i], discriminator.of_seed(i).reward)
+    def practice(i: int) -> Practice:
+        from deconfounded.deconf.methods.practice import Practice
 
-    players = [Player(_ppo(environments(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
+        reward = discriminator.of_seed(i).reward
+        return Practice(environments(i, config.envs), space, mean[i], std[i], reward)
+
+    players = [Player(_ppo(practice(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
     named = {f"player{i}": player for i, player in enumerate(players)}
     checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
     begin = (checkpoint.load() or {"round": 0})["round"]
     for done in range(begin, config.rounds):
-        own, begun = [], []
+        own = []
         for i, player in enumerate(players):
-            env = environments(i)
+            env = practice(i)
             with numbers(int(rngs[i].integers(2**31))):
                 player.ppo.set_env(env)
                 player.ppo.learn(config.envs * config.steps)
             own.append([np.concatenate(column) for column in zip(*env.transitions, strict=True)])
-            begun.append(env.begun)
             agent.take(i, player.ppo.policy)
-        monitor.spend("exploration_trials", begun)
-        monitor.spend("interactions", [config.envs * config.steps] * seeds)
         before, action, then = (torch.as_tensor(np.stack(x), device=config.device) for x in zip(*own, strict=True))
         seen = Batch(before, action, then, torch.ones_like(before[..., 0]))[:, None]
         losses = []
@@ -285,3 +294,19 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
         )
     ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
     return ppo
+
+
+@uses(
+    *("demonstrations", "exploration"),
+    cost=60,
+    on_control=GailConfig(discriminator_rate=3e-4),
+    on_bandit=GailConfig(
+        rounds=150, envs=64, steps=100, minibatch=1600, gamma=0.9, policy_rate=3e-3, discriminator_rate=3e-4
+    ),
+    smoke={"rounds": 2},
+    smoke_bandit={"rounds": 20},
+)
+def fit(given: Given) -> GailAgent:
+    """The same, on what is given."""
+    data, space = given.demonstrations, given.action_space
+    return train(data, given.environments, space, given.config, given.rngs, given.monitor)

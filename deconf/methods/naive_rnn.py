@@ -9,10 +9,26 @@ from __future__ import annotations
 
 from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Rngs, Source
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.clones import by_chunks, clone
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
 
-def fit(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
+def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
     """Clone the expert's trials, or what draws them: see `clone`."""
     return clone(trials, config, rng, lambda *kind: RecurrentAgent.new(config.width, *kind), by_chunks(config), monitor)
+
+
+@uses(
+    "demonstrations",
+    cost=2,
+    on_control=RecurrentConfig(),
+    on_bandit=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    smoke={"updates": 60},
+    smoke_bandit={"updates": 500},
+    paper=RecurrentConfig(width=256, updates=5000, batch=100, chunk=100, learning_rate=1e-3, cooled=False),
+)
+def fit(given: Given) -> RecurrentAgent:
+    """The same, on what is given."""
+    return train(given.source, given.config, given.rngs, given.monitor)

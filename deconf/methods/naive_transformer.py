@@ -21,6 +21,8 @@ from deconfounded.deconf.core.agents import LearnedAgent, Monitor
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler
 from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.clones import clone
 
 
@@ -201,7 +203,7 @@ class Teacher:
         self.monitor.update(self.done, self.total, {"imitation": loss.mean().item()}, self.agent)
 
 
-def fit(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor | None = None) -> TransformerAgent:
+def train(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor | None = None) -> TransformerAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
 
     def start(signature: Signature, obs: Scaler, draws: Draws) -> TransformerAgent:
@@ -213,3 +215,16 @@ def fit(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor |
         return Teacher(agent, config, monitor)
 
     return clone(trials, config, rng, start, teach, monitor)
+
+
+@uses(
+    "demonstrations",
+    cost=30,
+    on_control=TransformerConfig(layers=4),
+    on_bandit=TransformerConfig(width=32, layers=4, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),
+    smoke={"updates": 10},
+    smoke_bandit={"updates": 200},
+)
+def fit(given: Given) -> TransformerAgent:
+    """The same, on what is given."""
+    return train(given.source, given.config, given.rngs, given.monitor)

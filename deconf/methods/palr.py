@@ -18,6 +18,8 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, take_steps
 from deconfounded.deconf.core.nets import ActionHead, Scaler
 from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.clones import by_chunks, clone
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
@@ -93,7 +95,7 @@ class PalrAgent(RecurrentAgent):
         return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-def fit(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> PalrAgent:
+def train(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> PalrAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
 
     def start(signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
@@ -102,3 +104,16 @@ def fit(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None =
         return agent
 
     return clone(trials, config, rng, start, by_chunks(config), monitor)
+
+
+@uses(
+    "demonstrations",
+    cost=4,
+    on_control=PalrConfig(penalty=1.0),
+    on_bandit=PalrConfig(penalty=1.0, updates=2000, batch=128, chunk=50, learning_rate=1e-2),
+    smoke={"updates": 60},
+    smoke_bandit={"updates": 500},
+)
+def fit(given: Given) -> PalrAgent:
+    """The same, on what is given."""
+    return train(given.source, given.config, given.rngs, given.monitor)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from torch import Tensor, nn
 
-from deconfounded.envs import BatchEnv, Task
+from deconfounded.deconf.given import Environments
 from deconfounded.experts.sb3 import Bare
 
 Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
@@ -19,28 +19,25 @@ Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]
 
 
 class Practice(Bare):
-    """n environments; theta stays for `task.episodes` episodes, and `done` says that they are over.
+    """The environments of a vector in which a whole trial is one episode: `done` says that the trial is over.
 
     What is observed [N, O + F + 1]: the observation, scaled; the action before it, one-hot if discrete; and whether an
     episode has just begun, when there is no such action. `transitions` keeps what took place since the last reset.
     """
 
     def __init__(
-        self, task: Task, n: int, seed: Sequence[int], mean: NDArray[Any], std: NDArray[Any], reward: Reward
+        self, environments: Environments, space: Any, mean: NDArray[Any], std: NDArray[Any], reward: Reward
     ) -> None:
-        """seed: of each environment. mean, std [O]: of the expert's observations."""
-        self._batch, self._mean, self._std, self._reward = BatchEnv(task, n), mean, std, reward
-        self._seed, self._actions = list(seed), int(getattr(task.action_space, "n", 0))
-        self._features = self._actions or int(np.prod(task.action_space.shape or 1))
-        width = len(task.observation) + self._features + 1
-        seen = spaces.Box(-np.inf, np.inf, (width,), np.float32)
-        super().__init__(n, seen, task.action_space)
+        """space: of actions. mean, std [O]: of the expert's observations."""
+        self._environments, self._mean, self._std, self._reward = environments, mean, std, reward
+        self._actions = int(getattr(space, "n", 0))
+        self._features = self._actions or int(np.prod(space.shape or 1))
+        seen = spaces.Box(-np.inf, np.inf, (len(mean) + self._features + 1,), np.float32)
+        super().__init__(environments.n, seen, space)
 
     def reset(self) -> Any:
         """Trials start, under the thetas of these environments' seeds."""
-        self._obs = self._batch.reset(self._seed)
-        self._episode = np.ones(self.num_envs, int)
-        self.begun = self.num_envs  # trials
+        self._obs = self._environments.reset()
         self.transitions: list[tuple[NDArray[np.float32], ...]] = []
         return self._observation(np.zeros((self.num_envs, self._features)), np.ones(self.num_envs, bool))
 
@@ -52,21 +49,17 @@ class Practice(Bare):
         self._chosen = np.asarray(actions, np.float32).reshape(self.num_envs, -1)
 
     def step_wait(self) -> Any:
-        batch, action, obs = self._batch, self._chosen, self._obs
-        then, _, terminated, truncated = batch.step(action)
+        action, obs = self._chosen, self._obs
+        then, following, over, done = self._environments.step(action)
         reward = self._reward(obs, action, then)
         self.transitions.append((obs, action, then))
         before = np.eye(self._actions)[action[:, 0].astype(int)] if self._actions else action
-        self._obs, over = then, terminated | truncated
-        done = over & (self._episode >= batch.task.episodes)
+        self._obs = then
         infos: list[dict[str, Any]] = [{} for _ in done]
         ends = self._observation(before, np.zeros(len(done), bool))
         for i in np.flatnonzero(done):
             infos[i] = {"terminal_observation": ends[i], "TimeLimit.truncated": True}  # life would go on
-        if over.any():
-            self._obs = batch.reset(options={"keep_theta": ~done}, where=over)
-            self._episode = np.where(done, 1, self._episode + over)
-            self.begun += int(done.sum())
+        self._obs = following
         return self._observation(before, over), reward, done, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:

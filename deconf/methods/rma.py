@@ -7,7 +7,7 @@ were chosen by the student, and so are no evidence of theta. It acts on one esti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,13 +21,15 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
 from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import cloning
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.envs.task import Array, InputError
 from deconfounded.experts.rollout import Agent, Trials
 
-Tell = Callable[[Agent | None, Sequence[np.random.Generator]], tuple[Trials, Array]]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each generator.
+Tell = Callable[[Agent | None], tuple[Trials, Array]]
+"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each seed.
 
 Returns trials, and the encoded theta [B, E, F] of their episodes."""
 
@@ -100,7 +102,7 @@ class RmaAgent(LearnedAgent):
         return masked_mean(error.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
 
 
-def fit(
+def train(
     trials: Trials, theta: Array, tell: Tell, config: RmaConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> RmaAgent:
     """Clone the teacher, then teach the student on its own roll-outs.
@@ -112,7 +114,7 @@ def fit(
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     rngs, monitor = listed(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
-    teacher = cloning.fit(trials, _teacher(config), rngs, theta)
+    teacher = cloning.train(trials, _teacher(config), rngs, theta)
     signature, width = Signature.of(trials), config.width
     adapter = Adapter(width, theta.shape[-1], signature, teacher.scaler, draws)
     agent = RmaAgent(adapter, teacher.policy, teacher.scaler)
@@ -126,7 +128,7 @@ def fit(
     if before := checkpoint.load():
         begin, data, told = before["round"], Batch(*before["data"]), before["told"]
     for i in range(begin, config.rounds):
-        own, thetas = tell(agent if i > 0 else None, rngs)
+        own, thetas = tell(agent if i > 0 else None)
         new, label = Batch.of(own, len(rngs), config.device), along(own, thetas, len(rngs), config.device)
         data, told = (new, label) if data is None else (data.joined(new), torch.cat([told, label], 1))
         for j in range(passes[i]):
@@ -158,3 +160,17 @@ def along(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
     """theta [B, E, F] of episodes -> [S, B, T, F], at each step as `Batch.of` joins them."""
     each = np.repeat(theta[:, :, None], trials.mask.shape[2], 2).astype(np.float32)
     return Batch.of(Trials(trials.obs, each, trials.mask), seeds, device).action
+
+
+@uses(
+    *("demonstrations", "exploration", "theta"),
+    cost=4,
+    on_control=RmaConfig(updates=3000, learning_rate=6e-4),
+    on_bandit=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=3e-3, teacher_updates=500),
+    smoke={"updates": 60, "rounds": 2, "teacher_updates": 400},
+    smoke_bandit={"updates": 500, "rounds": 2, "teacher_updates": 400},
+)
+def fit(given: Given) -> RmaAgent:
+    """The same, on what is given."""
+    theta = given.theta
+    return train(given.demonstrations, theta, given.explore_with_theta, given.config, given.rngs, given.monitor)

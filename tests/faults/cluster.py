@@ -27,7 +27,7 @@ from tests import tools
 ROOT = Path(__file__).parents[2]
 RUN = ("--task", "bandit", "--preset", "smoke", "--methods", "naive_rnn", "blind_bc", "--seeds", "2")
 MARK = "DECONFOUNDED_KILLS"  # in the environment of all that this script starts
-AMOUNTS = ("naive.updates=150", "expert_trials=200", "eval_trials=200", "cloning.updates=200")
+AMOUNTS = ("naive_rnn.updates=150", "expert_trials=200", "eval_trials=200", "blind_bc.updates=200")
 
 
 def command(out: Path, *more: str) -> subprocess.Popen[bytes]:

@@ -31,7 +31,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.methods.cloning import CloningConfig, fit
+from deconfounded.deconf.methods.cloning import CloningConfig, train
 from deconfounded.experts import policy, store
 from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
@@ -66,12 +66,14 @@ DEVICES = ("", "hpu", "cuda:99", "meta", "gpu", "cpu:x", "-1")
 FOLDERS = ("", " ", "/proc/none", "/dev/null", "/dev/null/x", "{file}", "{file}/x", "x" * 300)
 EXPERTS = ("", "gone.safetensors", "gone.py:f", "{file}", "{folder}", ":", "os:nothing", "os:sep", "{junk}")
 AGENTS = ("", "nowhere", "/proc/none", "{file}", "{folder}")
+OF_NAIVE = ("", "=", "=-1", "=1e400", "=NaN", "=true", "=1.5", "=" + "9" * 30)
 SETS = (
-    *("", "=", "x", "x=1", "naive", "naive.updates", "naive.updates=", "naive.updates=-1", "naive.updates=1e400"),
-    *("naive.updates=NaN", "naive.updates=true", "naive.updates=1.5", "naive.x=1", "nonsense.updates=1", "a.b.c=1"),
-    *("seeds=0", "seeds=1000000000", "seeds=[1]", "device=cuda", "naive.device=cuda", "deconfounded.model=tree"),
-    *("eval_trials=0", "expert_trials=", "naive.width=0", "naive.learning_rate=-1", "naive.learning_rate=fast"),
-    *("naive.cooled=1", "naive.updates=" + "9" * 30, "expert_trials=99999999999999"),
+    *("", "=", "x", "x=1", "naive", "nonsense.updates=1", "a.b.c=1"),
+    *(f"naive_rnn.updates{rest}" for rest in OF_NAIVE),
+    *("seeds=0", "seeds=1000000000", "seeds=[1]", "device=cuda", "deconfounded.model=tree"),
+    *("eval_trials=0", "expert_trials=", "expert_trials=99999999999999"),
+    *(f"naive_rnn.{amount}" for amount in ("x=1", "width=0", "learning_rate=-1", "learning_rate=fast", "cooled=1")),
+    "naive_rnn.device=cuda",
 )
 ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # command: what it is given beside, and options
     "run": (
@@ -186,7 +188,7 @@ def commands(folder: Path) -> Iterator[tuple[str, str]]:
     (folder / "junk").write_bytes(b"\xff\x00 junk {")
     preset = tiny_preset()
     shown = Context(envs.get("bandit"), preset, [0]).demonstrations
-    agent = fit(shown, preset.cloning, [np.random.default_rng(0)])
+    agent = train(shown, CloningConfig(updates=3, batch=64), [np.random.default_rng(0)])
     assert isinstance(agent, LearnedAgent)
     store.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
     for command, (base, options) in ODD.items():
@@ -214,7 +216,7 @@ def calls() -> dict[str, Callable[[], Any]]:
     rng = np.random.default_rng(0)
     obs, action, mask = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1)), np.ones((2, 1, 3), bool)
     trials = Trials(obs, action, mask)
-    agent = fit(trials, CloningConfig(updates=1, batch=4), [rng])
+    agent = train(trials, CloningConfig(updates=1, batch=4), [rng])
     batch, task = envs.BatchEnv(envs.get("bandit"), 4), envs.get(CONTROL)
     odd: dict[str, Callable[[], Any]] = {}
     for name in (None, 3, b"bandit", "", [], "bandid", True, 1.5, ("bandit",)):

@@ -26,7 +26,8 @@ from deconfounded.benchmarks.engine import store
 from deconfounded.envs.files import write_json
 
 HERE = Path(__file__).parent
-AMOUNTS = ("seeds=2", "expert_trials=100", "explore_trials=50", "eval_trials=50", "naive.updates=120", "naive.batch=16")
+AMOUNTS = ("seeds=2", "expert_trials=100", "explore_trials=50", "eval_trials=50")
+AMOUNTS += ("naive_rnn.updates=120", "naive_rnn.batch=16")
 AMOUNTS += ("deconfounded.inference_updates=60", "deconfounded.imitation_updates=40", "deconfounded.final_updates=40")
 METHODS = ("blind_bc", "naive_rnn", "deconfounded")
 OF_TIME = ("cpu_s", "spans", "wall_s", "resumed", "sha256", "commit", "commits")

@@ -18,7 +18,10 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, extent,
 from deconfounded.deconf.core.drift import apart, choose_kept
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, final_belief
 from deconfounded.experts.rollout import Trials
 
@@ -79,7 +82,7 @@ def explain(
     return offline.eval(), online, policy
 
 
-def fit(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
+def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
     rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
     trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
@@ -138,3 +141,29 @@ def synthesise(
         obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
     obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))
     return Batch(obs, action, next_obs, torch.ones(len(draws), n, len(steps), device=draws.device))
+
+
+@uses(
+    "demonstrations",
+    cost=7,
+    on_control=OfflineConfig(),
+    on_bandit=OfflineConfig(
+        latent=5,
+        offline_batch=64,
+        offline_steps=100,
+        beta=5e-3,
+        shortest=1.0,
+        online_batch=64,
+        online_steps=6400,
+        synthetic=2000,
+        refresh=200,
+        random_share=1.0,
+        learning_rate=3e-3,
+    ),
+    smoke={"offline_updates": 300, "online_updates": 300},
+    smoke_bandit={"offline_updates": 300, "online_updates": 300},
+    many=lambda config: {"latent": SPACIOUS, "learning_rate": 2e-3},
+)
+def fit(given: Given) -> DeconfoundedAgent:
+    """Algorithm 3."""
+    return train(given.demonstrations, given.config, given.rngs, given.monitor)

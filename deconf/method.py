@@ -1,0 +1,116 @@
+"""What a method declares: the data that it uses, its version, and its amounts by kind of task and by preset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from gymnasium import spaces
+
+from deconfounded.deconf.core.sizes import MANY, WIDE
+from deconfounded.envs.task import InputError, Task
+from deconfounded.experts.rollout import Agent
+
+if TYPE_CHECKING:
+    from deconfounded.deconf.given import Given
+
+USES = {
+    "demonstrations": "expert trials, without theta",
+    "exploration": "roll-outs of a behaviour that is blind to theta",
+    "queries": "what the expert would do at each step of such a roll-out",
+    "theta": "the theta of each demonstration, in training",
+}
+ENVIRONMENT = "environment"  # what evaluation steps, and the expert: for the suite's own references alone
+
+Ways = Mapping[str, Callable[[Any], Agent]]
+"""Further ways of deploying a trained agent, by name."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method's declaration, made by `uses`.
+
+    uses: of USES. version: raised by hand when the method's numbers change. cost: the CPU seconds of training, about,
+    where blind BC has 1; for the remaining time of a run alone. on_control, on_bandit: its configuration where
+    actions are continuous, and where they are discrete (None: the same). smoke, smoke_bandit: changes to these in the
+    preset `smoke`; paper: its configuration on the bandit in the preset `paper`. many: changes where much is observed,
+    from the configuration. ways: further ways of deploying its agent, each scored. exact: an exact reference policy.
+    reference: path/file.py:function of a method from outside.
+    """
+
+    uses: tuple[str, ...]
+    version: int = 1
+    cost: int = 4
+    on_control: Any = None
+    on_bandit: Any = None
+    smoke: Mapping[str, Any] = field(default_factory=dict)
+    smoke_bandit: Mapping[str, Any] = field(default_factory=dict)
+    paper: Any = None
+    many: Callable[[Any], dict[str, Any]] | None = None
+    ways: Ways = field(default_factory=dict)
+    exact: bool = False
+    reference: str = ""
+
+    @property
+    def learned(self) -> bool:
+        """Whether it is trained, on data."""
+        return bool(self.uses) and ENVIRONMENT not in self.uses
+
+    @property
+    def tier(self) -> str:
+        """The paper's tier: 1, demonstrations; 2, exploration too; 3, queries of the expert. Or what else it sees."""
+        if not self.learned:
+            return "sees theta" if self.uses and not self.exact else "reference"
+        if "theta" in self.uses:
+            return "sees theta"
+        return "3" if "queries" in self.uses else "2" if "exploration" in self.uses else "1"
+
+    def amounts(self, preset: str, task: Task, device: str) -> dict[str, Any]:
+        """Its configuration on a task, under a preset, as plain values; empty if it has none."""
+        discrete = isinstance(task.action_space, spaces.Discrete)
+        config = self.on_bandit if discrete and self.on_bandit is not None else self.on_control
+        if config is None:
+            return {}
+        if preset == "smoke":
+            config = replace(config, **(self.smoke_bandit if discrete else self.smoke))
+        if preset == "paper" and discrete and self.paper is not None:
+            config = self.paper
+        values = asdict(config)
+        given: dict[str, Any] = {"device": device, "drifts": task.drifts}
+        if len(task.observation) >= MANY:
+            given |= {"width": WIDE, **(self.many(config) if self.many else {})}
+        return values | {key: value for key, value in given.items() if key in values}
+
+    def config(self, values: Mapping[str, Any]) -> Any:
+        """The configuration of these values; None if the method has none."""
+        return None if self.on_control is None else type(self.on_control)(**values)
+
+
+Fit = TypeVar("Fit", bound="Callable[[Given], Agent]")
+
+
+def uses(*kinds: str, **declared: Any) -> Callable[[Fit], Fit]:
+    """Declare a method: `@uses("demonstrations")` above `def fit(given: Given) -> Agent`.
+
+    kinds: some of USES. declared: further fields of Method, which stands in `fit.method`. Raises InputError for
+    anything else.
+    """
+    check_uses(kinds)
+    try:
+        method = Method(kinds, **declared)
+    except TypeError:
+        fields = ", ".join(name for name in Method.__dataclass_fields__ if name != "uses")
+        raise InputError(f"a method declares {', '.join(declared)}; it may declare {fields}") from None
+
+    def declare(fit: Fit) -> Fit:
+        fit.method = method  # type: ignore[attr-defined]
+        return fit
+
+    return declare
+
+
+def check_uses(kinds: Iterable[str]) -> None:
+    """Raises InputError for what is neither one of USES nor ENVIRONMENT."""
+    if wrong := [kind for kind in kinds if kind not in (*USES, ENVIRONMENT)]:
+        raise InputError(f"a method uses {wrong[0]!r}; it may use {', '.join(USES)}")

@@ -1,0 +1,46 @@
+"""Deconfounded imitation whose latent is one of K values: a mixture of K dynamics models, with an exact posterior."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
+from deconfounded.deconf.methods import deconfounded
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
+
+ON_BANDIT = DeconfoundedConfig(
+    model="discrete",
+    latent=10,
+    rounds=2,
+    inference_updates=400,
+    inference_batch=64,
+    inference_rate=3e-3,
+    shortest=1.0,
+    imitation_updates=200,
+    final_updates=800,
+    imitation_rate=3e-3,
+    random_share=1.0,
+)
+
+
+@uses(
+    *("demonstrations", "exploration"),
+    cost=7,
+    on_control=replace(
+        deconfounded.ON_CONTROL,
+        model="discrete",
+        latent=16,
+        inference_updates=800,
+        inference_batch=8,
+        inference_rate=1e-2,
+    ),
+    on_bandit=ON_BANDIT,
+    smoke=deconfounded.SMOKE,
+    smoke_bandit=deconfounded.SMOKE_BANDIT,
+    paper=replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40),
+    ways={"episode": deconfounded.once},
+)
+def fit(given: Given) -> DeconfoundedAgent:
+    """Algorithm 1 with that belief."""
+    return deconfounded.fit(given)

@@ -1,0 +1,50 @@
+"""Reference policies: nothing is learned. They are handed the environments that evaluation steps, and the expert.
+
+The exact ones hold the posterior of theta on a grid: `conditional` takes its own actions as evidence, Eq. (2), and
+`interventional` does not, Eq. (4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent
+
+
+@dataclass(frozen=True)
+class ExactConfig:
+    """grid: values of each latent; 0 where all latents are categories, which have values of their own."""
+
+    grid: int = 21
+
+
+def _exact(given: Given, conditional: bool) -> ExactAgent:
+    env, expert = given.environment
+    return ExactAgent(env, expert, conditional, given.config.grid)
+
+
+@uses("environment", cost=1, exact=True, on_control=ExactConfig(), on_bandit=ExactConfig(0), smoke={"grid": 9})
+def conditional(given: Given) -> ExactAgent:
+    """The exact conditional policy: the optimum of naive cloning."""
+    return _exact(given, True)
+
+
+@uses("environment", cost=1, exact=True, on_control=ExactConfig(), on_bandit=ExactConfig(0), smoke={"grid": 9})
+def interventional(given: Given) -> ExactAgent:
+    """The exact interventional policy, by posterior sampling: the optimum of deconfounded imitation."""
+    return _exact(given, False)
+
+
+@uses("environment", cost=1)
+def expert(given: Given) -> ExpertAgent:
+    """The expert itself, which sees theta: the one of every score."""
+    return ExpertAgent(*given.environment)
+
+
+@uses(cost=1)
+def random(given: Given) -> RandomAgent:
+    """Uniform actions: the zero of every score."""
+    return RandomAgent(given.action_space)
