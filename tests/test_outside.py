@@ -407,6 +407,7 @@ HUNTER = """
 import collections, sys, types
 
 OURS = ("deconfounded", "outside_", "__mp_main__", "tests")
+BOUND = ("method-wrapper", "builtin_function_or_method", "wrapper_descriptor", "method_descriptor", "getset_descriptor")
 
 def hunt(start, skipped=(), limit=100_000):
     # Every number within reach, nearest first: attributes, containers, closures, globals, frames, our modules.
@@ -433,6 +434,8 @@ def hunt(start, skipped=(), limit=100_000):
             continue
         else:
             names = {*dir(thing), "__dict__", "__closure__", "__globals__", "__self__", "cell_contents"}
+            if type(thing).__name__ in BOUND:  # without end: each has methods of its own
+                names = {"__self__"}
             for name in names - {*skipped}:
                 try:
                     queue.append(getattr(thing, name))
