@@ -109,12 +109,10 @@ State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 class Agent(ABC):
     """Something that acts in N trials side by side, from its own history alone."""
 
-    @abstractmethod
-    def begin(self, n: int) -> None:
+    def begin(self, n: int) -> None:  # noqa: B027 (agents without memory need nothing here)
         """Forget everything: n new trials start, each under a theta of its own."""
 
-    @abstractmethod
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027 (nor those without random numbers)
         """An episode starts, the first of new trials or the next of the same: theta stays.
 
         rngs: its random numbers, one generator for each of equal groups of trials.
@@ -149,9 +147,6 @@ class ExpertAgent(Agent):
     def __init__(self, env: BatchEnv, expert: Expert, told: Array | None = None) -> None:
         self.env, self.expert, self.told = env, expert, told
 
-    def begin(self, n: int) -> None:
-        pass
-
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
 
@@ -164,9 +159,6 @@ class RandomAgent(Agent):
 
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
-
-    def begin(self, n: int) -> None:
-        pass
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
