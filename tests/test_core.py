@@ -21,7 +21,7 @@ from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
-from deconfounded.deconf.core.models import DiscreteModel, VariationalModel
+from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
 from deconfounded.deconf.core.nets import ActionHead, Embedding, Linear, Scaler, scalers
 from deconfounded.deconf.equations import (
     belief_update,
@@ -534,7 +534,7 @@ class TestMethods:
         )
         rng = np.random.default_rng(0)
         agent = deconfounded.train(trials, explorer("tilted_cartpole", 32, rng), config, rng)
-        mean = agent.model.point(deconfounded.final_belief(agent.model, Batch.of(trials, 1)))[0]
+        mean = agent.model.point(final_belief(agent.model, Batch.of(trials, 1)))[0]
         inputs = np.c_[mean.numpy(), np.ones(len(mean))]
         residual = theta - inputs @ np.linalg.lstsq(inputs, theta, rcond=None)[0]
         assert 1 - (residual**2).mean() / theta.var() > 0.5

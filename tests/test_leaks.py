@@ -236,7 +236,7 @@ class TestLatents:
     def test_training_draws_theta_hat(self, kind: str) -> None:
         """The same update twice: only the noise of theta_hat differs, and so does the loss."""
         model, data, draws, agent = make(kind)
-        belief = deconfounded.final_belief(model, data)
+        belief = models.final_belief(model, data)
         if kind == "discrete":
             belief = torch.full_like(belief, 1 / 3)
         first, second = (agent.loss(data, belief, None, draws) for _ in range(2))

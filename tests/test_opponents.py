@@ -30,7 +30,7 @@ from deconfounded.deconf.methods.naive_dropout import DroppingAgent
 from deconfounded.deconf.methods.naive_obs import ObsAgent, ObsMemory
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
-from deconfounded.deconf.methods.practice import WholePolicy
+from deconfounded.deconf.methods.practice import WholePolicy, new_ppo
 from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from deconfounded.experts.train import train
@@ -347,7 +347,7 @@ class TestGail:
         """Step by step the same distribution of actions as Stable-Baselines3's policy; to 1e-5."""
         for task in (CONTROL, "bandit"):
             (env, _), config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
-            ppo = gail._ppo(env, config, 0)
+            ppo = new_ppo(env, config, 0)
             trials = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0).trials
             signature = Signature.of(trials)
             obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))

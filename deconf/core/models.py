@@ -210,3 +210,10 @@ def new(
     if kind not in BELIEFS:
         raise InputError(f"model was {kind!r}; it must be one of {', '.join(BELIEFS)}, discrete")
     return VariationalModel(kind, latent, width, signature, obs, change, draws)
+
+
+@torch.no_grad()
+def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
+    """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
+    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
+    return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))

@@ -11,13 +11,13 @@ from torch import Tensor
 
 from deconfounded.deconf.core.agents import Monitor, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
-from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.diagnosis.learned_env import known_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
 from deconfounded.deconf.methods.cloning import CloningConfig
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig, final_belief
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Trials

@@ -51,7 +51,7 @@ class Amounts:
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
     exploring: DeconfoundedConfig = field(
-        default_factory=lambda: DeconfoundedConfig(inference_updates=2000, inference_rate=3e-3, shortest=1 / 4)
+        default_factory=lambda: DeconfoundedConfig(inference_updates=2000, shortest=1 / 4)
     )  # of shorter sets the bandit's latent was ignored for too long
 
     def fitting(self, observed: int) -> Amounts:

@@ -13,6 +13,7 @@ from deconfounded.deconf.core.nets import Adam, Scaler
 from deconfounded.deconf.methods.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 
 Kind = TypeVar("Kind", bound=LearnedAgent)
+Recurrent = TypeVar("Recurrent", bound=RecurrentAgent)
 
 
 class Config(Protocol):
@@ -66,6 +67,14 @@ def clone(
     return agent
 
 
-def by_chunks(config: RecurrentConfig) -> Callable[[RecurrentAgent, int, Monitor], Cloner]:
-    """Teaches as naive_rnn is taught."""
-    return lambda agent, steps, monitor: Cloner(agent, config, steps, monitor)
+def clone_by_chunks(
+    kind: type[Recurrent], trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None
+) -> Recurrent:
+    """Clone with an agent of that kind, an update a chunk of a trial: see `clone`."""
+
+    def start(signature: Signature, obs: Scaler, draws: Draws) -> Recurrent:
+        agent = kind.new(config.width, signature, obs, draws)
+        agent.configure(config)
+        return agent  # type: ignore[return-value]
+
+    return clone(trials, config, rng, start, lambda agent, steps, watch: Cloner(agent, config, steps, watch), monitor)

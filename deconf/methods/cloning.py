@@ -87,3 +87,9 @@ def train(
         optimizer.step(loss)
         monitor.update(update + 1, config.updates, {"imitation": loss.mean().item()}, agent)
     return agent
+
+
+AMOUNTS: dict[str, Any] = {
+    **{"cost": 1, "on_control": CloningConfig(), "on_bandit": CloningConfig(updates=500)},
+    **{"smoke": {"updates": 400}, "smoke_bandit": {"updates": 400}},
+}

@@ -165,5 +165,5 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     smoke_bandit={"updates": 500, "rounds": 4},
 )
 def fit(given: Given) -> DaggerAgent:
-    """The same, on what is given."""
+    """Rounds of labelled roll-outs and imitation."""
     return train(given.query, given.config, given.rngs, given.monitor)

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconfounded.deconf.core.drift import apart, choose_kept
-from deconfounded.deconf.core.models import LatentModel
+from deconfounded.deconf.core.models import LatentModel, final_belief
 from deconfounded.deconf.core.models import new as new_model
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.core.sizes import SPACIOUS
@@ -48,15 +48,15 @@ class DeconfoundedConfig:
     beta: float = 1e-3
     warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
-    inference_updates: int = 300  # a round
+    inference_updates: int = 500  # a round
     inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
     shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
     inference_steps: int | None = 1024  # of them, whose next observation is predicted; None: all
-    inference_rate: float = 1e-3
-    imitation_updates: int = 500  # a round
+    inference_rate: float = 3e-3
+    imitation_updates: int = 250  # a round
     final_updates: int = 2000  # of the policy, after the last round
     imitation_batch: int | None = 1024  # steps; None: all there are
-    imitation_rate: float = 1e-3
+    imitation_rate: float = 2e-3
     cooled: bool = True  # learning rates fall to 0 along a cosine
     # Use the explorations of all rounds; else each round's alone, with demonstrations drawn anew if there is a source.
     accumulate: bool = True
@@ -239,20 +239,6 @@ def train(
     return agent
 
 
-@torch.no_grad()
-def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
-    """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
-    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
-    return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))
-
-
-ON_CONTROL = DeconfoundedConfig(
-    inference_updates=500,
-    inference_rate=3e-3,
-    imitation_updates=250,
-    final_updates=2000,
-    imitation_rate=2e-3,
-)
 ON_BANDIT = DeconfoundedConfig(
     rounds=2,
     latent=5,
@@ -260,7 +246,6 @@ ON_BANDIT = DeconfoundedConfig(
     inference_updates=1200,
     inference_batch=64,
     inference_steps=3200,
-    inference_rate=3e-3,
     shortest=1.0,  # its trials are short, and on the beginnings of few the latent is ignored for too long
     imitation_updates=800,
     final_updates=3200,
@@ -287,8 +272,6 @@ PAPER = DeconfoundedConfig(  # appendix D and table 1; what they leave open is i
     fit_prior=False,
     random_share=1.0,
 )
-SMOKE = {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100}
-SMOKE_BANDIT = {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800}
 
 
 def many(config: DeconfoundedConfig) -> dict[str, Any]:
@@ -301,17 +284,15 @@ def once(agent: DeconfoundedAgent) -> DeconfoundedAgent:
     return DeconfoundedAgent(agent.model, agent.policy, "episode")
 
 
-@uses(
-    *("demonstrations", "exploration"),
-    cost=4,
-    on_control=ON_CONTROL,
-    on_bandit=ON_BANDIT,
-    smoke=SMOKE,
-    smoke_bandit=SMOKE_BANDIT,
-    paper=PAPER,
-    many=many,
-    ways={"episode": once},
-)
+USES = ("demonstrations", "exploration")
+FAMILY: dict[str, Any] = {  # of all methods that train so
+    "smoke": {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100},
+    "smoke_bandit": {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800},
+    "ways": {"episode": once},
+}
+
+
+@uses(*USES, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, many=many, **FAMILY)
 def fit(given: Given) -> DeconfoundedAgent:
     """Algorithm 1, on explorations of all rounds; or on each round's alone, with fresh demonstrations."""
     trials = given.demonstrations if given.config.accumulate else given.source

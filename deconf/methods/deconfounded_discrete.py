@@ -7,40 +7,27 @@ from dataclasses import replace
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded import FAMILY, USES, DeconfoundedAgent, DeconfoundedConfig
 
+ON_CONTROL = DeconfoundedConfig(
+    model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
+)
 ON_BANDIT = DeconfoundedConfig(
     model="discrete",
     latent=10,
     rounds=2,
     inference_updates=400,
     inference_batch=64,
-    inference_rate=3e-3,
     shortest=1.0,
     imitation_updates=200,
     final_updates=800,
     imitation_rate=3e-3,
     random_share=1.0,
 )
+PAPER = replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40)
 
 
-@uses(
-    *("demonstrations", "exploration"),
-    cost=7,
-    on_control=replace(
-        deconfounded.ON_CONTROL,
-        model="discrete",
-        latent=16,
-        inference_updates=800,
-        inference_batch=8,
-        inference_rate=1e-2,
-    ),
-    on_bandit=ON_BANDIT,
-    smoke=deconfounded.SMOKE,
-    smoke_bandit=deconfounded.SMOKE_BANDIT,
-    paper=replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40),
-    ways={"episode": deconfounded.once},
-)
+@uses(*USES, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **FAMILY)
 def fit(given: Given) -> DeconfoundedAgent:
     """Algorithm 1 with that belief."""
     return deconfounded.fit(given)

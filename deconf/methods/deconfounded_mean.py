@@ -199,5 +199,5 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     many=lambda config: {"latent": SPACIOUS},
 )
 def fit(given: Given) -> MeanAgent:
-    """The same, on what is given."""
+    """Rounds of exploration, inference and imitation."""
     return train(given.demonstrations, given.explore, given.config, given.rngs, given.monitor)

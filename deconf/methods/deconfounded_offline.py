@@ -16,13 +16,13 @@ from torch import Tensor
 from deconfounded.deconf.core.agents import Monitor, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, extent, listed, take
 from deconfounded.deconf.core.drift import apart, choose_kept
-from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, final_belief
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.experts.rollout import Trials
 
 

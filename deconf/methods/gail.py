@@ -11,9 +11,8 @@ after another, each with random numbers of its own; their discriminators are tra
 
 from __future__ import annotations
 
-import contextlib
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
@@ -34,8 +33,6 @@ from deconfounded.envs.task import InputError
 from deconfounded.experts.rollout import Trials
 
 if TYPE_CHECKING:
-    from sb3_contrib import RecurrentPPO
-
     from deconfounded.deconf.methods.practice import Practice
 
 Space = spaces.Box | spaces.Discrete
@@ -184,33 +181,6 @@ class Discriminator(nn.Module):
         return one
 
 
-@contextlib.contextmanager
-def numbers(seed: int) -> Iterator[None]:
-    """Stable-Baselines3 draws from torch's and numpy's global generators: seeded here, and put back after."""
-    before = np.random.get_state()  # noqa: NPY002
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        np.random.seed(seed)  # noqa: NPY002
-        try:
-            yield
-        finally:
-            np.random.set_state(before)  # noqa: NPY002
-
-
-class Player:
-    """RecurrentPPO of one seed: what of it is to be kept in a checkpoint."""
-
-    def __init__(self, ppo: RecurrentPPO) -> None:
-        self.ppo = ppo
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"policy": self.ppo.policy.state_dict(), "adam": self.ppo.policy.optimizer.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.ppo.policy.load_state_dict(state["policy"])
-        self.ppo.policy.optimizer.load_state_dict(state["adam"])
-
-
 def train(
     trials: Trials, environments: Open, space: Space, config: GailConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> GailAgent:
@@ -225,6 +195,8 @@ def train(
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     if find_spec("sb3_contrib") is None:
         raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
+    from deconfounded.deconf.methods.practice import Player, Practice, new_ppo, numbers
+
     rngs, monitor, signature = listed(rng), monitor or Monitor(), Signature.of(trials)
     seeds, draws = len(rngs), Draws(rngs, config.device)
     expert = Batch.of(trials, seeds, config.device)
@@ -235,12 +207,10 @@ def train(
     mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
 
     def practice(i: int) -> Practice:
-        from deconfounded.deconf.methods.practice import Practice
-
         reward = discriminator.of_seed(i).reward
         return Practice(environments(i, config.envs), space, mean[i], std[i], reward)
 
-    players = [Player(_ppo(practice(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
+    players = [Player(new_ppo(practice(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
     named = {f"player{i}": player for i, player in enumerate(players)}
     checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
     begin = (checkpoint.load() or {"round": 0})["round"]
@@ -266,36 +236,6 @@ def train(
     return agent
 
 
-def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
-    """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
-    from sb3_contrib import RecurrentPPO
-    from stable_baselines3.common.logger import Logger
-
-    from deconfounded.deconf.methods.practice import WholePolicy
-
-    widths = [config.width, config.width]
-    policy = {
-        "lstm_hidden_size": config.width,
-        "net_arch": {"pi": widths, "vf": widths},
-        "activation_fn": nn.ReLU,
-        "log_std_init": -0.5,
-    }
-    with numbers(seed):
-        ppo = RecurrentPPO(
-            WholePolicy,
-            env,
-            learning_rate=config.policy_rate,
-            n_steps=config.steps,
-            batch_size=config.minibatch,
-            n_epochs=config.epochs,
-            gamma=config.gamma,
-            policy_kwargs=policy,
-            device=config.device,
-        )
-    ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
-    return ppo
-
-
 @uses(
     *("demonstrations", "exploration"),
     cost=60,
@@ -307,6 +247,6 @@ def _ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
     smoke_bandit={"rounds": 20},
 )
 def fit(given: Given) -> GailAgent:
-    """The same, on what is given."""
+    """Rounds of practice and discrimination."""
     data, space = given.demonstrations, given.action_space
     return train(data, given.environments, space, given.config, given.rngs, given.monitor)

@@ -11,13 +11,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import by_chunks, clone
+from deconfounded.deconf.methods.clones import clone_by_chunks
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
 
@@ -44,16 +42,12 @@ class DropoutConfig(RecurrentConfig):
 class DroppingAgent(RecurrentAgent):
     """Acts on all of its history, having learned not to count on its actions."""
 
+    memory_kind = DroppingMemory
     memory: DroppingMemory
     dropout: float = 0.0  # while it is trained
-    noise: Draws
 
-    @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> DroppingAgent:
-        memory = DroppingMemory(width, signature, obs, draws)
-        agent = DroppingAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
-        agent.noise = draws
-        return agent
+    def configure(self, config: DropoutConfig) -> None:
+        self.dropout = config.dropout
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         if self.dropout:
@@ -69,17 +63,6 @@ class DroppingAgent(RecurrentAgent):
         return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-def train(trials: Source, config: DropoutConfig, rng: Rngs, monitor: Monitor | None = None) -> DroppingAgent:
-    """Clone. Trials are in as many equal groups as there are generators in rng."""
-
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> DroppingAgent:
-        agent = DroppingAgent.new(config.width, signature, obs, draws)
-        agent.dropout = config.dropout
-        return agent
-
-    return clone(trials, config, rng, start, by_chunks(config), monitor)
-
-
 @uses(
     "demonstrations",
     cost=2,
@@ -89,5 +72,5 @@ def train(trials: Source, config: DropoutConfig, rng: Rngs, monitor: Monitor | N
     smoke_bandit={"updates": 500},
 )
 def fit(given: Given) -> DroppingAgent:
-    """The same, on what is given."""
-    return train(given.source, given.config, given.rngs, given.monitor)
+    """Clone the demonstrations."""
+    return clone_by_chunks(DroppingAgent, given.source, given.config, given.rngs, given.monitor)

@@ -9,13 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import by_chunks, clone
+from deconfounded.deconf.methods.clones import clone_by_chunks
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
 
@@ -29,19 +27,7 @@ class ObsMemory(GruMemory):
 class ObsAgent(RecurrentAgent):
     """Acts on observations, past and present."""
 
-    @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> ObsAgent:
-        memory = ObsMemory(width, signature, obs, draws)
-        return ObsAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
-
-
-def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> ObsAgent:
-    """Clone. Trials are in as many equal groups as there are generators in rng."""
-
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> ObsAgent:
-        return ObsAgent.new(config.width, signature, obs, draws)
-
-    return clone(trials, config, rng, start, by_chunks(config), monitor)
+    memory_kind = ObsMemory
 
 
 @uses(
@@ -53,5 +39,5 @@ def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor |
     smoke_bandit={"updates": 500},
 )
 def fit(given: Given) -> ObsAgent:
-    """The same, on what is given."""
-    return train(given.source, given.config, given.rngs, given.monitor)
+    """Clone the demonstrations."""
+    return clone_by_chunks(ObsAgent, given.source, given.config, given.rngs, given.monitor)

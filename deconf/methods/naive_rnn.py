@@ -11,13 +11,13 @@ from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Rngs, Source
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import by_chunks, clone
+from deconfounded.deconf.methods.clones import clone_by_chunks
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
 
 def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
-    """Clone the expert's trials, or what draws them: see `clone`."""
-    return clone(trials, config, rng, lambda *kind: RecurrentAgent.new(config.width, *kind), by_chunks(config), monitor)
+    """Clone the expert's trials, or what draws them."""
+    return clone_by_chunks(RecurrentAgent, trials, config, rng, monitor)
 
 
 @uses(
@@ -30,5 +30,5 @@ def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor |
     paper=RecurrentConfig(width=256, updates=5000, batch=100, chunk=100, learning_rate=1e-3, cooled=False),
 )
 def fit(given: Given) -> RecurrentAgent:
-    """The same, on what is given."""
+    """Clone the demonstrations."""
     return train(given.source, given.config, given.rngs, given.monitor)

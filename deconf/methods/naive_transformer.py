@@ -226,5 +226,5 @@ def train(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor
     smoke_bandit={"updates": 200},
 )
 def fit(given: Given) -> TransformerAgent:
-    """The same, on what is given."""
+    """Clone the demonstrations."""
     return train(given.source, given.config, given.rngs, given.monitor)

@@ -5,17 +5,10 @@ from __future__ import annotations
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import CloningConfig, MemorylessAgent
+from deconfounded.deconf.methods.cloning import AMOUNTS, MemorylessAgent
 
 
-@uses(
-    *("demonstrations", "theta"),
-    cost=1,
-    on_control=CloningConfig(),
-    on_bandit=CloningConfig(updates=500),
-    smoke={"updates": 400},
-    smoke_bandit={"updates": 400},
-)
+@uses("demonstrations", "theta", **AMOUNTS)
 def fit(given: Given) -> MemorylessAgent:
     """Clone the expert step by step, given theta."""
     trials, theta = given.demonstrations, given.theta

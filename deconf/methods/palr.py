@@ -13,14 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Monitor
-from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, take_steps
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.data import Batch, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import by_chunks, clone
+from deconfounded.deconf.methods.clones import clone_by_chunks
 from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
 
 
@@ -58,15 +55,9 @@ class PalrAgent(RecurrentAgent):
     """naive_rnn's; what is new is its loss."""
 
     config: PalrConfig | None = None  # while it is trained
-    noise: Draws
 
-    @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
-        agent = PalrAgent(
-            GruMemory(width, signature, obs, draws), ActionHead(width + signature.obs, width, signature, draws)
-        )
-        agent.noise = draws
-        return agent
+    def configure(self, config: PalrConfig) -> None:
+        self.config = config
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         states = self.memory(batch, state)
@@ -95,17 +86,6 @@ class PalrAgent(RecurrentAgent):
         return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-def train(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None = None) -> PalrAgent:
-    """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
-
-    def start(signature: Signature, obs: Scaler, draws: Draws) -> PalrAgent:
-        agent = PalrAgent.new(config.width, signature, obs, draws)
-        agent.config = config
-        return agent
-
-    return clone(trials, config, rng, start, by_chunks(config), monitor)
-
-
 @uses(
     "demonstrations",
     cost=4,
@@ -115,5 +95,5 @@ def train(trials: Source, config: PalrConfig, rng: Rngs, monitor: Monitor | None
     smoke_bandit={"updates": 500},
 )
 def fit(given: Given) -> PalrAgent:
-    """The same, on what is given."""
-    return train(given.source, given.config, given.rngs, given.monitor)
+    """Clone the demonstrations."""
+    return clone_by_chunks(PalrAgent, given.source, given.config, given.rngs, given.monitor)

@@ -1,18 +1,25 @@
-"""To practise, with Stable-Baselines3: environments that are blind to theta, a whole trial as one episode; a policy."""
+"""The side of Stable-Baselines3 of GAIL: theta-blind environments, whose episode is a whole trial, and its policy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
+from sb3_contrib import RecurrentPPO
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
+from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from deconfounded.deconf.given import Environments
 from deconfounded.experts.sb3 import Bare
+
+if TYPE_CHECKING:
+    from deconfounded.deconf.methods.gail import GailConfig
 
 Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
 """Of observations [N, O], actions [N, A] and what followed [N, O]: [N]. The task's own reward is told to nobody."""
@@ -83,3 +90,55 @@ class WholePolicy(RecurrentActorCriticPolicy):
         kept = 1 - starts[None, :, :1]
         starts[:, 0] = 0
         return RecurrentActorCriticPolicy._process_sequence(features, (kept * hidden, kept * cell), starts, lstm)
+
+
+@contextlib.contextmanager
+def numbers(seed: int) -> Iterator[None]:
+    """Stable-Baselines3 draws from torch's and numpy's global generators: seeded here, and put back after."""
+    before = np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002
+        try:
+            yield
+        finally:
+            np.random.set_state(before)  # noqa: NPY002
+
+
+class Player:
+    """RecurrentPPO of one seed: what of it is to be kept in a checkpoint."""
+
+    def __init__(self, ppo: RecurrentPPO) -> None:
+        self.ppo = ppo
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"policy": self.ppo.policy.state_dict(), "adam": self.ppo.policy.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.ppo.policy.load_state_dict(state["policy"])
+        self.ppo.policy.optimizer.load_state_dict(state["adam"])
+
+
+def new_ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
+    """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
+    widths = [config.width, config.width]
+    policy = {
+        "lstm_hidden_size": config.width,
+        "net_arch": {"pi": widths, "vf": widths},
+        "activation_fn": nn.ReLU,
+        "log_std_init": -0.5,
+    }
+    with numbers(seed):
+        ppo = RecurrentPPO(
+            WholePolicy,
+            env,
+            learning_rate=config.policy_rate,
+            n_steps=config.steps,
+            batch_size=config.minibatch,
+            n_epochs=config.epochs,
+            gamma=config.gamma,
+            policy_kwargs=policy,
+            device=config.device,
+        )
+    ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
+    return ppo

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -37,15 +37,23 @@ class RecurrentAgent(LearnedAgent):
     the expert's small action noise from its own error, and clones less well.
     """
 
+    memory_kind: ClassVar[type[GruMemory]] = GruMemory
+    noise: Draws
+
     def __init__(self, memory: GruMemory, policy: ActionHead) -> None:
         super().__init__(policy)
         self.memory = memory
 
-    @staticmethod
-    def new(width: int, signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
-        """One that knows nothing yet."""
-        memory = GruMemory(width, signature, obs, draws)
-        return RecurrentAgent(memory, ActionHead(width + signature.obs, width, signature, draws))
+    @classmethod
+    def new(cls, width: int, signature: Signature, obs: Scaler, draws: Draws) -> Self:
+        """One that knows nothing yet; `noise` is for its training."""
+        memory = cls.memory_kind(width, signature, obs, draws)
+        agent = cls(memory, ActionHead(width + signature.obs, width, signature, draws))
+        agent.noise = draws
+        return agent
+
+    def configure(self, config: Any) -> None:
+        """Take what training needs of a configuration, beside the width."""
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:

@@ -171,6 +171,6 @@ def along(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
     smoke_bandit={"updates": 500, "rounds": 2, "teacher_updates": 400},
 )
 def fit(given: Given) -> RmaAgent:
-    """The same, on what is given."""
+    """Clone the teacher; then rounds of the student's roll-outs."""
     theta = given.theta
     return train(given.demonstrations, theta, given.explore_with_theta, given.config, given.rngs, given.monitor)
