@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import queue
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +25,15 @@ from deconfounded.experts.rollout import Agent
 
 def settings(name: str, fresh: bool) -> Any:
     """Twenty-odd updates."""
-    model = DeconfoundedConfig(
-        width=16, rounds=5, inference_updates=2, imitation_updates=2, inference_batch=4, final_updates=4
-    )
-    return replace(
-        preset("smoke", envs.get(name), "cpu"),
-        expert_trials=8,
-        explore_trials=4,
-        eval_trials=8,
-        fresh=8 if fresh else 0,
-        deconfounded=replace(model, accumulate=not fresh),
-        naive=RecurrentConfig(width=16, updates=12, chunk=300, batch=4),
-    )
+    few = {"width": 16, "rounds": 5, "inference_updates": 2, "imitation_updates": 2, "inference_batch": 4}
+    model, naive = DeconfoundedConfig(**few, final_updates=4, accumulate=not fresh), RecurrentConfig(16, 12, 4, 300)
+    configs = {
+        "deconfounded": asdict(model),
+        "deconfounded_gru": asdict(replace(model, model="gru")),
+        "naive_rnn": asdict(naive),
+    }
+    amounts = {"expert_trials": 8, "explore_trials": 4, "eval_trials": 8, "fresh": 8 if fresh else 0}
+    return replace(preset("smoke", envs.get(name), "cpu"), **amounts, configs=configs)
 
 
 KINDS = (
