@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import jobs, progress, scheduler
+from deconfounded.benchmarks.engine import benchmark, jobs, progress, scheduler, store
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.studies import paper
 from deconfounded.benchmarks.studies.paper import FigureJob
+from deconfounded.deconf.methods import naive_rnn, references
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
 from deconfounded.experts.rollout import Agent
@@ -122,6 +124,53 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert results["wall_s"] > 0
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + len(finished)
     assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("figure2", "figure3", "tiers"))
+
+
+@pytest.mark.parametrize("edited", ["method", "task", "amount"])
+def test_a_checkpoint_of_other_code_is_refused(
+    edited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that was begun under another version of the method or the task, or other amounts, is not gone on with."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
+    job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
+    begun = CurveMonitor(job, 0.8)
+    begun.save(lambda: {"done": 3})
+    assert CurveMonitor(job, 0.8).load() == {"done": 3}
+    if edited == "method":
+        monkeypatch.setattr(naive_rnn.fit, "method", replace(METHODS["naive_rnn"], version=9))
+    elif edited == "task":
+        monkeypatch.setattr(type(envs.get("bandit")), "version", 9)
+    else:
+        job = replace(job, preset=job.preset.configured("naive_rnn", updates=13))
+    assert CurveMonitor(job, 0.8).load() is None
+    assert "was begun with other code or amounts; training begins again" in capsys.readouterr().out
+
+
+def test_an_edit_during_a_run_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A result whose identity changed under it is not written; where only our files changed, its commit is marked."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "commit", lambda: "abc")
+    job = BenchmarkJob("bandit", settings("bandit", False), "random", (0,), tmp_path)
+    job.run()
+    assert store.read(job.file(0))["meta"]["commit"] == "abc"  # type: ignore[index]
+    stamps = iter((1, 2))
+    monkeypatch.setattr(jobs, "last_edit", lambda: next(stamps))
+    job.run()
+    assert store.read(job.file(0))["meta"]["commit"] == "abc+"  # type: ignore[index]
+    job.file(0).unlink()
+    monkeypatch.undo()
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    evaluate = benchmark.evaluate
+
+    def edit(*given: Any) -> Any:
+        monkeypatch.setattr(references.random, "method", replace(METHODS["random"], version=9))
+        return evaluate(*given)
+
+    monkeypatch.setattr(benchmark, "evaluate", edit)
+    with pytest.raises(envs.InputError, match=r"^files that random is made of were edited while it ran; run it again$"):
+        job.run()
+    assert not job.file(0).exists()
 
 
 def test_damaged_checkpoint_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

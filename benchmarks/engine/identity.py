@@ -18,6 +18,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from deconfounded import envs
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.sources import ROOT
@@ -87,8 +89,24 @@ def versions() -> dict[str, str]:
 
 
 def machine(device: str) -> str:
-    """What it ran on."""
-    return f"{platform.machine()}, {os.cpu_count()} cores, trained on {device}"
+    """What it runs on: the CPU and its vector extensions, on which bits depend, BLAS and threads."""
+    import torch
+
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]["name"]  # type: ignore[index]
+    vectors, threads = torch.backends.cpu.get_cpu_capability(), torch.get_num_threads()
+    mkl = "MKL" if torch.backends.mkl.is_available() else "no MKL"
+    cpu = f"{_cpu()}, {vectors}, {os.cpu_count()} cores, torch threads: {threads}"
+    return f"{cpu}; numpy with {blas}, torch with {mkl}; trained on {device}"
+
+
+@cache
+def _cpu() -> str:
+    """The name of its model, or of its kind where the system does not say."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 @cache

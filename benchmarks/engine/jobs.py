@@ -22,6 +22,7 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import tick
+from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.agents import Monitor, Training
 from deconfounded.envs.files import write_atomically
 from deconfounded.experts.rollout import Agent
@@ -76,7 +77,11 @@ class Job(ABC):
         i = self.seeds.index(seed)
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
-        known = {"identity": identity(self), "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
+        if monitor.identity != json.loads(json.dumps(identity(self))):
+            raise envs.InputError(f"files that {self.method} is made of were edited while it ran; run it again")
+        known = {"identity": monitor.identity, "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
+        if monitor.last_edit != last_edit() and known["commit"]:  # not the code of that commit alone
+            known["commit"] = f"{known['commit'].rstrip('+')}+"
         known |= {"reference": self.about.reference, "arrays": list(arrays)}
         whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
@@ -132,6 +137,7 @@ class JobMonitor(Monitor):
 
     def __init__(self, job: Job, share: float) -> None:
         super().__init__()
+        self.identity, self.last_edit = json.loads(json.dumps(identity(job))), last_edit()
         self.ticks, self.share, self.told = job.ticks, share, 0
         self.device = job.preset.device
         self.file = job.checkpoint
@@ -164,7 +170,7 @@ class JobMonitor(Monitor):
         if time.monotonic() - self.saved >= SAVE_EVERY_S:
             buffer = io.BytesIO()
             known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
-            torch.save({"training": state(), **known}, buffer)
+            torch.save({"training": state(), "identity": json.dumps(self.identity), **known}, buffer)
             write_atomically(self.file, hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
             self.saved = time.monotonic()
 
@@ -174,6 +180,9 @@ class JobMonitor(Monitor):
             if hashlib.sha256(content[32:]).digest() != content[:32]:
                 return None
             state = torch.load(io.BytesIO(content[32:]), self.device, weights_only=True)
+            if state["identity"] != json.dumps(self.identity):
+                print(f"{self.file.name} was begun with other code or amounts; training begins again")
+                return None
         except Exception:  # missing, or of other code, which torch tells in many ways: begin again
             return None
         self.kept, self.before, self.budget = state["kept"], state["spans"], state["budget"]
