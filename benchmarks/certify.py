@@ -28,12 +28,13 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
 from deconfounded.deconf.methods import cloning
-from deconfounded.envs.files import check_folder, save_figure, write_json
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials

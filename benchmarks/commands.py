@@ -14,8 +14,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
-from deconfounded.envs import outside
-from deconfounded.envs.files import check_folder
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
     from deconfounded.benchmarks.engine.jobs import Job

@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
-        from deconfounded.envs.task import InputError
+        from deconfounded.envs.support.errors import InputError
 
         raise InputError(f"{message}; see --help")
 
@@ -133,7 +133,7 @@ class Stoppable:
 
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
     """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
-    from deconfounded.envs.task import InputError
+    from deconfounded.envs.support.errors import InputError
 
     escape_output()
     signals = Stoppable()

@@ -17,7 +17,7 @@ from importlib.util import find_spec
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
-from deconfounded.envs.files import check_folder
+from deconfounded.envs.support.files import check_folder
 from deconfounded.experts import datasets, policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.envs.files import write_json
+from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.deconf.diagnosis.diagnose import Diagnosis

@@ -16,7 +16,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine import store
 from deconfounded.benchmarks.output import report
-from deconfounded.envs.files import read_sealed
+from deconfounded.envs.support.files import read_sealed
 
 
 def main() -> None:

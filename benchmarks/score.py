@@ -21,7 +21,7 @@ from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
-from deconfounded.envs.files import check_file, write_json
+from deconfounded.envs.support.files import check_file, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials

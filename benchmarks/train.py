@@ -19,7 +19,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.files import check_file, write_atomically, write_json
+from deconfounded.envs.support.files import check_file, write_atomically, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
 

@@ -22,7 +22,7 @@ from deconfounded.benchmarks.console import ROOT, Parser, run_command
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 
 COMPARED = ("commit", "machine", "expert", "outside", "protocol", "task_version", "method_version", "expert_version")
 

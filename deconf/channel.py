@@ -10,7 +10,7 @@ import numpy as np
 
 from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.wire import pack
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent
 
 ANSWERED = ("act", "features")

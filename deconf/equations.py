@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 
 Kind = TypeVar("Kind", Array, Tensor)
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from gymnasium import spaces
 
 from deconfounded.deconf.core.sizes import MANY, WIDE
-from deconfounded.envs.task import InputError, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Task
 from deconfounded.experts.rollout import Agent
 
 if TYPE_CHECKING:

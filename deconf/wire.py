@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 
 def pack(value: Any) -> bytes:

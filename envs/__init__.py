@@ -17,6 +17,7 @@ if _gl is not None:
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.check import check_task
+from deconfounded.envs.latent import Latent
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.registry import (
     TASKS,
@@ -29,7 +30,8 @@ from deconfounded.envs.registry import (
     names,
     register,
 )
-from deconfounded.envs.task import InputError, Latent, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Task
 from deconfounded.envs.tasks import SUITE
 
 __all__ = [

@@ -15,7 +15,8 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deconfounded.envs.batch import BatchEnv, check_number
-from deconfounded.envs.task import InputError, Painter, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Painter, Task
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import InputError, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Task
 
 MOST = 10_000_000  # environments
 

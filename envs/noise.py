@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.streams import Array
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 WIDEST = 0.5  # std of a rotation, rad: beyond, more than half a turn is no longer out of the question
 

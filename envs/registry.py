@@ -10,9 +10,10 @@ from typing import Any
 
 import gymnasium
 
-from deconfounded.envs import outside
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
-from deconfounded.envs.task import InputError, Task
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Task
 
 TASKS: dict[str, type[Task]] = {}
 GROUP = "deconfounded.tasks"  # entry points of installed packages: name = "package.module:Class"

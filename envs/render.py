@@ -13,8 +13,9 @@ import numpy as np
 from mujoco.rendering.classic import gl_context
 from numpy.typing import NDArray
 
-from deconfounded.envs.handles import Handle
-from deconfounded.envs.task import Array, InputError
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.handles import Handle
 
 _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
 

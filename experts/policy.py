@@ -16,8 +16,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
-from deconfounded.envs import InputError, Task, outside
-from deconfounded.envs.task import ASSETS, Array
+from deconfounded.envs import InputError, Task
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support import outside
+from deconfounded.envs.task import ASSETS
 
 
 class Random(Protocol):

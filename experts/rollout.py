@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.batch import generators
-from deconfounded.envs.files import write_atomically
 from deconfounded.envs.streams import Array, Streams, unseeded
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.policy import Expert
 
 

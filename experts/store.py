@@ -12,8 +12,9 @@ from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
 from deconfounded import __version__
-from deconfounded.envs import InputError, outside
-from deconfounded.envs.files import as_json, check_folder, read_sealed, sealed, write_atomically
+from deconfounded.envs import InputError
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import as_json, check_folder, read_sealed, sealed, write_atomically
 from deconfounded.experts.rollout import Agent
 
 ARRAYS = "agent.safetensors"

@@ -34,7 +34,7 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.presets import Preset, preset
 from deconfounded.benchmarks.output import index, score, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import RandomAgent, run_trials
 from tests import toys

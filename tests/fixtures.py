@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.envs.physics import Edit
-from deconfounded.envs.task import Array
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
 from deconfounded.envs.contract.core import CONTRACT
-from deconfounded.envs.physics import Edit, ModelEdit
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array
+from deconfounded.envs.edits import Edit, ModelEdit
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks import slippery_walker
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy

@@ -20,7 +20,7 @@ from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.deconf.core.agents import Training
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 from tests.tools import processes, tiny_preset
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install deconfounded-imitation[cluster]")

@@ -26,9 +26,10 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.studies import cost, publish, site
 from deconfounded.envs import render
-from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
+from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
 from deconfounded.experts.policy import OwnExpert
 from tests.fixtures import NoStakes, feedback
 from tests.tools import tiny_preset

@@ -11,7 +11,7 @@ from deconfounded import envs
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.physics import same_model
 from deconfounded.envs.contract.probe import Skipped, far_thetas, gl_works, streams
-from deconfounded.envs.physics import ModelEdit, SpecEdit
+from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.experts import policy
 
 TASKS = envs.names()

@@ -20,7 +20,7 @@ from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 

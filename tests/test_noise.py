@@ -11,8 +11,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.studies import cards
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
+from deconfounded.envs.edits import Edit
 from deconfounded.envs.noise import ProcessNoise
-from deconfounded.envs.physics import Edit
 from deconfounded.envs.streams import Array, Streams
 
 XML = """

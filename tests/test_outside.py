@@ -35,8 +35,8 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.recurrent import RecurrentConfig
-from deconfounded.envs import outside
-from deconfounded.envs.files import write_sealed
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import write_sealed
 from deconfounded.experts import policy, store
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset

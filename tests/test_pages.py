@@ -18,8 +18,8 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, report, score, statistics
 from deconfounded.benchmarks.output.answers import answers
+from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
 from deconfounded.benchmarks.studies import browser, gap, publish, site, tune
-from deconfounded.envs.files import mark, mark_of, save_figure
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 

@@ -23,7 +23,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.deconf.methods import dagger
-from deconfounded.envs.files import PARTIAL, write_sealed
+from deconfounded.envs.support.files import PARTIAL, write_sealed
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Trials
 from tests.tools import tiny_preset

@@ -17,7 +17,7 @@ from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.deconf.methods import cloning
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent, Painter, Task
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Painter, Task
 
 
 class Push(Task):

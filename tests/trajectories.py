@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.envs.files import write_atomically
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, run_trials
 

@@ -18,7 +18,7 @@ from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts import store
 from deconfounded.experts.rollout import Agent, run_trials

@@ -9,7 +9,7 @@ from dataclasses import replace
 from deconfounded import envs
 from deconfounded.deconf import methods
 from deconfounded.deconf.method import ENVIRONMENT, USES, Method
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 
 
 class Methods(Mapping[str, Method]):

@@ -20,8 +20,8 @@ from deconfounded.benchmarks.engine import identity, sources
 from deconfounded.benchmarks.engine.jobs import Job
 from deconfounded.benchmarks.engine.scheduler import Engine
 from deconfounded.benchmarks.engine.worker import Files, Unlike, work
-from deconfounded.envs import outside
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
 
 TRIES = 5  # of a job, whose worker was lost each time

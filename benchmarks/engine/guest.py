@@ -26,7 +26,7 @@ from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.wire import unpack
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts.rollout import Agent
 

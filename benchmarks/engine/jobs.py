@@ -24,7 +24,7 @@ from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import tick
 from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.agents import Monitor, Training
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.rollout import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from deconfounded.deconf.equations import imitation_objective
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Trials
 

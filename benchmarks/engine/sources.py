@@ -17,7 +17,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from deconfounded import envs
-from deconfounded.envs import outside
+from deconfounded.envs.support import outside
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import catalogue
-from deconfounded.envs.files import check_folder, read_sealed, sweep, write_sealed
+from deconfounded.envs.support.files import check_folder, read_sealed, sweep, write_sealed
 
 META: dict[str, Any] = {  # what a file says of itself, and of what types
     **{"identity": dict, "seed": int, "budget": dict, "spans": list, "cpu_s": (int, float), "arrays": list},

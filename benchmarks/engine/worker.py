@@ -20,8 +20,8 @@ from ray.exceptions import RayError
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, progress, sources
 from deconfounded.benchmarks.engine.jobs import Job
-from deconfounded.envs import outside
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
 
 EVERY_S = 1.0  # it tells how far it has come

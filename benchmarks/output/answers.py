@@ -8,7 +8,7 @@ import numpy as np
 
 from deconfounded.benchmarks.output import statistics
 from deconfounded.benchmarks.output.score import two_decimals
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 
 NOTE = (
     "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Opponents were"

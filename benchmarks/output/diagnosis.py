@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
 from deconfounded.deconf.diagnosis.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
-from deconfounded.envs.files import write_atomically, write_json
+from deconfounded.envs.support.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
 """Bars by what stands beside them, each with its colour."""

@@ -16,9 +16,9 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.store import Finished, by_method
 from deconfounded.benchmarks.output.colours import colour
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.deconf.exact import ExactAgent
-from deconfounded.envs.files import save_figure
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, run_trials
 

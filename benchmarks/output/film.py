@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from deconfounded import envs
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 
 WIDTH, HEIGHT, HEAD, STRIP = 320, 240, 30, 80  # of a pane, px; a strip for each latent, under its label
 FRAMES = 240  # of a whole film, at most

@@ -17,7 +17,7 @@ import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
 from deconfounded.benchmarks.output import score
-from deconfounded.envs.files import check_folder, sealed, unsealed, write_atomically
+from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]

@@ -22,8 +22,9 @@ from deconfounded.benchmarks.engine.store import Finished
 from deconfounded.benchmarks.output import film, records, score
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.envs import outside
-from deconfounded.envs.files import mark, save_figure, write_atomically, write_json
+from deconfounded.benchmarks.output.pictures import mark, save_figure
+from deconfounded.envs.support import outside
+from deconfounded.envs.support.files import write_atomically, write_json
 
 
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:

@@ -12,7 +12,7 @@ from scipy import stats
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import REFERENCES
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 
 VERSION = 1  # raised when the same records come to other figures
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
 
 Runs = Mapping[str, Array]
 RESAMPLES = 2000

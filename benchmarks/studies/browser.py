@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 PATIENCE_S = 120.0  # for any answer

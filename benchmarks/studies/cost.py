@@ -21,7 +21,8 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
-from deconfounded.envs.files import save_figure, write_json
+from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.envs.support.files import write_json
 from deconfounded.experts import policy
 
 SHARES = (0.25, 0.5, 1.0)

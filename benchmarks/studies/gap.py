@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deconfounded import envs
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
-from deconfounded.envs.files import save_figure
 
 FORETOLD = "exact interventional less conditional"
 

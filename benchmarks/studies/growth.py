@@ -21,7 +21,8 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
-from deconfounded.envs.files import check_folder, save_figure, write_json
+from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.envs.support.files import check_folder, write_json
 
 STEPS = (200, 400, 800, 1600, 3200)
 VALUES = (5, 11, 21, 41, 81)

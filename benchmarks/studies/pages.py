@@ -13,7 +13,7 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.studies import site
 from deconfounded.benchmarks.studies.browser import Browser
-from deconfounded.envs.files import write_atomically
+from deconfounded.envs.support.files import write_atomically
 
 
 def main() -> None:

@@ -33,8 +33,8 @@ from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.deconf.methods.recurrent import RecurrentAgent
-from deconfounded.envs.files import write_atomically, write_json
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, run_trials
 

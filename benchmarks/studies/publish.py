@@ -25,9 +25,9 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.output.pictures import mark, mark_of
 from deconfounded.benchmarks.studies import site
 from deconfounded.benchmarks.studies.site import DOCS
-from deconfounded.envs.files import mark, mark_of
 
 LOOK: dict[str, Any] = {"duration": 150, "loop": 0, "quality": 30, "method": 4}  # of clips
 

@@ -21,10 +21,11 @@ from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCE
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, score
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
+from deconfounded.benchmarks.output.pictures import mark, mark_of
 from deconfounded.benchmarks.studies import cards, gap, spectra
 from deconfounded.benchmarks.studies import validation as validated
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS, kept, markdown_table, nats
-from deconfounded.envs.files import mark, mark_of, write_atomically
+from deconfounded.envs.support.files import write_atomically
 
 README = DOCS.parent / "README.md"
 SUMMARY = (

@@ -9,9 +9,9 @@ import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.output.colours import colour
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table, nats
-from deconfounded.envs.files import save_figure
 
 LEARNED = ("deconfounded", "naive_rnn", "dagger")
 KINDS = {"process": "process noise", "expert": "the expert's action noise"}

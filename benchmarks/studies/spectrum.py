@@ -24,7 +24,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.studies import noise
 from deconfounded.benchmarks.studies.spectra import KINDS, LEARNED, Point, picture
-from deconfounded.envs.files import write_json
+from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 

@@ -30,8 +30,9 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.files import check_folder, save_figure, write_json
+from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.envs.physics import Physics, cores
+from deconfounded.envs.support.files import check_folder, write_json
 
 SIZES = (1, 4, 16, 64, 256, 1024, 4096)
 SYNC = 64  # environments, at most, that SyncVectorEnv is timed with

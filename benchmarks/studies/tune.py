@@ -22,7 +22,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
-from deconfounded.envs.files import write_atomically, write_json
+from deconfounded.envs.support.files import write_atomically, write_json
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset

@@ -26,7 +26,7 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.studies import noise, validation
 from deconfounded.benchmarks.studies.spectrum import variants
-from deconfounded.envs.files import write_json
+from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
 if TYPE_CHECKING:

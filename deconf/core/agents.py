@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature, listed
 from deconfounded.deconf.core.nets import ActionHead, Scaler
-from deconfounded.envs.task import Array, InputError
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import store
 from deconfounded.experts.rollout import Agent, State
 

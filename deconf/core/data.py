@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from deconfounded.envs.task import Array, InputError
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]

@@ -17,7 +17,7 @@ from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.nets import Adam, DynamicsHead, Inputs, Scaler, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 

@@ -14,7 +14,7 @@ import numpy as np
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.diagnosis.latent import near
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 Verdict = Literal["confounded", "not confounded", "cannot tell"]

@@ -19,7 +19,7 @@ from deconfounded.deconf.methods import deconfounded_offline
 from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 LEAST = 0.02  # share of exploring steps that are where the expert goes

@@ -10,10 +10,11 @@ from gymnasium import spaces
 
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.probe import actions, beyond_bounds
-from deconfounded.envs.outside import told
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import InputError, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.outside import told
+from deconfounded.envs.task import Task
 
 
 def sentence(error: Exception) -> str:

@@ -18,7 +18,8 @@ from deconfounded.envs.contract.probe import (
     same,
     streams,
 )
-from deconfounded.envs.physics import STATE, SpecEdit
+from deconfounded.envs.edits import SpecEdit
+from deconfounded.envs.physics import STATE
 from deconfounded.envs.render import level
 from deconfounded.envs.task import Task
 

@@ -13,7 +13,8 @@ from gymnasium import spaces
 from deconfounded.envs import render
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import InputError, Task
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Task
 
 
 class Skipped(Exception):  # noqa: N818 (nothing is wrong)

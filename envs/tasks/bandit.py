@@ -10,8 +10,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent, Painter, Task
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Painter, Task
 
 ARMS = 5
 

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array, Streams
 
 FALLEN = 1.2  # rad
 

@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent, Painter
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Painter
 from deconfounded.envs.tasks import gymnasium_body
 
 WRONG = 0.2  # probability

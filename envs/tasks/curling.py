@@ -18,9 +18,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
 
 START, TEE = -3.0, 7.0  # m from the hog line
 HOUSE = 1.7  # m

@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
 
 MIDDLE, SPEED = 2.0, 3.0  # of the hand, m/s
 LOST = 1.2  # m

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from deconfounded.envs.physics import Edit
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.puck import Puck
 
 

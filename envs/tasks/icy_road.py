@@ -23,9 +23,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
 
 AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
 STEERING, TORQUE = 0.5, 0.03  # rad; N m

@@ -17,9 +17,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
 
 SPEED = 3.0  # m/s
 RADIUS = 0.1  # of the wheel, m

@@ -8,8 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array
+from deconfounded.envs.streams import Array, Streams
 
 
 class Puck(MujocoTask):

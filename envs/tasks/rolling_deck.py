@@ -10,7 +10,7 @@ reward and end as in `Cartpole`.
 
 from __future__ import annotations
 
-from deconfounded.envs.task import Latent
+from deconfounded.envs.latent import Latent
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 
 

@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from deconfounded.envs.physics import Edit
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 SPIN = 10.0  # rad/s

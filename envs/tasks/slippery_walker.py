@@ -27,9 +27,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, InputError, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.support.errors import InputError
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s

@@ -9,8 +9,9 @@ Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward:
 
 from __future__ import annotations
 
-from deconfounded.envs.physics import Edit
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 

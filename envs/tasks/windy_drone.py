@@ -20,9 +20,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.streams import Streams
-from deconfounded.envs.task import Array, Latent
+from deconfounded.envs.edits import Edit
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array, Streams
 
 HEIGHT = 1.5  # of the mark, m
 LOST = 1.5  # m

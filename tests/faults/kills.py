@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.engine import store
-from deconfounded.envs.files import write_json
+from deconfounded.envs.support.files import write_json
 
 HERE = Path(__file__).parent
 AMOUNTS = ("seeds=2", "expert_trials=100", "explore_trials=50", "eval_trials=50")

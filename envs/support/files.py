@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 PARTIAL = ".partial"  # the end of the name of a file that is being written
 
@@ -51,30 +50,6 @@ def sweep(folder: Path) -> None:
     """Remove what was being written in a folder when a process was killed; nobody else may be at work in it."""
     for partial in folder.glob(f".*{PARTIAL}"):
         partial.unlink(missing_ok=True)
-
-
-def save_figure(figure: Any, file: Path, dpi: int, mark: str = "") -> None:
-    """A matplotlib figure as .png, atomically. mark: of what it is made of, for `mark_of`."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=dpi, metadata={"Comment": mark} if mark else None)
-    write_atomically(file, buffer.getvalue())
-
-
-def mark(*made_of: Any) -> str:
-    """A picture's mark: the SHA-256 of what it is made of, which json can hold."""
-    return hashlib.sha256(json.dumps(made_of, sort_keys=True).encode()).hexdigest()
-
-
-def mark_of(picture: Path) -> str:
-    """The mark that a .png or .webp was saved with; empty if it has none, or is no picture."""
-    from PIL import Image
-
-    try:
-        with Image.open(picture) as image:
-            value = image.info.get("Comment") or image.info.get("xmp", b"").decode()
-    except (OSError, ValueError):
-        return ""
-    return str(value)
 
 
 def as_json(file: Path, data: Any) -> str:

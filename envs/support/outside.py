@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 
 SENT = "DECONFOUNDED_OUTSIDE"  # in the environment of a worker elsewhere: the folder that such files were sent to
 

@@ -1,0 +1,100 @@
+"""Hidden physical parameters and their distributions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import ndtr
+
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
+
+
+@dataclass(frozen=True)
+class Latent:
+    """One hidden physical parameter and its distribution p(theta).
+
+    distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
+    low..high, equally likely. drift: where it is not 0, the latent's quantile u = cdf(theta) walks at random from each
+    episode of a trial to the next: u' = u + N(0, drift^2), reflected at 0 and 1, so that every episode's theta has the
+    distribution. Raises InputError for bounds that do not fit the distribution, and for a drift that is none.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
+    drift: float = 0.0
+
+    def __post_init__(self) -> None:
+        rules = {
+            "uniform": ("low < high", True),
+            "loguniform": ("0 < low < high", self.low > 0),
+            "categorical": ("whole numbers low < high", self.low % 1 == 0 == self.high % 1),
+        }
+        if self.distribution not in rules:
+            raise InputError(
+                f"distribution of {self.name} was {self.distribution!r}; it must be one of {', '.join(rules)}"
+            )
+        right, holds = rules[self.distribution]
+        if not (holds and -np.inf < self.low < self.high < np.inf):
+            raise InputError(f"{self.name} was {self.low:g} to {self.high:g}, {self.distribution}; it must be {right}")
+        if not 0 <= self.drift <= 1 or (self.drift and self.distribution == "categorical"):
+            raise InputError(
+                f"drift of {self.name} was {self.drift:g}; it must be from 0 to 1, and 0 of a categorical latent"
+            )
+
+    def ppf(self, u: Array) -> Array:
+        """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""
+        if self.distribution == "uniform":
+            return self.low + np.asarray(u) * (self.high - self.low)
+        if self.distribution == "loguniform":
+            return self.low * (self.high / self.low) ** np.asarray(u)
+        return np.floor(self.low + np.asarray(u) * (self.high - self.low + 1))
+
+    def cdf(self, theta: Array) -> Array:
+        """The inverse of ppf; for a categorical latent the lower edge of its bin."""
+        if self.distribution == "uniform":
+            return (theta - self.low) / (self.high - self.low)
+        if self.distribution == "loguniform":
+            return np.log(theta / self.low) / np.log(self.high / self.low)
+        return (theta - self.low) / (self.high - self.low + 1)
+
+    def grid(self, k: int) -> Array:
+        """[K] equally likely values: the mid-quantiles, or every category."""
+        if self.distribution == "categorical":
+            return np.arange(self.low, self.high + 1)
+        return self.ppf((np.arange(k) + 0.5) / k)
+
+    def encode(self, theta: Array) -> Array:
+        """theta [...] -> features [..., F]: one-hot if categorical, else 2 cdf - 1 in [-1, 1]."""
+        if self.distribution == "categorical":
+            return (np.asarray(theta)[..., None] == self.grid(0)).astype(float)
+        return (2 * self.cdf(np.asarray(theta)) - 1)[..., None]
+
+    def drifted(self, theta: Array, normal: Array) -> Array:
+        """theta [...] of the next episode of a trial, by standard normal draws of the same shape."""
+        u = np.abs(self.cdf(theta) + self.drift * normal) % 2  # unfolded, the reflected walk is periodic
+        return self.ppf(np.minimum(u, 2 - u)).clip(self.low, self.high)
+
+    def transition(self, k: int) -> Array:
+        """P(value j in the next episode | value i) [K, K] of `grid(k)`, from each value to the bins of all.
+
+        The walk's density is a sum over its images, u' + 2 m and -u' + 2 m. Rows and columns sum to one.
+        """
+        k = self.features if self.distribution == "categorical" else k
+        if not self.drift:
+            return np.eye(k)
+        u, edges = (np.arange(k) + 0.5) / k, np.arange(k + 1) / k
+        images = 2.0 * np.arange(-3, 4)[:, None, None]
+        ahead = ndtr((edges + images - u[:, None]) / self.drift)
+        behind = ndtr((images - edges - u[:, None]) / self.drift)
+        return np.diff(ahead, axis=-1).sum(0) - np.diff(behind, axis=-1).sum(0)
+
+    @property
+    def features(self) -> int:
+        """F, the width of `encode`."""
+        return int(self.high - self.low) + 1 if self.distribution == "categorical" else 1
