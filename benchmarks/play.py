@@ -49,7 +49,7 @@ def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = 
         total, over = 0.0, False
         while not over:
             action = agent.act(obs[None])
-            taken = action[0] if env.action_space.shape else int(action[0, 0])
+            taken = int(action[0, 0]) if env.task.n_actions else action[0]
             then, reward, terminated, truncated, _ = env.step(taken)
             agent.observe(obs[None], action, then[None], np.ones(1, bool))
             total, over, obs = total + reward, terminated or truncated, then

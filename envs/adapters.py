@@ -23,8 +23,7 @@ def _observation_space(task: Task, privileged: bool) -> spaces.Box:
     base = task.observation_space
     if not privileged:
         return base
-    features = sum(lat.features for lat in task.latents)
-    low, high = np.append(base.low, [-1.0] * features), np.append(base.high, [1.0] * features)
+    low, high = np.append(base.low, [-1.0] * task.theta_width), np.append(base.high, [1.0] * task.theta_width)
     return spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
@@ -40,7 +39,7 @@ class _Pictures:
 
     def __init__(self, batch: BatchEnv) -> None:
         self._batch = batch
-        self._action = np.zeros((batch.n, *(batch.task.action_space.shape or (1,))))
+        self._action = np.zeros((batch.n, batch.task.action_width))
         self._painters: dict[int, tuple[NDArray[Any], Painter]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -181,6 +180,6 @@ class DmEnv(dm_env.Environment):
 
     def action_spec(self) -> specs.BoundedArray:
         space = self.task.action_space
-        if isinstance(space, spaces.Discrete):
-            return specs.DiscreteArray(int(space.n), name="action")
-        return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "action")
+        if isinstance(space, spaces.Box):
+            return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "action")
+        return specs.DiscreteArray(self.task.n_actions, name="action")

@@ -16,7 +16,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -27,6 +27,11 @@ from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.errors import InputError
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
+
+
+def action_sizes(space: spaces.Space[Any]) -> tuple[int, int]:
+    """A, the columns of an action, which are one if it is discrete; and the number of discrete actions, else 0."""
+    return (space.shape or (1,))[0], int(space.n) if isinstance(space, spaces.Discrete) else 0
 
 
 class Painter(Protocol):
@@ -142,6 +147,21 @@ class Task(ABC):
         return spaces.Box(low, high)
 
     @property
+    def n_actions(self) -> int:
+        """The number of discrete actions; 0 if actions are continuous."""
+        return action_sizes(self.action_space)[1]
+
+    @property
+    def action_width(self) -> int:
+        """A, the columns of an action: one if it is discrete."""
+        return action_sizes(self.action_space)[0]
+
+    @property
+    def theta_width(self) -> int:
+        """F, the width of `encode_theta`."""
+        return sum(latent.features for latent in self.latents)
+
+    @property
     def gym_id(self) -> str:
         """deconf/SlipperyCartpole-v0, say."""
         return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
@@ -212,7 +232,6 @@ class Task(ABC):
 
         ignored [N]: rows that nothing will come of, and that may hold any number.
         """
-        width = 1 if isinstance(self.action_space, spaces.Discrete) else self.action_space.shape[0]
         try:
             array = np.asarray(action)
             if array.dtype.kind not in "biuf":
@@ -220,15 +239,16 @@ class Task(ABC):
             array = array.astype(float)
         except (TypeError, ValueError):
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
-        if array.shape != (n, width):
-            raise InputError(f"action of {self.name} had shape {array.shape}; it must be ({n}, {width})")
+        if array.shape != (n, self.action_width):
+            wanted = (n, self.action_width)
+            raise InputError(f"action of {self.name} had shape {array.shape}; it must be {wanted}")
         if ignored is not None:
             array[ignored] = 0
         if not np.isfinite(array).all():
             raise InputError(f"action of {self.name} held NaN or infinity; every entry must be a finite number")
-        if isinstance(self.action_space, spaces.Discrete):
-            if ((array != np.floor(array)) | (array < 0) | (array >= self.action_space.n)).any():
-                last = int(self.action_space.n) - 1
-                raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")
-            return array
-        return np.clip(array, self.action_space.low, self.action_space.high)
+        if isinstance(self.action_space, spaces.Box):
+            return np.clip(array, self.action_space.low, self.action_space.high)
+        if ((array != np.floor(array)) | (array < 0) | (array >= self.n_actions)).any():
+            last = self.n_actions - 1
+            raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")
+        return array

@@ -11,10 +11,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
+from deconfounded.envs.task import action_sizes
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 HORIZON = "deconf_horizon"  # of the data set's metadata: T, which no episode need last
@@ -123,9 +123,8 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
     if len({(int(one["trial"]), int(one["episode"])) for one in about}) != b * e or len(about) != b * e:
         raise InputError(f"{source} holds {len(about)} episodes; every trial of {b} must have each of {e} once")
     t = int(found.storage.metadata.get(HORIZON, max(len(episode.rewards) for episode in episodes)))
-    discrete = isinstance(found.action_space, spaces.Discrete)
+    width, n_actions = action_sizes(found.action_space)
     obs = np.zeros((b, e, t + 1, np.shape(episodes[0].observations)[-1]), np.float32)
-    width = 1 if discrete else np.shape(episodes[0].actions)[-1]
     action, mask = np.zeros((b, e, t, width), np.float32), np.zeros((b, e, t), bool)
     for one, episode in zip(about, episodes, strict=True):
         at, n = (int(one["trial"]), int(one["episode"])), len(episode.rewards)
@@ -135,7 +134,7 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
     told = {(int(one["trial"]), int(one["episode"])): one.get("theta") for one in about}
     whole = all(value is not None for value in told.values())
     theta = np.array([[told[i, j] for j in range(e)] for i in range(b)]) if whole else None
-    return Trials(obs, action, mask, int(found.action_space.n) if discrete else 0), theta  # type: ignore[attr-defined]
+    return Trials(obs, action, mask, n_actions), theta
 
 
 @contextmanager

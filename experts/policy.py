@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
@@ -120,7 +119,7 @@ class OwnExpert(BoxExpert):
             raise
         except Exception as error:
             raise InputError(f"expert {self.name}: {outside.told(error)}") from error
-        shape = (len(obs), self.task.action_space.shape[0])  # type: ignore[index]
+        shape = (len(obs), self.task.action_width)
         if given.shape != shape or not np.isfinite(given).all():
             what = f"shape {given.shape}" if given.shape != shape else "NaN or infinity"
             raise InputError(f"expert {self.name} gave {what} for {len(obs)} observations; it must be {shape}, finite")
@@ -144,7 +143,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
     source: a .safetensors file, or a callable (`OwnExpert`) as path/file.py:name or package.module:name. Raises
     InputError if it is missing, damaged, or does not fit the task.
     """
-    if isinstance(task.action_space, spaces.Discrete):
+    if task.n_actions:
         if source is not None:
             raise InputError(f"expert was {source}; that of {task.name} is its closed form, `expert_probs`")
         return DiscreteExpert(task)
@@ -174,7 +173,7 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
-    width = len(task.observation) + sum(lat.features for lat in task.latents)
+    width = len(task.observation) + task.theta_width
     for i in range(max(len(weights) // 2, 1)):
         weight, bias = weights.get(f"{i}.weight"), weights.get(f"{i}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:
@@ -182,9 +181,8 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
         if weight.shape[1] != width or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"layer {i} of {file} takes {weight.shape[1]} finite inputs, not {width}; {remedy}")
         width = len(bias)
-    assert isinstance(task.action_space, spaces.Box)
-    if width != task.action_space.shape[0]:
-        raise InputError(f"expert weights at {file} give {width} actions, not {task.action_space.shape[0]}; {remedy}")
+    if width != task.action_width:
+        raise InputError(f"expert weights at {file} give {width} actions, not {task.action_width}; {remedy}")
     return weights
 
 
@@ -199,7 +197,7 @@ def version(task: Task, source: str | Path | None = None) -> int:
 
     That of a closed form is its task's.
     """
-    if isinstance(task.action_space, spaces.Discrete):
+    if task.n_actions:
         return task.version
     card = (path(task) if source is None else Path(source)).with_suffix(".json")
     try:

@@ -18,6 +18,7 @@ from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.batch import generators
 from deconfounded.envs.streams import Array, Streams, unseeded
 from deconfounded.envs.support.files import write_atomically
+from deconfounded.envs.task import action_sizes
 from deconfounded.experts.policy import Expert
 
 
@@ -164,9 +165,9 @@ class RandomAgent(Agent):
         self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        if isinstance(self.space, spaces.Discrete):
-            return np.floor(self._rng.random((len(obs), 1)) * self.space.n)
-        return 2 * self._rng.random((len(obs), *self.space.shape)) - 1
+        width, n_actions = action_sizes(self.space)
+        draws = self._rng.random((len(obs), width))
+        return np.floor(draws * n_actions) if n_actions else 2 * draws - 1
 
 
 def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
@@ -238,5 +239,4 @@ def run_trials(
                 obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
                 break
     assert action is not None
-    discrete = int(task.action_space.n) if isinstance(task.action_space, spaces.Discrete) else 0
-    return Rollout(Trials(obs, action, mask, discrete), returns, hidden)
+    return Rollout(Trials(obs, action, mask, task.n_actions), returns, hidden)

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
@@ -100,9 +99,8 @@ def of_task(name: str) -> Numbers:
         env.reset(7, {"theta": theta}) if episode == 0 else env.reset(options={"keep_theta": True})
         for _ in range(steps):
             before, alive, held = env.state.copy(), env.alive.copy(), env.theta.copy()
-            draw = rng.random((n, *(task.action_space.shape or (1,))))
-            discrete = isinstance(task.action_space, spaces.Discrete)
-            action = np.floor(draw * task.action_space.n) if discrete else 1.4 * draw - 0.7  # type: ignore[union-attr]
+            draw = rng.random((n, task.action_width))
+            action = np.floor(draw * task.n_actions) if task.n_actions else 1.4 * draw - 0.7
             right, other = (s.outcome(before, action, None).copy() for s in (env.simulator, wrong))
             obs, reward, terminated, truncated = env.step(action)
             likely = [task.log_prob(env.state, out) for out in (right, other)]
@@ -161,7 +159,7 @@ def of_method(name: str) -> Numbers:
         amounts = small(preset("default", task, "cpu", [name]))
         if task.drifts and name not in EXACT and "drifts" not in amounts.configs.get(name, {}):
             continue
-        source = None if isinstance(task.action_space, spaces.Discrete) else CONTROL
+        source = None if task.n_actions else CONTROL
         with double():
             context = Context(task, amounts, (0,), expert=source)
             for way, agent in deployed(name, fit(context, name)).items():

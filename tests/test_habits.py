@@ -26,7 +26,7 @@ CONTROL = "slippery_cartpole"
 def flat(task: envs.Task, n: int, steps: int) -> Array:
     """[steps, n, ...] actions as gymnasium wants them."""
     acts = actions(task, n, steps)
-    return acts[..., 0].astype(int) if task.action_space.shape == () else acts
+    return acts[..., 0].astype(int) if task.n_actions else acts
 
 
 def thetas(task: envs.Task, seed: int, k: int) -> Array:

@@ -51,7 +51,7 @@ class TestEnvironments:
         vec = envs.make_vec(name, 3)
         assert vec.reset(seed=0)[1] == {}
         for action in actions(task, 3, task.horizon + 3):  # over autoresets
-            assert vec.step(action[:, 0].astype(int) if task.action_space.shape == () else action)[4] == {}
+            assert vec.step(action[:, 0].astype(int) if task.n_actions else action)[4] == {}
 
     def test_observations_are_those_of_the_state(self, name: str) -> None:
         """Bit for bit, at every step: `observe` is given the state, and never theta."""
@@ -98,7 +98,7 @@ def test_expert_density_is_one(name: str) -> None:
     task = envs.get(name)
     expert = policy.load(task)
     assert isinstance(expert, NetworkExpert)
-    batch, width = envs.BatchEnv(task, 1), task.action_space.shape[0]
+    batch, width = envs.BatchEnv(task, 1), task.action_width
     obs, inside = batch.reset(0), np.linspace(-1, 1, 20_001)[1:-1]
     for centre in (-1.0, -0.99, 0.3, 1.0):
         expert.mean = lambda obs, theta, groups=1, c=centre: np.full((len(obs), width), c)  # type: ignore[method-assign]

@@ -34,7 +34,7 @@ def test_noise_is_scaled_and_nothing_else(base: str) -> None:
             assert other.process_noise[joint] == pytest.approx(tuple(by["process"] * std for std in stds))
         one, same = envs.BatchEnv(task, 3), envs.BatchEnv(other, 3)
         np.testing.assert_array_equal(one.reset(1), same.reset(1))
-        action = np.full((3, *task.action_space.shape), 0.3)
+        action = np.full((3, task.action_width), 0.3)
         outcomes = [env.task.outcome(env.state, action, env.theta) for env in (one, same)]
         np.testing.assert_array_equal(*outcomes)
         theirs, ours = policy.load(other, weights), policy.load(task)

@@ -193,7 +193,7 @@ def test_a_copy_goes_on_alone(name: str, kind: str, how: str, request: pytest.Fi
     make, step = MAKERS[kind]
     env = make(task)
     acts = actions(task, 3, 30)
-    acts = acts[..., 0].astype(int) if task.action_space.shape == () and kind != "BatchEnv" else acts
+    acts = acts[..., 0].astype(int) if task.n_actions and kind != "BatchEnv" else acts
     reset = partial(env.reset, seed=1) if kind in ("GymEnv", "GymVectorEnv", "gymnasium") else env.reset
     reset()
     step(env, acts[0])

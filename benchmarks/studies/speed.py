@@ -70,7 +70,7 @@ def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
 def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
     """Control steps a second, by way of stepping; KiB an environment. The same actions and the same thetas for all."""
     steps = max(8, min(task.horizon, 20_000 // n))
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, *task.action_space.shape)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, task.action_width)).astype(np.float32)
     before = resident()
     ours = envs.make_vec(task.name, n)
     ours.reset(seed=0)

@@ -41,7 +41,7 @@ def check_task(task: Task) -> None:
         _check_actions(task)
     n = 2
     rng = Streams([np.random.default_rng(seed) for seed in range(n)])
-    action = np.zeros((n, *(task.action_space.shape or (1,))))
+    action = np.zeros((n, task.action_width))
     with _part(task, "apply_latent"):
         env = BatchEnv(task, n)
     with _part(task, "init_state"):
@@ -84,11 +84,10 @@ def _check_model(task: MujocoTask) -> None:
 
 def _check_actions(task: Task) -> None:
     """Actions are those that experts, networks and random agents make, and the expert's have a density."""
-    space = task.action_space
-    if isinstance(space, spaces.Discrete):
+    if task.n_actions:
         return
-    box = isinstance(space, spaces.Box) and len(space.shape) == 1
-    if not box or (space.low != -1).any() or (space.high != 1).any():
+    space = task.action_space
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or (space.low != -1).any() or (space.high != 1).any():
         given = " ".join(str(space).split())
         raise InputError(
             f"action_space of {task.name} was {given}; it must be Box(-1, 1, (A,)), which `control` scales, or Discrete"

@@ -43,7 +43,7 @@ def effect(task: Task) -> None:
     """
     plans, thetas = [actions(task, 1, task.horizon)], far_thetas(task)
     if isinstance(task, MujocoTask):
-        axes = np.eye(task.action_space.shape[0])
+        axes = np.eye(task.action_width)
         plans += [np.tile(axis, (task.horizon, 1, 1)) for axis in axes]
     differs = np.zeros((len(plans), len(thetas) - 1), bool)
     for i, plan in enumerate(plans):

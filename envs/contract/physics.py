@@ -111,7 +111,7 @@ def noise_covers_every_coordinate_that_matters(task: Task) -> None:
     stated, joints = set(mine.process_noise), {joint.name for joint in mine.spec().joints}
     require(stated == joints, f"process_noise of {task.name} has {sorted(stated)}; it must have {sorted(joints)}")
     start = task.init_state(streams(0))
-    action, simulator = np.ones((1, *mine.action_space.shape)), mine.simulator(1)
+    action, simulator = np.ones((1, mine.action_width)), mine.simulator(1)
     noisy = mine.noise.columns
     quiet = set(range(1, 1 + mine.model.nq + mine.model.nv)) - set(noisy.tolist())
     thetas = task.theta_grid(3)

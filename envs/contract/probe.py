@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from itertools import product
 
 import numpy as np
-from gymnasium import spaces
 
 from deconfounded.envs import render
 from deconfounded.envs.physics import MujocoTask
@@ -69,9 +68,8 @@ def physics(task: Task) -> MujocoTask:
 def actions(task: Task, n: int, steps: int) -> Array:
     """[steps, n, A] random actions, the same for the same arguments."""
     rng = np.random.default_rng(99)
-    if isinstance(task.action_space, spaces.Discrete):
-        return rng.integers(task.action_space.n, size=(steps, n, 1)).astype(float)
-    return rng.uniform(-1, 1, (steps, n, *task.action_space.shape))
+    shape = (steps, n, task.action_width)
+    return rng.integers(task.n_actions, size=shape).astype(float) if task.n_actions else rng.uniform(-1, 1, shape)
 
 
 def far_thetas(task: Task) -> Array:

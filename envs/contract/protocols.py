@@ -77,7 +77,7 @@ def adapters_agree(task: Task) -> None:
     same(first, theirs.reset(seed=7)[0], "first observations of GymVectorEnv and SyncVectorEnv")
     same(first[0], dm.reset().observation, "first observations of GymVectorEnv and DmEnv")
     for at, action in enumerate(actions(task, n, steps=2 * task.horizon + 5), start=1):
-        flat = action[:, 0].astype(int) if task.action_space.shape == () else action
+        flat = action[:, 0].astype(int) if task.n_actions else action
         mine, other = ours.step(flat), theirs.step(flat)
         for name, x, y in zip(("observations", "rewards", "terminated", "truncated"), mine, other, strict=False):
             same(x, y, f"{name} of GymVectorEnv and SyncVectorEnv after {at} steps")
