@@ -22,6 +22,6 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	cd deconfounded && for name in assets benchmarks deconf envs experts; do test -e $$name || ln -s ../$$name; done
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/pip install -q -c constraints.txt torch
-	$(VENV)/bin/pip install -q -c constraints.txt -e .[dev]
+	$(VENV)/bin/pip install -q -c constraints.txt --config-settings editable_mode=compat -e .[dev]  # a path, as editors need
 	$(VENV)/bin/pip install -q -c constraints.txt --no-deps dm_control  # for its MJCF; from 3.13 on the line above leaves it out
 	touch $@
