@@ -1,6 +1,6 @@
-"""Tasks with hidden physics, and the registry: `names`, `get`, `register`, `make`, `make_vec`, `make_dm`.
+"""Tasks with hidden physics, and their registry: `names`, `get`, `register`, `make`, `make_vec`, `make_dm`.
 
-The suite's tasks are in tasks/; one of your own stays in your own folder: `get("path/file.py:Class")`. Importing this
+The suite's tasks are in tasks/; a task of your own stays in your folder: `get("path/file.py:Class")`. Importing this
 package also registers every task with gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v1")` works.
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 
-_gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` dies of a backend that is not there; pictures can wait
+_gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` fails if the backend is missing, which only rendering needs
 import mujoco  # noqa: F401
 
 if _gl is not None:

@@ -1,4 +1,4 @@
-"""Protocols over BatchEnv: gymnasium Env and VectorEnv, and dm_env. No maths of any task lives here."""
+"""Interfaces of a BatchEnv: gymnasium Env and VectorEnv, and dm_env. They hold no maths of any task."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from deconfounded.envs.batch import BatchEnv, check_number
 from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Painter, Task
+from deconfounded.envs.task import Renderer, Task
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
@@ -28,25 +28,25 @@ def _observation_space(task: Task, privileged: bool) -> spaces.Box:
 
 
 def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
-    """What gymnasium wants to know of pictures. Raises InputError for a render_mode that is none."""
+    """Gymnasium's metadata for rendering. Raises InputError for an unknown render_mode."""
     if render_mode not in (None, "rgb_array"):
         raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be 'rgb_array' or None")
     return {"render_modes": ["rgb_array"], "render_fps": round(1 / task.control_dt)}
 
 
 class _Pictures:
-    """Pictures of the environments of a batch; each has a painter, made again when its theta has changed."""
+    """Pictures of a batch's environments; each has a renderer of its own, which is replaced when its theta changes."""
 
     def __init__(self, batch: BatchEnv) -> None:
         self._batch = batch
         self._action = np.zeros((batch.n, batch.task.action_width))
-        self._painters: dict[int, tuple[NDArray[Any], Painter]] = {}
+        self._renderers: dict[int, tuple[NDArray[Any], Renderer]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_painters": {}}  # a copy makes its own
+        return {**vars(self), "_renderers": {}}  # a copy creates its own
 
     def act(self, action: NDArray[Any], alive: NDArray[np.bool_]) -> None:
-        """Remember the actions [N, A] that led to the next pictures: of environments that went on, `alive` [N]."""
+        """Store the actions [N, A] of the environments that were stepped, `alive` [N], for the next pictures."""
         self._action = np.where(alive[:, None], action, self._action)
 
     def __call__(self, i: int) -> NDArray[np.uint8]:
@@ -54,16 +54,16 @@ class _Pictures:
         if not self._batch.state.size:
             raise InputError("render was called before the first reset; reset once")
         theta = self._batch.theta[i].copy()
-        if i not in self._painters or (self._painters[i][0] != theta).any():
-            self._painters[i] = theta, self._batch.task.painter(theta)
-        return self._painters[i][1](self._batch.state[i], self._action[i])
+        if i not in self._renderers or (self._renderers[i][0] != theta).any():
+            self._renderers[i] = theta, self._batch.task.renderer(theta)
+        return self._renderers[i][1](self._batch.state[i], self._action[i])
 
 
 class GymEnv(gym.Env[Any, Any]):
     """One environment with gymnasium's interface: the batch of one.
 
     `reset(options={"keep_theta": True})` starts the next episode of a trial; `options={"theta": [...]}` forces theta.
-    theta is in no observation (but for privileged=True, for experts) and in no info. Raises InputError for bad input.
+    theta is in no info, and in no observation unless privileged=True, for experts. Raises InputError for bad input.
     """
 
     def __init__(self, task: Task, privileged: bool = False, render_mode: str | None = None) -> None:
@@ -100,9 +100,9 @@ class GymEnv(gym.Env[Any, Any]):
 class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
 
-    A finished environment is reset by the next step (AutoresetMode.NEXT_STEP): under the same theta until it has had
-    `episodes` of them, then with a new one of its own. `reset` takes the options of GymEnv.reset, keep_theta as a mask
-    [N] too: kept, an environment starts the next episode of its trial; else the first of a new one.
+    A finished environment is reset by the next step (AutoresetMode.NEXT_STEP): under the same theta until its trial has
+    had `episodes` episodes, then under a new theta. `reset` takes the options of GymEnv.reset; keep_theta may be a mask
+    [N]: where True, the next episode of the trial starts, elsewhere the first episode of a new trial.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return obs, *ended, {}
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """One picture [H, W, 3] for each environment; None without a render_mode."""
+        """A picture [H, W, 3] of each environment; None without a render_mode."""
         return None if self.render_mode is None else tuple(self._pictures(i) for i in range(self.num_envs))
 
 

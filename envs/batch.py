@@ -1,4 +1,4 @@
-"""N episodes of a task in lock step: seeding, theta, the time limit. Every protocol in adapters.py stands on this."""
+"""N episodes of a task in lock step: seeding, theta, the time limit. All interfaces in adapters.py are built on it."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 
-MOST = 10_000_000  # environments
+MAX_ENVS = 10_000_000
 
 
 def check_number(what: str, given: object, most: float = np.inf) -> None:
-    """Raises InputError for what is no whole number from 1 up, and at most so many."""
+    """Raise InputError unless `given` is a whole number from 1 to `most`. what: the things counted, for the message."""
     whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
     if not whole or not 1 <= given <= most:  # type: ignore[operator]
         limit = "up" if most == np.inf else f"to {most:,}"
@@ -28,25 +28,25 @@ def _is_seed(given: object) -> bool:
 
 
 def generators(seed: int | None) -> list[np.random.Generator]:
-    """The streams of one environment: for theta, start and noise. None: fresh entropy."""
-    return [np.random.Generator(np.random.PCG64(one)) for one in np.random.SeedSequence(seed).spawn(3)]
+    """Three generators of one environment: for theta, start and noise. None: fresh entropy."""
+    return [np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(3)]
 
 
 class BatchEnv:
     """N environments of one task; each has its own theta and three random streams (theta, start, noise).
 
     Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `alive` [N], whether the
-    episode goes on. A dead environment keeps its place, earns nothing, and waits for `reset`.
+    episode goes on. An environment whose episode has ended keeps its row, has reward 0, and waits for `reset`.
     """
 
     def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
-        """Raises InputError for a number of environments that cannot be."""
-        check_number("environments", n, MOST)
+        """Raises InputError for an invalid number of environments."""
+        check_number("environments", n, MAX_ENVS)
         self.task, self.n, self.privileged = task, n, privileged
         self.simulator = task.simulator(n)
         self.alive = np.zeros(n, bool)
         self.state: Array = np.zeros((n, 0))
-        self._steps, self._every = np.zeros(n, int), np.arange(n)
+        self._steps, self._all_rows = np.zeros(n, int), np.arange(n)
         self._noise: Array = np.zeros((n, 0, 0))
         self._streams: list[list[np.random.Generator]] = []
         self._space = task.observation_space
@@ -63,9 +63,9 @@ class BatchEnv:
         elif isinstance(seed, int | np.integer) and _is_seed(seed):
             seed = [int(seed) + i for i in range(self.n)]
         whole = isinstance(seed, list | tuple | np.ndarray) and np.shape(seed) == (self.n,)
-        if isinstance(seed, int) or not whole or not all(one is None or _is_seed(one) for one in seed):
+        if isinstance(seed, int) or not whole or not all(value is None or _is_seed(value) for value in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
-        self._streams = [generators(one) for one in seed]
+        self._streams = [generators(value) for value in seed]
 
     def reset(
         self,
@@ -75,9 +75,9 @@ class BatchEnv:
     ) -> NDArray[np.float32]:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
-        options: `keep_theta` True, or a mask [N], goes on with the theta at hand (the next episode of a trial), the
-        others draw a new one; `theta` [L] or [N, L] forces one. Neither moves the start or the noise. A theta that
-        drifts is kept but for its drift. Raises InputError for a theta out of bounds and for a mask that is none.
+        options: `keep_theta`, True or a mask [N], keeps theta but for its drift, for the next episode of a trial; other
+        environments draw a new theta. `theta` [L] or [N, L] sets theta. Neither changes the start or the noise. Raises
+        InputError for a theta out of bounds and for an invalid mask.
         """
         options = {} if options is None else options
         if not isinstance(options, dict):
@@ -94,7 +94,7 @@ class BatchEnv:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
-        rows = self._every if where is None else np.flatnonzero(where)
+        rows = self._all_rows if where is None else np.flatnonzero(where)
         theta_rng, start_rng, noise_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
         new = ~keep[rows]
         for which, is_new in ((new, True), (~new, False)):
@@ -145,14 +145,14 @@ class BatchEnv:
         return self.observe(), *ended
 
     def advance(self, action: object) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """`step` without its observation, for who resets what has ended before looking."""
+        """`step` without the observation, for a caller that resets ended episodes before it observes."""
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")
         task, over = self.task, ~self.alive
         checked = task.check_action(action, self.n, over)
         rows = np.flatnonzero(self.alive) if over.any() else None
         on = slice(None) if rows is None else rows
-        before, taken, noise = self.state[on], checked[on], self._noise[self._every[on], self._steps[on]]
+        before, taken, noise = self.state[on], checked[on], self._noise[self._all_rows[on], self._steps[on]]
         after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
         after = task.sense(after, self.theta[on], noise)
         reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)
@@ -166,7 +166,7 @@ class BatchEnv:
         if rows is None:
             self.state = after
         else:
-            self.state = self.state.copy()  # what agents remember of the one before stays
+            self.state = self.state.copy()  # agents may hold the array before
             self.state[rows] = after
         self.alive = ~(over | terminated | truncated)
         return reward, terminated, truncated

@@ -1,4 +1,4 @@
-"""Edits of MuJoCo models: what a latent may change, in a compiled model and before compilation."""
+"""Edits of MuJoCo models by a latent: in a compiled model, and in a specification before compilation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from deconfounded.envs.streams import Array
 
 
 class Edit(Protocol):
-    """What a latent may change in a model, by the element's name; values are absolute or times the MJCF's own."""
+    """Changes that a latent may make to a named element; a value is absolute, a scale multiplies the MJCF's value."""
 
     def body_tilt(self, name: str, angle: float) -> None:
         """Set a body's angle about its parent's y axis, in place of the MJCF's; rad."""
@@ -38,7 +38,7 @@ class Edit(Protocol):
         """Spring of a hinge or slide joint; N m/rad or N/m."""
 
     def actuator_gain(self, name: str, scale: float) -> None:
-        """Scale what a motor makes of its control; of -1, it is wired the wrong way round."""
+        """Scale a motor's gain; -1 reverses it."""
 
     def tendon_friction(self, name: str, value: float) -> None:
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
@@ -53,9 +53,9 @@ def _uphill(gravity: Array, angle: float) -> list[float]:
 
 
 class ModelEdit:
-    """Edits a compiled model in place. Scales are of the nominal model's values, so that they never compound.
+    """Edits of a compiled model in place. Scales multiply the nominal model's values, so that they never compound.
 
-    data: scratch space, which many edits may share (an MjData takes megabytes).
+    data: scratch space, which many models may share (an MjData takes megabytes).
     """
 
     def __init__(self, model: mujoco.MjModel, nominal: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -96,14 +96,14 @@ class ModelEdit:
         self.model.tendon_frictionloss[self.model.tendon(name).id] = value
 
     def finish(self) -> None:
-        """Recompute what MuJoCo derives from bodies' places and masses (subtree masses, invweight0, ...), if edited."""
+        """Recompute what MuJoCo derives from positions and masses (subtree masses, invweight0), if those changed."""
         if self._stale:
             mujoco.mj_setConst(self.model, self._data)
             self._stale = False
 
 
 class SpecEdit:
-    """The same edits before compilation: the reference that tests hold ModelEdit to."""
+    """The same edits before compilation: the reference for tests of ModelEdit."""
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
         self.spec = spec

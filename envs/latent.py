@@ -19,7 +19,7 @@ class Latent:
     distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
     low..high, equally likely. drift: where it is not 0, the latent's quantile u = cdf(theta) walks at random from each
     episode of a trial to the next: u' = u + N(0, drift^2), reflected at 0 and 1, so that every episode's theta has the
-    distribution. Raises InputError for bounds that do not fit the distribution, and for a drift that is none.
+    distribution. Raises InputError for bounds that do not fit the distribution, and for an invalid drift.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Latent:
         return np.floor(self.low + np.asarray(u) * (self.high - self.low + 1))
 
     def cdf(self, theta: Array) -> Array:
-        """The inverse of ppf; for a categorical latent the lower edge of its bin."""
+        """Cumulative distribution [...] at theta [...], the inverse of ppf; of a categorical latent the lower edge."""
         if self.distribution == "uniform":
             return (theta - self.low) / (self.high - self.low)
         if self.distribution == "loguniform":
@@ -64,26 +64,26 @@ class Latent:
         return (theta - self.low) / (self.high - self.low + 1)
 
     def grid(self, k: int) -> Array:
-        """[K] equally likely values: the mid-quantiles, or every category."""
+        """Equally likely values [K]: the mid-quantiles, or every category."""
         if self.distribution == "categorical":
             return np.arange(self.low, self.high + 1)
         return self.ppf((np.arange(k) + 0.5) / k)
 
     def encode(self, theta: Array) -> Array:
-        """theta [...] -> features [..., F]: one-hot if categorical, else 2 cdf - 1 in [-1, 1]."""
+        """Features [..., F] of theta [...]: one-hot if categorical, else 2 cdf - 1 in [-1, 1]."""
         if self.distribution == "categorical":
             return (np.asarray(theta)[..., None] == self.grid(0)).astype(float)
         return (2 * self.cdf(np.asarray(theta)) - 1)[..., None]
 
     def drifted(self, theta: Array, normal: Array) -> Array:
-        """theta [...] of the next episode of a trial, by standard normal draws of the same shape."""
-        u = np.abs(self.cdf(theta) + self.drift * normal) % 2  # unfolded, the reflected walk is periodic
+        """Theta [...] of a trial's next episode, by standard normal draws of the same shape."""
+        u = np.abs(self.cdf(theta) + self.drift * normal) % 2  # the reflected walk is a periodic one, folded
         return self.ppf(np.minimum(u, 2 - u)).clip(self.low, self.high)
 
     def transition(self, k: int) -> Array:
-        """P(value j in the next episode | value i) [K, K] of `grid(k)`, from each value to the bins of all.
+        """Transition matrix [K, K] of `grid(k)`: P(bin of value j in the next episode | value i).
 
-        The walk's density is a sum over its images, u' + 2 m and -u' + 2 m. Rows and columns sum to one.
+        The walk's density is a sum over its images, u' + 2 m and -u' + 2 m. Rows and columns sum to 1.
         """
         k = self.features if self.distribution == "categorical" else k
         if not self.drift:

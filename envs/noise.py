@@ -1,4 +1,4 @@
-"""Process noise: normal on every coordinate of a joint, and for rotations on the tangent space at the outcome."""
+"""Process noise: normal on every coordinate of a joint; for rotations, on the tangent space at the outcome."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
 
-WIDEST = 0.5  # std of a rotation, rad: beyond, more than half a turn is no longer out of the question
+MAX_ROTATION_STD = 0.5  # rad; log_prob neglects noise of more than half a turn
 
 
 class Kind(NamedTuple):
-    """A type of joint: how many columns it has in qpos and qvel, and what its standard deviations are of."""
+    """A type of joint: its numbers of columns in qpos and qvel, and the quantities that have a standard deviation."""
 
     name: str
     qpos: int
@@ -35,21 +35,21 @@ KINDS = {
 
 
 def columns(model: mujoco.MjModel, joint: str) -> tuple[range, range]:
-    """Where states [..., S] have a joint's qpos and qvel. Raises KeyError, which names all joints, if it is unknown."""
-    found = model.joint(joint)
-    kind = KINDS[mujoco.mjtJoint(int(found.type[0]))]
-    q, v = 1 + int(found.qposadr[0]), 1 + model.nq + int(found.dofadr[0])
+    """Columns of a joint's qpos and qvel in states [..., S]. Raises KeyError, with all joints' names, if unknown."""
+    element = model.joint(joint)
+    kind = KINDS[mujoco.mjtJoint(int(element.type[0]))]
+    q, v = 1 + int(element.qposadr[0]), 1 + model.nq + int(element.dofadr[0])
     return range(q, q + kind.qpos), range(v, v + kind.qvel)
 
 
 class ProcessNoise:
-    """Independent normal noise, of a standard deviation for each part of a joint; 0 is no noise.
+    """Independent normal noise with a standard deviation for each part of a joint, 0 for no noise.
 
     stds: joint -> (position, velocity) of a hinge or slide joint; (rotation, angular velocity) of a ball joint, and
-    (position, rotation, velocity, angular velocity) of a free one, each std on all three axes. Units are m and rad,
-    or these a second. A rotation q becomes q exp(w / 2), for noise w [3] (rad) about the body's own axes.
+    (position, rotation, velocity, angular velocity) of a free joint, each std on all three axes. Units are m, rad,
+    m/s and rad/s. A rotation q becomes q exp(w / 2), for noise w [3] (rad) about the body's own axes.
 
-    Attributes: `size`, Z, the unit noise a step, in the order of stds; `columns`, those of the state that it moves.
+    Attributes: `size`, Z, the width of a step's unit noise, in the order of stds; `columns` of the state with noise.
     Raises InputError for stds that do not fit the joint, or that are negative, and KeyError for an unknown joint.
     """
 
@@ -58,7 +58,7 @@ class ProcessNoise:
         index: list[int] = []  # of plain coordinates, in the state
         draws: list[int] = []  # and in the noise
         sigma: list[float] = []
-        self._rotations: list[tuple[slice, slice, float]] = []  # likewise, of quaternions
+        self._rotations: list[tuple[slice, slice, float]] = []  # the same of quaternions
         for joint, given in stds.items():
             for part, std in _parts(model, joint, given):
                 if std == 0:
@@ -77,31 +77,32 @@ class ProcessNoise:
         self.columns: NDArray[np.int64] = np.sort(np.concatenate([self._index, *quaternions]))
 
     def apply(self, outcome: Array, noise: Array) -> Array:
-        """Outcome [N, S], which is written to, and unit noise [N, Z] -> next state [N, S]; quaternions are unit."""
+        """Outcome [N, S] and unit noise [N, Z] -> next state [N, S], in place; quaternions stay of unit length."""
         outcome[:, self._index] += self._sigma * noise[:, self._draws]
         for at, drawn, std in self._rotations:
-            turned = _product(outcome[:, at], _exp(std * noise[:, drawn]))
-            outcome[:, at] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
+            rotated = _product(outcome[:, at], _exp(std * noise[:, drawn]))
+            outcome[:, at] = rotated / np.linalg.norm(rotated, axis=-1, keepdims=True)
         return outcome
 
     def log_prob(self, next_state: Array, outcome: Array) -> Array:
-        """log p [...] of next states [..., S], given their outcome [..., S].
+        """Log density [...] of next states [..., S], given their outcome [..., S].
 
-        Rotations have theirs with respect to the Haar measure, dw near the outcome and (sin(|w| / 2) / (|w| / 2))^2 dw
-        further off, so that densities about several outcomes compare. q and -q are the same rotation.
+        The density of a rotation is with respect to the Haar measure, dw near the outcome and
+        (sin(|w| / 2) / (|w| / 2))^2 dw further off, so that densities about different outcomes can be compared. q and
+        -q are the same rotation.
         """
         z = (next_state[..., self._index] - outcome[..., self._index]) / self._sigma
         total = -0.5 * (z**2).sum(-1) - np.log(self._sigma).sum() - 0.5 * len(self._sigma) * np.log(2 * np.pi)
         for at, _, std in self._rotations:
-            turned = _product(outcome[..., at] * (1, -1, -1, -1), next_state[..., at])
-            half = np.arctan2(np.linalg.norm(turned[..., 1:], axis=-1), np.abs(turned[..., 0]))  # |w| / 2
+            between = _product(outcome[..., at] * (1, -1, -1, -1), next_state[..., at])
+            half = np.arctan2(np.linalg.norm(between[..., 1:], axis=-1), np.abs(between[..., 0]))  # |w| / 2
             normal = -0.5 * (2 * half / std) ** 2 - 3 * np.log(std) - 1.5 * np.log(2 * np.pi)
             total = total + normal - 2 * np.log(np.sinc(half / np.pi))
         return total
 
 
 def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[tuple[range, float]]:
-    """A joint's standard deviations, each with the columns of the state that it is of."""
+    """Pairs of columns of the state and their standard deviation, for each part of a joint."""
     q, v = columns(model, joint)
     parts = {1: [q, v], 4: [q, v], 7: [q[:3], q[3:], v[:3], v[3:]]}[len(q)]
     kind = KINDS[mujoco.mjtJoint(int(model.joint(joint).type[0]))]
@@ -112,13 +113,15 @@ def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[t
         )
     if not all(0 <= std < np.inf for std in stds):
         raise InputError(f"process_noise of joint {joint} was {stds}; it must be standard deviations, from 0 up")
-    if any(std > WIDEST for part, std in zip(parts, stds, strict=True) if len(part) == 4):
-        raise InputError(f"process_noise of joint {joint} was {stds}; its rotation's must be at most {WIDEST} rad")
+    if any(std > MAX_ROTATION_STD for part, std in zip(parts, stds, strict=True) if len(part) == 4):
+        raise InputError(
+            f"process_noise of joint {joint} was {stds}; its rotation's must be at most {MAX_ROTATION_STD} rad"
+        )
     return list(zip(parts, stds, strict=True))
 
 
 def _product(p: Array, q: Array) -> Array:
-    """Quaternions p and q [..., 4] -> p q [..., 4]: q's rotation, then p's."""
+    """Product p q [..., 4] of quaternions [..., 4]: q's rotation, then p's."""
     a, b, c, d = np.moveaxis(p, -1, 0)
     e, f, g, h = np.moveaxis(q, -1, 0)
     return np.stack(
@@ -133,6 +136,6 @@ def _product(p: Array, q: Array) -> Array:
 
 
 def _exp(w: Array) -> Array:
-    """Rotation vectors [..., 3] (rad) -> unit quaternions [..., 4]."""
+    """Unit quaternions [..., 4] of rotation vectors [..., 3], rad."""
     half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
     return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)

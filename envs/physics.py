@@ -1,4 +1,4 @@
-"""MuJoCo, batched: one model per environment in one mujoco.rollout thread pool. The only file that steps MuJoCo."""
+"""Batched MuJoCo: a model for each environment, stepped by mujoco.rollout's thread pool. No other file steps MuJoCo."""
 
 from __future__ import annotations
 
@@ -19,45 +19,45 @@ from deconfounded.envs.edits import Edit, ModelEdit, SpecEdit
 from deconfounded.envs.noise import ProcessNoise, columns
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.handles import Handle
-from deconfounded.envs.task import Painter, Simulator, Task
+from deconfounded.envs.task import Renderer, Simulator, Task
 
 STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 
 def cores() -> int:
-    """How many threads to use: the cores this process may run on, or OMP_NUM_THREADS if that is fewer."""
-    wanted = os.environ.get("OMP_NUM_THREADS", "")
-    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(there, int(wanted)) if wanted.isdecimal() and int(wanted) > 0 else there
+    """Number of threads to use: the cores that this process may run on, or OMP_NUM_THREADS if that is fewer."""
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(available, int(limit)) if limit.isdecimal() and int(limit) > 0 else available
 
 
 class Physics(Simulator):
-    """n models, each with its own theta, stepped in a thread pool; OMP_NUM_THREADS sets its size."""
+    """Models of n environments, each with its own theta, stepped in a thread pool of `cores()` threads."""
 
     def __init__(self, task: MujocoTask, n: int) -> None:
         super().__init__(task, n)
         self._mujoco_task = task
         self.models = [copy.copy(task.model) for _ in range(n)]
-        self._furnish()
+        self._allocate()
         for i in range(n):
             self.set_theta(i, self.theta[i])
 
-    def _furnish(self) -> None:
-        """Make what is of this machine and process, and no part of the state."""
+    def _allocate(self) -> None:
+        """Create thread pools and scratch space, which belong to this process and are no part of the state."""
         model, threads = self._mujoco_task.model, cores()
         self._threads = threads if threads > 1 else 0
         self._pools = {size: Handle(partial(rollout.Rollout, nthread=size)) for size in {0, self._threads}}
         self._datas = [mujoco.MjData(model) for _ in range(max(threads, 1))]
-        self._edits = [ModelEdit(one, model, self._datas[0]) for one in self.models]
+        self._edits = [ModelEdit(edited, model, self._datas[0]) for edited in self.models]
         self._buffer: Array = np.empty(0)
 
     def __getstate__(self) -> dict[str, Any]:
-        furniture = ("_threads", "_pools", "_datas", "_edits", "_buffer")
-        return {name: value for name, value in vars(self).items() if name not in furniture}
+        local = ("_threads", "_pools", "_datas", "_edits", "_buffer")
+        return {name: value for name, value in vars(self).items() if name not in local}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._furnish()
+        self._allocate()
 
     def set_theta(self, i: int, theta: Array) -> None:
         self.theta[i] = theta
@@ -67,13 +67,13 @@ class Physics(Simulator):
     def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
         width, physical = state.shape[1], state.shape[1] - self._mujoco_task.readings
         shape = (len(state), self._mujoco_task.substeps, physical)
-        if self._buffer.size < (size := int(np.prod(shape))):  # kept: large arrays are slow to get anew
+        if self._buffer.size < (size := int(np.prod(shape))):  # kept, as large arrays are slow to allocate
             self._buffer = np.empty(size)
         rolled = self._roll(state[:, :physical], action[:, None], rows, self._buffer[:size].reshape(shape))[:, -1]
         return np.pad(rolled, ((0, 0), (0, width - physical))) if width > physical else rolled.copy()
 
     def rollout(self, state: Array, action: Array) -> Array:
-        """Open loop: states [n, S] and actions [n, T, A] -> noise-free states [n, T * substeps, S - readings]."""
+        """Noise-free states [n, T * substeps, S - readings] from states [n, S] and actions [n, T, A], in open loop."""
         steps, physical = action.shape[1] * self._mujoco_task.substeps, state.shape[1] - self._mujoco_task.readings
         return self._roll(state[:, :physical], action, None, np.empty((len(state), steps, physical)))
 
@@ -84,7 +84,7 @@ class Physics(Simulator):
         control = np.repeat(self._mujoco_task.control(action), self._mujoco_task.substeps, axis=1)
         models = self.models if rows is None else [self.models[i] for i in rows.tolist()]
         threads = self._threads if n > 1 else 0
-        # Arrays are float64 and contiguous already; without a warm start, the solver starts from scratch in every
+        # Arrays are float64 and contiguous already. There is no warm start: the solver starts from scratch in every
         # control step, so that the next state is a function of this state alone.
         self._pools[threads]().rollout(
             models,
@@ -95,7 +95,7 @@ class Physics(Simulator):
             state=out,
             sensordata=np.empty((n, steps, models[0].nsensordata)),
             skip_checks=True,
-            chunk_size=max(1, n // (2 * max(threads, 1))),  # two for each thread: handing one over takes its time
+            chunk_size=max(1, n // (2 * max(threads, 1))),  # two chunks a thread: each hand-over takes time
         )
         return out
 
@@ -103,15 +103,16 @@ class Physics(Simulator):
 class MujocoTask(Task):
     """A task whose outcome is MuJoCo's next state: x' = f(x, a, theta) + w, w ~ N(0, diag sigma^2), a control step.
 
-    The state [S] is MuJoCo's full physics state (time, qpos, qvel, act), and after it what the task's sensors read.
-    Joints are read by name.
+    The state [S] is MuJoCo's full physics state (time, qpos, qvel, act), followed by the readings of the task's
+    sensors. Joints are read by name.
     """
 
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     substeps: ClassVar[int] = 2  # physics steps a control step
-    process_noise: ClassVar[dict[str, tuple[float, ...]]]  # joint -> std of (position, velocity) a control step
-    readings: ClassVar[int] = 0  # columns, at the end of the state, that `sense` fills with what its noise gives them
-    # Of ball and free joints, see envs/noise.py. A coordinate without noise counts as no evidence: it must be of no
-    # consequence, or one that theta does not move.
+    # joint -> std of (position, velocity) a control step; of ball and free joints see envs/noise.py. A coordinate
+    # without noise counts as no evidence: theta must not move it, or nothing observed may depend on it.
+    process_noise: ClassVar[dict[str, tuple[float, ...]]]
+    readings: ClassVar[int] = 0  # last columns of the state, which `sense` fills
 
     @abstractmethod
     def apply_latent(self, edit: Edit, theta: Array) -> None:
@@ -122,16 +123,16 @@ class MujocoTask(Task):
         return action
 
     def spec(self) -> mujoco.MjSpec:
-        """The nominal model, from <name>.xml in `home`. Every environment has a copy, so that it should be small."""
+        """The nominal model, from <name>.xml in `home`. Every environment has a copy, so keep it small."""
         return mujoco.MjSpec.from_file(str(self.home / f"{self.name}.xml"))
 
     def decorate(self, spec: mujoco.MjSpec) -> None:
-        """Add what is to be looked at only, for pictures: by default, a sky."""
+        """Add visual elements, for pictures only; by default a sky."""
         render.sky(spec)
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled nominal model. Never edited: environments copy it."""
+        """The compiled nominal model. It is never edited: environments copy it."""
         return self.spec().compile()
 
     @property
@@ -141,19 +142,20 @@ class MujocoTask(Task):
     def qpos(self, state: Array, joint: str) -> Array:
         """Position [...] of a hinge or slide joint in states [..., S], rad or m.
 
-        Of a ball joint its quaternion [..., 4], of a free one position (m) and quaternion [..., 7].
+        Of a ball joint, its quaternion [..., 4]; of a free joint, position (m) and quaternion [..., 7].
         """
         return state[..., self._address(joint)[0]]
 
     def qvel(self, state: Array, joint: str) -> Array:
         """Velocity [...] of a hinge or slide joint, rad/s or m/s.
 
-        Of a ball joint its angular velocity about its own axes [..., 3], of a free one velocity and that [..., 6].
+        Of a ball joint, its angular velocity about its own axes [..., 3]; of a free joint, velocity and angular
+        velocity [..., 6].
         """
         return state[..., self._address(joint)[1]]
 
     def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
-        """States [N, S] with the named joints' (position, velocity), [N] or numbers; all others at the MJCF's rest.
+        """States [N, S] with given (position, velocity) of joints, [N] or numbers; other joints are at the MJCF's rest.
 
         Of ball and free joints they are [N, K] or [K], with K as of `qpos` and `qvel`, or a number for all K.
         """
@@ -180,20 +182,20 @@ class MujocoTask(Task):
 
     @cached_property
     def noise(self) -> ProcessNoise:
-        """The noise of `process_noise`. Raises InputError where it does not fit the model's joints."""
+        """The noise that `process_noise` states. Raises InputError where it does not fit the model's joints."""
         return ProcessNoise(self.model, self.process_noise)
 
     def simulator(self, n: int) -> Physics:
         return Physics(self, n)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         spec = self.spec()
         self.decorate(spec)
         self.apply_latent(SpecEdit(spec), theta)
-        return render.Painter(spec.compile())
+        return render.MujocoRenderer(spec.compile())
 
     def sample_noise(self, rng: Streams) -> Array:
-        """Unit normal: of the process first, then a column for each reading."""
+        """Unit normal noise: of the process first, then a column for each reading."""
         return rng.standard_normal((rng.groups, self.horizon, self.noise.size + self.readings))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
@@ -207,5 +209,3 @@ class MujocoTask(Task):
 
     def log_prob(self, next_state: Array, outcome: Array) -> Array:
         return self.noise.log_prob(next_state, outcome)
-
-    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)

@@ -16,11 +16,11 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 
 TASKS: dict[str, type[Task]] = {}
-GROUP = "deconfounded.tasks"  # entry points of installed packages: name = "package.module:Class"
+GROUP = "deconfounded.tasks"  # group of entry points of installed packages: name = "package.module:Class"
 
 
 def register(cls: type[Task]) -> type[Task]:
-    """Add a task by its name, for `get` and for gymnasium; usable as a decorator. Raises InputError if it is taken."""
+    """Add a task to the registry and to gymnasium; usable as a decorator. Raises InputError for an invalid class."""
     name, where = getattr(cls, "name", None), _where(cls)
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise InputError(
@@ -51,7 +51,7 @@ def register(cls: type[Task]) -> type[Task]:
 
 
 def _parts(task: Task) -> tuple[Any, ...]:
-    """A task from outside for `pickle`: its module has no name that another process could import."""
+    """Pickle's parts of a task from outside, whose module has no name that another process could import."""
     return get, (task.reference,), vars(task) or None
 
 
@@ -60,21 +60,21 @@ def _where(cls: type[Task]) -> str:
 
 
 def names() -> list[str]:
-    """The tasks that are registered, and those that installed packages offer as entry points."""
+    """Names of registered tasks, and of those that installed packages offer as entry points."""
     return list(dict.fromkeys([*TASKS, *(point.name for point in entry_points(group=GROUP))]))
 
 
-def closest(kind: str, given: str, known: list[str], remedy: str = "") -> InputError:
-    """The error for a name that is not known: it names the nearest one, and what else may help."""
-    near = difflib.get_close_matches(given, known, 1, 0.6)
+def closest(kind: str, given: str, choices: list[str], remedy: str = "") -> InputError:
+    """The error for an unknown name, which suggests the closest of the choices; remedy: appended to the message."""
+    near = difflib.get_close_matches(given, choices, 1, 0.6)
     hint = f"did you mean {near[0]!r}? " if near else ""
-    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(known)}{remedy}")
+    return InputError(f"{kind} {given!r} is unknown; {hint}there are {', '.join(choices)}{remedy}")
 
 
 def get(name: str) -> Task:
-    """The task of that name, or one from outside: path/file.py:Class, or package.module:Class.
+    """The task of a name, or of a reference: path/file.py:Class, or package.module:Class.
 
-    Raises InputError, naming the nearest, if there is none.
+    Raises InputError, which suggests the closest name, if there is none.
     """
     if not isinstance(name, str):
         raise InputError(f"task was {name!r}; it must be a name, or path/file.py:Class")
@@ -86,9 +86,9 @@ def get(name: str) -> Task:
     if not outside.is_outside(name):
         raise closest("task", name, names(), "; your own is path/file.py:Class")
     reference = outside.absolute(name)
-    for known in TASKS.values():
-        if known.reference == reference:
-            return known()
+    for registered in TASKS.values():
+        if registered.reference == reference:
+            return registered()
     cls = outside.find("task", name)
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
@@ -104,14 +104,14 @@ def make(name: str, privileged: bool = False, render_mode: str | None = None) ->
 def make_vec(
     name: str, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
 ) -> GymVectorEnv:
-    """n environments in one gymnasium VectorEnv, stepped natively in a thread pool; trials are of `episodes` each."""
+    """A gymnasium VectorEnv of n environments, stepped natively in a thread pool; a trial has `episodes` episodes."""
     return GymVectorEnv(get(name), n, privileged, episodes, render_mode)
 
 
 def make_registered_vec(
     name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kwargs: Any
 ) -> GymVectorEnv:
-    """`make_vec` as gymnasium.make_vec calls it, with the registered time limit. Raises InputError for another one."""
+    """`make_vec` as gymnasium.make_vec calls it. Raises InputError for a time limit other than the registered one."""
     task = get(name)
     if max_episode_steps not in (None, task.horizon):
         raise InputError(

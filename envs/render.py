@@ -1,4 +1,4 @@
-"""Pictures of MuJoCo states without a screen: EGL, else OSMesa, else InputError."""
+"""Rendering of MuJoCo states without a screen: by EGL, else by OSMesa, else InputError."""
 
 from __future__ import annotations
 
@@ -22,52 +22,51 @@ _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco
 
 @cache
 def backend() -> str:
-    """The GL backend that works here: MUJOCO_GL if it is set, else egl or osmesa. Raises InputError if none does."""
+    """Name of the GL backend that works here: MUJOCO_GL if set, else egl or osmesa. Raises InputError if none does."""
     # A failed import leaves PyOpenGL on the wrong platform, so each is tried in a process of its own.
-    wanted = os.environ.get("MUJOCO_GL", "").strip().lower()  # as mujoco reads it
-    for name in (wanted,) if wanted else ("egl", "osmesa"):
+    selected = os.environ.get("MUJOCO_GL", "").strip().lower()  # as mujoco reads it
+    for name in (selected,) if selected else ("egl", "osmesa"):
         environ = {**os.environ, "MUJOCO_GL": name}
         if subprocess.run([sys.executable, "-c", _PROBE], env=environ, capture_output=True).returncode == 0:
             return name
-    raise InputError(f"no GL for pictures: tried {wanted or 'egl and osmesa'}; install libegl1 or libosmesa6")
+    raise InputError(f"no GL for pictures: tried {selected or 'egl and osmesa'}; install libegl1 or libosmesa6")
 
 
-_DRAWING: set[int] = set()
-"""Processes that have made a GL context: this one, and those that it was forked from."""
+_GL_PROCESSES: set[int] = set()
+"""Ids of processes that have created a GL context: this process, and those that it was forked from."""
 
 
-def _renderer(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
-    if _DRAWING - {os.getpid()}:  # the GL library would wait for threads that stayed behind
+def _create(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+    if _GL_PROCESSES - {os.getpid()}:  # the GL library would wait for threads of the parent process
         raise InputError("pictures cannot be made in a fork of a process that has made some; start it by `spawn`")
-    _DRAWING.add(os.getpid())
+    _GL_PROCESSES.add(os.getpid())
     return mujoco.Renderer(model, height, width)
 
 
 def _load_triton() -> None:
-    """Import triton, if it is installed, before a GL is loaded, or apart from it."""
-    # Mesa's software renderers and triton each bring an LLVM. Mesa's is visible to the whole process (RTLD_GLOBAL): a
-    # triton that is loaded after it binds to the wrong one and dies of a segmentation fault, one that is loaded before
-    # it has bound to its own. torch imports triton with its first optimizer, which is after the first picture of
-    # whoever renders, then trains. Where somebody else has loaded a GL before us, RTLD_DEEPBIND makes triton look in
-    # itself first; not elsewhere, as that also goes past a malloc that is preloaded. It costs .1 s and 90 MB, once, and
-    # imports no torch.
+    """Import triton, if it is installed, before a GL library is loaded, or isolated from it."""
+    # Mesa's software renderers and triton each contain an LLVM. Mesa's is visible to the whole process (RTLD_GLOBAL): a
+    # triton that is loaded later binds to Mesa's and crashes; a triton that is loaded earlier has bound to its own.
+    # torch imports triton with its first optimizer, which is too late for a process that renders, then trains. Where a
+    # GL library is loaded already, RTLD_DEEPBIND makes triton search itself first; only there, as that also bypasses a
+    # preloaded malloc. The import costs .1 s and 90 MB, once, and imports no torch.
     if "triton" in sys.modules:
         return
-    apart = getattr(os, "RTLD_DEEPBIND", 0) if "OpenGL" in sys.modules else 0
-    if apart:
+    deepbind = getattr(os, "RTLD_DEEPBIND", 0) if "OpenGL" in sys.modules else 0
+    if deepbind:
         flags = sys.getdlopenflags()
-        sys.setdlopenflags(flags | apart)
+        sys.setdlopenflags(flags | deepbind)
     try:
         importlib.import_module("triton")
     except ImportError:
         pass
     finally:
-        if apart:
+        if deepbind:
             sys.setdlopenflags(flags)
 
 
 def _close(renderer: mujoco.Renderer) -> None:
-    # In its own context: Renderer.close frees buffers by number in whichever is current, be it another painter's.
+    # Renderer.close frees buffers by number in the current context, which may be another renderer's: select its own.
     if renderer._gl_context is not None and renderer._mjr_context is not None:
         renderer._gl_context.make_current()
         renderer._mjr_context.free()
@@ -76,7 +75,7 @@ def _close(renderer: mujoco.Renderer) -> None:
 
 
 def ribbon(spec: mujoco.MjSpec, name: str, left: Array, right: Array, grey: float) -> None:
-    """Add a strip on the ground between two lines [K, 2] (m), to look at only."""
+    """Add a visual strip on the ground between two lines [K, 2], m."""
     k, i = len(left), np.arange(len(left) - 1)
     corners = np.pad(np.concatenate([left, right]), ((0, 0), (0, 1)), constant_values=0.002)
     faces = np.stack([i, i + k, i + 1, i + 1, i + k, i + k + 1], -1)
@@ -94,7 +93,7 @@ def sky(spec: mujoco.MjSpec) -> None:
 
 
 def chequer(spec: mujoco.MjSpec, material: str) -> None:
-    """Cover a material with dark chequers."""
+    """Give a material a dark chequered texture."""
     builtin, kind = mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtTexture.mjTEXTURE_2D
     colours = {"rgb1": [0.1, 0.2, 0.3], "rgb2": [0.2, 0.3, 0.4]}
     spec.add_texture(name=material, type=kind, builtin=builtin, width=64, height=64, **colours)
@@ -102,18 +101,18 @@ def chequer(spec: mujoco.MjSpec, material: str) -> None:
 
 
 def level(model: mujoco.MjModel) -> None:
-    """Roll the camera `view` so that gravity points down in its picture, if there is any across it."""
+    """Roll the camera `view` until gravity points down in its picture, unless there is none across the view."""
     view, data = model.camera("view"), mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     right, up, _ = model.opt.gravity @ data.cam_xmat[view.id].reshape(3, 3)
-    if np.hypot(right, up) <= 1e-6 * np.linalg.norm(model.opt.gravity):  # none, or seen from straight above
+    if np.hypot(right, up) <= 1e-6 * np.linalg.norm(model.opt.gravity):
         return
     roll, before = np.arctan2(right, -up) / 2, view.quat.copy()
     mujoco.mju_mulQuat(view.quat, before, np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
 
 
-class Painter:
-    """Draws states of one model, which it keeps, by its camera `view`. Raises InputError where no GL works."""
+class MujocoRenderer:
+    """Renderer of a model's states through its camera `view`. Raises InputError where no GL works."""
 
     def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
         _load_triton()
@@ -121,11 +120,11 @@ class Painter:
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
-        self._renderer = Handle(partial(_renderer, model, height, width), _close)
+        self._renderer = Handle(partial(_create, model, height, width), _close)
         self._renderer()
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:
-        """State [S], whatever follows the full physics state in it -> picture [H, W, 3]."""
+        """State [S], of which the full physics state is drawn -> picture [H, W, 3]."""
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
         mujoco.mj_setState(self._model, self._data, state[: mujoco.mj_stateSize(self._model, kind)], kind)
         mujoco.mj_forward(self._model, self._data)

@@ -1,4 +1,4 @@
-"""Random numbers for many rows, each group of which has a generator of its own: what one draws moves no other's."""
+"""Random numbers for a batch of rows in groups, with an independent generator for each group."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.floating[Any]]
 
 
 class Streams:
-    """Rows in equal groups, one after another; each group draws from its own generator, whatever the others do."""
+    """Random numbers for rows in equal consecutive groups, each of which draws from its own generator."""
 
     def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
         self.rngs = list(rngs)
@@ -23,21 +23,21 @@ class Streams:
         return out, list(out.reshape(self.groups, -1))
 
     def random(self, size: tuple[int, ...]) -> Array:
-        """U(0, 1) of that size, whose first axis counts rows."""
+        """Draws from U(0, 1) of a given size, whose first axis counts rows."""
         out, parts = self._parts(size)
         for rng, part in zip(self.rngs, parts, strict=True):
             rng.random(out=part)
         return out
 
     def standard_normal(self, size: tuple[int, ...]) -> Array:
-        """N(0, 1), likewise."""
+        """Draws from N(0, 1) of a given size, whose first axis counts rows."""
         out, parts = self._parts(size)
         for rng, part in zip(self.rngs, parts, strict=True):
             rng.standard_normal(out=part)
         return out
 
     def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:
-        """U(low, high) for bounds [K], a row a generator: K columns [K, groups], to be unpacked."""
+        """Draws from U(low, high) with bounds [K], a row for each generator: K columns [K, groups], to be unpacked."""
         low, high = np.broadcast_arrays(np.asarray(low, float), high)
         return (low + (high - low) * self.random((self.groups, len(low)))).T
 

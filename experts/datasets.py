@@ -1,10 +1,10 @@
-"""Trials as Minari data sets, so that data travels: episodes that know their trial and, for scoring, its theta."""
+"""Trials as Minari data sets: episodes with the number of their trial in their metadata and, for scoring, theta."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,11 @@ from deconfounded.envs.streams import Array
 from deconfounded.envs.task import action_sizes
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
-HORIZON = "deconf_horizon"  # of the data set's metadata: T, which no episode need last
+HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before
 
 
-class _Noting(BatchEnv):
-    """Keeps what Trials do not: rewards and ends [N] of each step, and where episodes began."""
+class _RecordingEnv(BatchEnv):
+    """Environments that record the rewards and ends [N] of each step, by episode, which Trials do not hold."""
 
     def reset(self, *args: Any, **kwargs: Any) -> Any:
         self.steps = [*getattr(self, "steps", []), []]
@@ -33,11 +33,15 @@ class _Noting(BatchEnv):
         return (then, *ended)
 
 
-def collect(task: Task, n: int, agent: Any, seed: int) -> tuple[Trials, Array, list[list[list[Array]]]]:
-    """n trials of an agent, made for an environment -> Trials, theta [N, E, L], and reward and ends of each step."""
-    env = _Noting(task, n)
-    made: Agent = agent(env)
-    trials, _, theta = run_trials(env, made, task.episodes, seed)
+def collect(
+    task: Task, n: int, agent: Callable[[BatchEnv], Agent], seed: int
+) -> tuple[Trials, Array, list[list[list[Array]]]]:
+    """Trials of an agent in n environments, their theta [N, E, L], and the reward and ends of each step.
+
+    agent: a function from the environments to the Agent.
+    """
+    env = _RecordingEnv(task, n)
+    trials, _, theta = run_trials(env, agent(env), task.episodes, seed)
     return trials, theta, env.steps
 
 
@@ -49,14 +53,14 @@ def write(
     algorithm: str,
     scores: tuple[float, float],
 ) -> Path:
-    """A Minari data set `deconf/<task>/<name>-v<version>` under a folder; returns where it is.
+    """Write a Minari data set `deconf/<task>/<name>-v<version>` under a folder; returns its path.
 
-    scores: mean returns of an episode by random actions and by the expert, which Minari normalises with. Raises
-    InputError if it is there already.
+    collected: the result of `collect`. scores: mean returns of an episode by random actions and by the expert, for
+    Minari's normalisation. Raises InputError if the data set exists already.
     """
-    folder = folder.resolve()  # Minari joins a relative one to itself
+    folder = folder.resolve()  # Minari would join a relative path to itself
     with _root(folder), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of authors and links that it would like to be told
+        warnings.simplefilter("ignore", UserWarning)  # about authors and links, which are optional
         import minari
         from minari.data_collector import EpisodeBuffer
 
@@ -65,7 +69,7 @@ def write(
         place = folder / identity
         if place.exists():
             raise InputError(f"{place} is there already; remove it, or give another --out")
-        discrete, buffers, about = trials.actions > 0, list[EpisodeBuffer](), list[dict[str, Any]]()
+        discrete, buffers, metadata = trials.actions > 0, list[EpisodeBuffer](), list[dict[str, Any]]()
         for b in range(len(trials)):
             for e in range(trials.mask.shape[1]):
                 length = int(trials.mask[b, e].sum())
@@ -82,8 +86,8 @@ def write(
                         infos={},
                     )
                 )
-                about.append({"trial": b, "episode": e, "theta": theta[b, e]})
-        made = minari.create_dataset_from_buffers(
+                metadata.append({"trial": b, "episode": e, "theta": theta[b, e]})
+        dataset = minari.create_dataset_from_buffers(
             identity,
             buffers,
             env=gymnasium.spec(task.gym_id),
@@ -93,53 +97,53 @@ def write(
             ref_max_score=scores[1],
             data_format="hdf5",
         )
-        made.storage.update_metadata({HORIZON: trials.mask.shape[2]})
-        made.storage.update_episode_metadata(about)
+        dataset.storage.update_metadata({HORIZON: trials.mask.shape[2]})
+        dataset.storage.update_episode_metadata(metadata)
     return place
 
 
 def read(source: Path | str) -> tuple[Trials, Array | None]:
-    """The Trials of a data set's folder, and its thetas [B, E, L] if it has them: those are for scoring alone.
+    """Trials of a data set's folder, and its thetas [B, E, L], for scoring alone, or None if it has none.
 
-    Raises InputError if there is no data set, or if its episodes do not say which trial they belong to.
+    Raises InputError if there is no data set, or if its episodes' metadata do not name their trial.
     """
     import minari
 
-    places = [file.parent for file in sorted(Path(source).rglob("metadata.json")) if file.parent.name == "data"]
-    if len(places) != 1:
-        raise InputError(f"{source} holds {len(places)} Minari data sets; give the folder of one")
+    folders = [file.parent for file in sorted(Path(source).rglob("metadata.json")) if file.parent.name == "data"]
+    if len(folders) != 1:
+        raise InputError(f"{source} holds {len(folders)} Minari data sets; give the folder of one")
     try:
-        found = minari.MinariDataset(places[0])
-        about = list(found.storage.get_episode_metadata(found.episode_indices))
-        episodes = list(found.iterate_episodes())
+        dataset = minari.MinariDataset(folders[0])
+        metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
+        episodes = list(dataset.iterate_episodes())
     except InputError:
         raise
     except Exception as error:
         raise InputError(f"the data set in {source} cannot be read: {' '.join(str(error).split())}") from None
-    if not episodes or any("trial" not in one or "episode" not in one for one in about):
+    if not episodes or any("trial" not in entry or "episode" not in entry for entry in metadata):
         raise InputError(f"episodes of {source} do not say which `trial` and `episode` they are, in their metadata")
-    b = 1 + max(int(one["trial"]) for one in about)
-    e = 1 + max(int(one["episode"]) for one in about)
-    if len({(int(one["trial"]), int(one["episode"])) for one in about}) != b * e or len(about) != b * e:
-        raise InputError(f"{source} holds {len(about)} episodes; every trial of {b} must have each of {e} once")
-    t = int(found.storage.metadata.get(HORIZON, max(len(episode.rewards) for episode in episodes)))
-    width, n_actions = action_sizes(found.action_space)
+    places = [(int(entry["trial"]), int(entry["episode"])) for entry in metadata]
+    b, e = (1 + max(numbers) for numbers in zip(*places, strict=True))
+    if len(set(places)) != b * e or len(places) != b * e:
+        raise InputError(f"{source} holds {len(places)} episodes; every trial of {b} must have each of {e} once")
+    t = int(dataset.storage.metadata.get(HORIZON, max(len(episode.rewards) for episode in episodes)))
+    width, n_actions = action_sizes(dataset.action_space)
     obs = np.zeros((b, e, t + 1, np.shape(episodes[0].observations)[-1]), np.float32)
     action, mask = np.zeros((b, e, t, width), np.float32), np.zeros((b, e, t), bool)
-    for one, episode in zip(about, episodes, strict=True):
-        at, n = (int(one["trial"]), int(one["episode"])), len(episode.rewards)
+    for at, episode in zip(places, episodes, strict=True):
+        n = len(episode.rewards)
         obs[at][: n + 1], obs[at][n + 1 :] = episode.observations, episode.observations[-1]
         action[at][:n] = np.reshape(episode.actions, (n, width))
         mask[at][:n] = True
-    told = {(int(one["trial"]), int(one["episode"])): one.get("theta") for one in about}
-    whole = all(value is not None for value in told.values())
-    theta = np.array([[told[i, j] for j in range(e)] for i in range(b)]) if whole else None
+    thetas = {at: entry.get("theta") for at, entry in zip(places, metadata, strict=True)}
+    complete = all(value is not None for value in thetas.values())
+    theta = np.array([[thetas[i, j] for j in range(e)] for i in range(b)]) if complete else None
     return Trials(obs, action, mask, n_actions), theta
 
 
 @contextmanager
 def _root(folder: Path) -> Iterator[None]:
-    """Minari keeps its data sets in this folder meanwhile."""
+    """Context in which Minari's folder of data sets is the given one."""
     before = os.environ.get("MINARI_DATASETS_PATH")
     os.environ["MINARI_DATASETS_PATH"] = str(folder)
     try:

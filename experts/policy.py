@@ -1,4 +1,4 @@
-"""Experts: policies that see theta. A closed form where the task has one, else a small network in safetensors."""
+"""Experts, policies that see theta: the task's closed form if it has one, else a small network in safetensors."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from scipy.special import log_ndtr
 from deconfounded.envs import InputError, Task
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS
 
 
-class Random(Protocol):
-    """What is drawn from: a numpy generator, or `envs.streams.Streams`, whose rows are in `groups` equal groups."""
+class RandomSource(Protocol):
+    """A source of random numbers: a numpy generator, or `envs.streams.Streams` of rows in `groups` equal groups."""
 
     def random(self, size: tuple[int, ...]) -> Array: ...
     def standard_normal(self, size: tuple[int, ...]) -> Array: ...
@@ -32,7 +33,7 @@ class Expert(ABC):
     """pi_exp(a | s, theta), batched and Markov."""
 
     @abstractmethod
-    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
+    def act(self, obs: Array, theta: Array, rng: RandomSource) -> Array:
         """Observation [N, O], theta [N, L] -> sampled action [N, A]."""
 
     @abstractmethod
@@ -40,19 +41,19 @@ class Expert(ABC):
         """log pi_exp(a | s, theta) [N]."""
 
 
-def sample_rows(probs: Array, rng: Random) -> NDArray[np.int64]:
-    """One index [N] from each row of probabilities [N, K], which need not be normalised."""
+def sample_rows(probs: Array, rng: RandomSource) -> NDArray[np.int64]:
+    """Indices [N], drawn from each row of probabilities [N, K], which need not be normalised."""
     cumulative = probs.cumsum(-1)
     return (rng.random((len(probs), 1)) * cumulative[:, -1:] > cumulative).sum(-1)
 
 
 class DiscreteExpert(Expert):
-    """The closed form that a task states as `expert_probs`."""
+    """The closed-form expert that a task states as `expert_probs`."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
 
-    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
+    def act(self, obs: Array, theta: Array, rng: RandomSource) -> Array:
         return sample_rows(self._probs(obs, theta), rng)[:, None].astype(float)
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
@@ -65,21 +66,21 @@ class DiscreteExpert(Expert):
 
 
 class BoxExpert(Expert):
-    """clip(mu(s, theta) + sigma eps, -1, 1): any mean action with the task's expert noise sigma."""
+    """A Gaussian expert, clip(mu(s, theta) + sigma eps, -1, 1), with the task's expert noise sigma."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
 
     @abstractmethod
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
-        """mu [N, A] in [-1, 1]. Rows in equal groups should come out, bit for bit, as they would group by group."""
+        """Mean action mu [N, A] in [-1, 1]. Rows in equal groups must give the bits that each group gives alone."""
 
-    def act(self, obs: Array, theta: Array, rng: Random) -> Array:
+    def act(self, obs: Array, theta: Array, rng: RandomSource) -> Array:
         mean = self.mean(obs, theta, getattr(rng, "groups", 1))
         return np.clip(mean + self.task.expert_noise * rng.standard_normal(mean.shape), -1, 1)
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
-        """A Gaussian censored at the action bounds: density inside, tail mass on -1 and 1."""
+        """Log density [N] of a Gaussian censored at the action bounds: density inside, tail mass on -1 and 1."""
         sigma = self.task.expert_noise
         z = (action - self.mean(obs, theta)) / sigma
         inside = -0.5 * z**2 - np.log(sigma * np.sqrt(2 * np.pi))
@@ -87,7 +88,7 @@ class BoxExpert(Expert):
 
 
 class NetworkExpert(BoxExpert):
-    """A tanh network on the observation and the encoded theta."""
+    """An expert whose mean is a tanh network of the observation and the encoded theta."""
 
     def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
         super().__init__(task)
@@ -103,22 +104,22 @@ class NetworkExpert(BoxExpert):
         return np.clip(out.reshape(len(rows), -1), -1, 1).astype(float)
 
 
-class OwnExpert(BoxExpert):
-    """Any callable from observation [N, O] and theta [N, L], in its units, to the mean action [N, A]."""
+class CallableExpert(BoxExpert):
+    """An expert whose mean is any callable from observation [N, O] and theta [N, L], in its units, to [N, A]."""
 
     def __init__(self, task: Task, call: Callable[[Array, Array], Array], name: str) -> None:
         super().__init__(task)
         self.call, self.name = call, name
 
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
-        """Clipped to [-1, 1]. Raises InputError for what is not one finite row for each observation."""
+        """Mean action, clipped to [-1, 1]. Raises InputError unless it is a finite row for each observation."""
         parts = zip(np.split(obs, groups), np.split(theta, groups), strict=True)
-        try:  # on copies: what it does to them is its own business
+        try:  # on copies, as the callable may change them in place
             given = np.concatenate([np.asarray(self.call(np.array(o), np.array(t)), float) for o, t in parts])
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f"expert {self.name}: {outside.told(error)}") from error
+            raise InputError(f"expert {self.name}: {error_line(error)}") from error
         shape = (len(obs), self.task.action_width)
         if given.shape != shape or not np.isfinite(given).all():
             what = f"shape {given.shape}" if given.shape != shape else "NaN or infinity"
@@ -127,20 +128,20 @@ class OwnExpert(BoxExpert):
 
 
 def path(task: Task) -> Path:
-    """Where the weights of a task's expert lie; its card lies beside them as .json."""
+    """Path of the weights of a task's expert; its card is the .json beside them."""
     folder = ASSETS / "experts" if task.home == ASSETS else task.home
     return folder / f"{task.name}.safetensors"
 
 
 def names_callable(source: str) -> bool:
-    """Whether an expert's source is path/file.py:name or package.module:name, and not a file of weights."""
+    """Whether an expert's source is path/file.py:name or package.module:name, not a file of weights."""
     return outside.is_outside(source) and not source.endswith(".safetensors")
 
 
 def load(task: Task, source: str | Path | None = None) -> Expert:
-    """The task's expert: the closed form, the weights that come with the task, or others.
+    """Load a task's expert: the closed form, the weights that come with the task, or others.
 
-    source: a .safetensors file, or a callable (`OwnExpert`) as path/file.py:name or package.module:name. Raises
+    source: a .safetensors file, or a callable (`CallableExpert`) as path/file.py:name or package.module:name. Raises
     InputError if it is missing, damaged, or does not fit the task.
     """
     if task.n_actions:
@@ -150,7 +151,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
     if source is not None and (not isinstance(source, str | Path) or not str(source).strip()):
         raise InputError(f"expert was {source!r}; it must be weights.safetensors, or path/file.py:name of a callable")
     if isinstance(source, str) and names_callable(source):
-        expert = OwnExpert(task, outside.find("expert", source), source)
+        expert = CallableExpert(task, outside.find("expert", source), source)
         if not callable(expert.call):
             raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")
         lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
@@ -164,11 +165,11 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:
-        told = json.loads(file.with_suffix(".json").read_bytes()).get("sha256")
-    except (OSError, ValueError, AttributeError):  # weights of one's own may go without a card
-        told = None
+        recorded = json.loads(file.with_suffix(".json").read_bytes()).get("sha256")
+    except (OSError, ValueError, AttributeError):  # a card is optional
+        recorded = None
     try:
-        if told not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
+        if recorded not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
             raise OSError(f"their sha256 is not that of {file.with_suffix('.json').name}")
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
@@ -187,20 +188,20 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
 
 
 def fingerprint(task: Task, source: str | Path | None = None) -> str:
-    """SHA-256 of a file of weights, by default the task's own; or `closed form`."""
+    """SHA-256 of a file of weights, by default the task's own, or `closed form`."""
     file = path(task) if source is None else Path(source)
     return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "closed form"
 
 
 def version(task: Task, source: str | Path | None = None) -> int:
-    """The version of an expert, raised by hand when its actions change: of weights the one in their card, else 0.
+    """Version of an expert, raised by hand when its actions change: that in the weights' card, else 0.
 
-    That of a closed form is its task's.
+    A closed form has its task's version.
     """
     if task.n_actions:
         return task.version
     card = (path(task) if source is None else Path(source)).with_suffix(".json")
     try:
         return int(json.loads(card.read_bytes()).get("version", 0))
-    except (OSError, ValueError, TypeError, AttributeError):  # weights of one's own may go without a card
+    except (OSError, ValueError, TypeError, AttributeError):  # a card is optional
         return 0

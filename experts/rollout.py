@@ -1,4 +1,4 @@
-"""Trials: the data that imitators learn from, the agents that make it, and the loop that runs them."""
+"""Roll-outs: trials, the data that imitators learn from; agents, which act in them; and the loop that runs them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Trials:
 
     obs [B, E, T + 1, O] float32; action [B, E, T, A] float32; mask [B, E, T] bool, whether step t took place (False
     once an episode has ended early); actions: the number of discrete actions, or 0 for actions in [-1, 1].
-    Raises InputError for shapes that do not fit each other, NaN, or actions that cannot be.
+    Raises InputError for shapes that do not fit each other, NaN, or invalid actions.
     """
 
     obs: NDArray[np.float32]
@@ -66,7 +66,7 @@ class Trials:
 
     @property
     def sha256(self) -> str:
-        """Of shapes and contents: of what is in them, and not of how a file holds it."""
+        """SHA-256 of shapes and contents, whatever file they are in."""
         digest = hashlib.sha256(f"{self.obs.shape} {self.action.shape} {self.actions}".encode())
         for array in (self.obs, self.action, self.mask):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -74,31 +74,31 @@ class Trials:
 
     @staticmethod
     def from_minari(source: Path | str) -> Trials:
-        """The trials of a Minari data set's folder, without their thetas; see `experts.dataset.read`."""
+        """The trials of a Minari data set's folder, without their thetas; see `experts.datasets.read`."""
         from deconfounded.experts import datasets
 
         return datasets.read(source)[0]
 
     def save(self, file: Path, made_of: str = "") -> None:
-        """Write an .npz file, atomically. made_of: anything that `load` is to find in it."""
-        buffer, known = io.BytesIO(), {"actions": self.actions, "made_of": made_of}
-        np.savez_compressed(buffer, obs=self.obs, action=self.action, mask=self.mask, **known)  # type: ignore[arg-type]
+        """Write an .npz file atomically. made_of: identity of the data, which `load` compares."""
+        buffer, arrays = io.BytesIO(), {"obs": self.obs, "action": self.action, "mask": self.mask}
+        np.savez_compressed(buffer, **arrays, actions=self.actions, made_of=made_of)  # type: ignore[arg-type]
         write_atomically(file, buffer.getvalue())
 
     @staticmethod
     def load(file: Path, made_of: str | None = None) -> Trials:
-        """Read what `save` wrote. Raises InputError if the file is missing or damaged, or made of something else."""
+        """Read what `save` wrote. Raises InputError if the file is missing or damaged, or its `made_of` differs."""
         try:
             with np.load(file, allow_pickle=False) as data:
                 if made_of not in (None, str(data["made_of"])):
                     raise InputError("it was made of something else")
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
-        except Exception as error:  # a file that is no zip, or half of one, fails in many ways
+        except Exception as error:  # a damaged zip file raises many types of errors
             raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
 
 
 def joined(parts: Sequence[Trials]) -> Trials:
-    """The trials of all parts, one after another; they are of the same kind and shape."""
+    """Concatenate trials of the same shape."""
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
     return Trials(obs, action, mask, parts[0].actions)
 
@@ -108,15 +108,15 @@ State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
 
 
 class Agent(ABC):
-    """Something that acts in N trials side by side, from its own history alone."""
+    """A policy that acts in N trials side by side, from its own history alone."""
 
     def begin(self, n: int) -> None:  # noqa: B027 (agents without memory need nothing here)
-        """Forget everything: n new trials start, each under a theta of its own."""
+        """Start n new trials, each under a theta of its own: reset all memory."""
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027 (nor those without random numbers)
-        """An episode starts, the first of new trials or the next of the same: theta stays.
+        """Start an episode of the present trials: theta stays, and so may memory.
 
-        rngs: its random numbers, one generator for each of equal groups of trials.
+        rngs: a generator for each of equal groups of trials.
         """
 
     @abstractmethod
@@ -126,37 +126,37 @@ class Agent(ABC):
     def observe(  # noqa: B027 (agents without memory need nothing here)
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        """What followed: one transition a trial; where `alive` [N] is False, the episode had ended before it."""
+        """Take in a transition of each trial; where `alive` [N] is False, the episode had ended before it."""
 
     def features(self) -> NDArray[np.float32] | None:
-        """What the agent knows now [N, F], for probes of theta in it; None for agents without memory."""
+        """Features [N, F] of the agent's memory, for probes of theta in it; None for agents without memory."""
         return None
 
     def state(self) -> State:
-        """What `from_state` makes this agent anew from. Raises InputError for one that cannot be kept."""
+        """Settings and arrays, for `from_state`. Raises InputError for an agent that cannot be saved."""
         raise InputError(f"{type(self).__name__} cannot be saved; give it `state` and `from_state`")
 
     @classmethod
     def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Agent:
-        """The agent that gave this `state`."""
+        """The agent whose `state` this is."""
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 
 
 class ExpertAgent(Agent):
-    """The expert; it reads theta from the environment, or is told another: told [N, L]."""
+    """The expert as an agent. theta [N, L]: what it acts by; None: that of the environment."""
 
-    def __init__(self, env: BatchEnv, expert: Expert, told: Array | None = None) -> None:
-        self.env, self.expert, self.told = env, expert, told
+    def __init__(self, env: BatchEnv, expert: Expert, theta: Array | None = None) -> None:
+        self.env, self.expert, self.theta = env, expert, theta
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        return self.expert.act(obs, self.env.theta if self.told is None else self.told, self._rng)
+        return self.expert.act(obs, self.env.theta if self.theta is None else self.theta, self._rng)
 
 
 class RandomAgent(Agent):
-    """Uniform actions: the zero of every score."""
+    """An agent with uniform actions: the zero of every score."""
 
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
@@ -171,24 +171,24 @@ class RandomAgent(Agent):
 
 
 def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
-    """theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
-    rng = Streams([generators(one)[0] for one in trial_seeds(n, seed)])
-    found = [task.sample_theta(rng)]
+    """Theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
+    rng = Streams([generators(env_seed)[0] for env_seed in trial_seeds(n, seed)])
+    by_episode = [task.sample_theta(rng)]
     for _ in range(1, episodes):
-        found.append(task.drifted(found[-1], rng) if task.drifts else found[-1])
-    return np.stack(found, 1)
+        by_episode.append(task.drifted(by_episode[-1], rng) if task.drifts else by_episode[-1])
+    return np.stack(by_episode, 1)
 
 
 def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
-    """The environments' seeds for n trials. Raises InputError where several seeds do not have as many each."""
-    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(one) for one in seed]
+    """The environments' seeds for n trials, in equal groups. Raises InputError where n is no multiple of the seeds."""
+    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(first) for first in seed]
     if n % len(seeds):
         raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
-    return [one + i for one in seeds for i in range(n // len(seeds))]
+    return [first + i for first in seeds for i in range(n // len(seeds))]
 
 
 class Rollout(NamedTuple):
-    """N trials of E episodes: what happened, the returns [N, E], and the theta [N, E, L] of each episode.
+    """A roll-out, N trials of E episodes: the trials, their returns [N, E], and the theta [N, E, L] of each episode.
 
     Learners are handed `trials` alone; returns and theta are for scoring, and theta for methods that declare it.
     """
@@ -203,8 +203,8 @@ def run_trials(
 ) -> Rollout:
     """Run an agent in N trials of `episodes` episodes each.
 
-    seed: of the environments and, apart from them, of the agent; or one for each of several equal groups of trials, one
-    after another, each of which goes as it would go alone. theta: forced [N, L], else drawn from p(theta).
+    seed: of the environments and, independently, of the agent; or a seed for each of equal consecutive groups of
+    trials, each of which is the same, bit for bit, as it is alone. theta [N, L]: None: drawn from p(theta).
     """
     task, n = env.task, env.n
     each = trial_seeds(n, seed)
@@ -221,7 +221,7 @@ def run_trials(
         else:
             now = env.reset(options={"keep_theta": True})
         hidden[:, e] = env.theta
-        agent.reset([unseeded(np.random.default_rng([one, 1, e])) for one in seeds])  # not the environments' seeds
+        agent.reset([unseeded(np.random.default_rng([first, 1, e])) for first in seeds])  # not the environments' seeds
         obs[:, e, 0] = now
         for t in range(task.horizon):
             alive = env.alive

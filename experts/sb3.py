@@ -1,4 +1,4 @@
-"""Our batched environments as a Stable-Baselines3 VecEnv, for training experts fast."""
+"""Batched environments as a Stable-Baselines3 VecEnv, for fast training of experts."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from deconfounded import envs
 
 
-class Bare(VecEnv):
-    """What Stable-Baselines3 asks of vectors of separate environments, for one that is stepped as a whole."""
+class BatchVecEnv(VecEnv):
+    """A VecEnv that is stepped as a batch: it has no separate environments to get attributes of, or to call."""
 
     def close(self) -> None:
         """Nothing to close."""
@@ -30,8 +30,8 @@ class Bare(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
 
-class Sb3VecEnv(Bare):
-    """n privileged environments; a finished one is reset in the same step, as SB3 expects."""
+class Sb3VecEnv(BatchVecEnv):
+    """A VecEnv of n privileged environments; a finished environment is reset in the same step, as SB3 expects."""
 
     def __init__(self, task: envs.Task, n: int, seed: int) -> None:
         self.env = envs.GymVectorEnv(task, n, privileged=True)

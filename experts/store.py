@@ -1,4 +1,4 @@
-"""Agents that last: a folder with agent.json and agent.safetensors, written by `save` and read by `load`; no pickle."""
+"""Saved agents: folders with agent.json and agent.safetensors, without pickle."""
 
 from __future__ import annotations
 
@@ -14,23 +14,24 @@ from safetensors.numpy import save as to_bytes
 from deconfounded import __version__
 from deconfounded.envs import InputError
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import as_json, check_folder, read_sealed, sealed, write_atomically
 from deconfounded.experts.rollout import Agent
 
 ARRAYS = "agent.safetensors"
-CODE = "agent.py"  # of an agent from outside, kept beside its arrays
+CODE = "agent.py"  # source of an agent from outside, kept beside its arrays
 
 
 def save(agent: Agent, folder: Path, **about: Any) -> None:
-    """Keep an agent: its class by name, its settings, its arrays; about: what else to say of it, for json.
+    """Save an agent: its class by name, its settings, its arrays; about: further entries of agent.json.
 
-    Of a class that a file brought from outside, the file is kept too, so that the folder is whole; what else that file
-    imports has to be there when it is loaded. Raises InputError for an agent that cannot be kept, and writes nothing.
+    The file of a class from outside is copied into the folder; what that file imports must be importable when the agent
+    is loaded. Raises InputError for an agent that cannot be saved, and writes nothing.
     """
     cls, file, code = type(agent), folder / "agent.json", None
     if "." in cls.__qualname__:
         raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
-    if cls.__module__.startswith("outside_") and (source := outside.source(cls)) is not None:
+    if cls.__module__.startswith(outside.PREFIX) and (source := outside.source(cls)) is not None:
         code = source.read_bytes()
     settings, arrays = agent.state()
     about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
@@ -41,9 +42,9 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
         described = as_json(file, sealed(about))
     except InputError:
         raise
-    except Exception as error:  # whatever its class takes for its state
+    except Exception as error:  # any error of the class's own `state`
         raise InputError(
-            f"{cls.__qualname__} cannot be saved ({outside.told(error)}); its state() must return a dictionary for json"
+            f"{cls.__qualname__} cannot be saved ({error_line(error)}); its state() must return a dictionary for json"
             " and one of arrays"
         ) from None
     check_folder(folder)
@@ -54,7 +55,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """agent.json. Raises InputError if there is none, or it is damaged."""
+    """Read agent.json. Raises InputError if there is none, or it is damaged."""
     try:
         about = read_sealed(folder / "agent.json")
     except OSError:
@@ -65,9 +66,9 @@ def describe(folder: Path) -> dict[str, Any]:
 
 
 def load(folder: Path | str) -> Agent:
-    """The agent kept in a folder, ready for `begin`. Raises InputError if it is missing or damaged.
+    """Load the agent in a folder, ready for `begin`. Raises InputError if it is missing or damaged.
 
-    The class that agent.json names is imported, so that loading an agent is running its code.
+    The class that agent.json names is imported: loading an agent runs its code.
     """
     if not isinstance(folder, str | Path):
         raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
@@ -84,5 +85,5 @@ def load(folder: Path | str) -> Agent:
         return cls.from_state(about["settings"], from_bytes(content))
     except InputError:
         raise
-    except Exception as error:  # whatever its class makes of arrays that are not its own
-        raise InputError(f"the agent in {folder} is damaged ({outside.told(error)}); run the benchmark again") from None
+    except Exception as error:  # any error of the class's own `from_state`
+        raise InputError(f"the agent in {folder} is damaged ({error_line(error)}); run the benchmark again") from None

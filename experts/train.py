@@ -1,4 +1,4 @@
-"""PPO (Stable-Baselines3) on the view that sees theta."""
+"""Training of experts: PPO (Stable-Baselines3) on the privileged view, which has theta."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PPO_SETTINGS: dict[str, Any] = {
 
 
 Report = Callable[[int, str], None]
-"""Is told how many more steps are done, and how it goes."""
+"""Callback with the number of steps since the last call, and a text about returns."""
 
 
 class _Progress(BaseCallback):
@@ -43,8 +43,8 @@ class _Progress(BaseCallback):
 
 
 def train(task: envs.Task, steps: int, seed: int, report: Report, n: int = 64) -> dict[str, np.ndarray]:
-    """PPO for `steps` control steps in n environments -> the weights of the policy's mean, layer by layer."""
-    torch.set_num_threads(1)  # the networks are small: a second thread only gets in the way
+    """Train by PPO for `steps` control steps in n environments; returns the weights of the policy's mean by layer."""
+    torch.set_num_threads(1)  # the networks are small: more threads are slower
     rate = PPO_SETTINGS["learning_rate"]
     schedule: Callable[[float], float] = lambda left: rate * left  # noqa: E731
     model = PPO(
@@ -55,7 +55,7 @@ def train(task: envs.Task, steps: int, seed: int, report: Report, n: int = 64) -
         seed=seed,
         device="cpu",
     )
-    model.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one
+    model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     model.learn(steps, callback=_Progress(report))
     layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
     weights = {}

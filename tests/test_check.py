@@ -282,7 +282,7 @@ def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
         with pytest.raises(SystemExit) as done:
             check.main()
         outputs.append((done.value.code, capsys.readouterr().out.splitlines()))
-    skipped = "skip bounds_are_wide_enough: this is of MuJoCo tasks"
+    skipped = "skip bounds_are_wide_enough: this check is for MuJoCo tasks"
     assert outputs[0] == (0, ["ok   check_task", "ok   effect", "ok   reset_options", skipped])
     code, (_, failed, *rest) = outputs[1]
     assert code == 1

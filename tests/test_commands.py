@@ -30,7 +30,7 @@ from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.studies import cost, publish, site
 from deconfounded.envs import render
 from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
-from deconfounded.experts.policy import OwnExpert
+from deconfounded.experts.policy import CallableExpert
 from tests.fixtures import NoStakes, feedback
 from tests.tools import tiny_preset
 
@@ -431,7 +431,7 @@ class TestScore:
 def test_certificate_fails_what_deserves_it() -> None:
     """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
     task = NoStakes()
-    result = certify.certify(task, OwnExpert(task, feedback, "feedback"), trials=12, grid=7)
+    result = certify.certify(task, CallableExpert(task, feedback, "feedback"), trials=12, grid=7)
     assert result["return_expert"] > 4 * result["return_random"]
     assert result["verdict"] == "failed"
     assert not result["checks"]["told_wrong_theta"]["passed"]

@@ -43,16 +43,16 @@ def test_registered(name: str) -> None:
 
 
 @pytest.mark.skipif(not gl_works(), reason="no GL")
-def test_painters_do_not_touch_each_other() -> None:
-    """A painter draws the same before and after another one is gone."""
+def test_renderers_are_independent() -> None:
+    """A renderer draws the same before and after another one is gone."""
     task = envs.get("tilted_cartpole")
     theta, state = task.theta_grid(3)[0], task.init_state(streams(0))[0]
-    other = task.painter(theta)
+    other = task.renderer(theta)
     other(state, np.zeros(1))
-    paint = task.painter(theta)
+    render = task.renderer(theta)
     del other
-    picture = paint(state, np.zeros(1))
-    np.testing.assert_array_equal(task.painter(theta)(state, np.zeros(1)), picture)
+    picture = render(state, np.zeros(1))
+    np.testing.assert_array_equal(task.renderer(theta)(state, np.zeros(1)), picture)
     assert 100 < picture.mean() < 250
 
 

@@ -277,17 +277,17 @@ class TestPictures:
                 since = 0
         assert ended.all()
 
-    def test_a_painter_lives_as_long_as_its_theta(self, name: str) -> None:
+    def test_a_renderer_lives_as_long_as_its_theta(self, name: str) -> None:
         """A new one for each new theta, and for no other environment."""
         task = envs.get(name)
         made: list[Array] = []
-        painter = task.painter
+        renderer = task.renderer
 
         def spy(theta: Array) -> object:
             made.append(theta)
-            return painter(theta)
+            return renderer(theta)
 
-        task.painter = spy  # type: ignore[method-assign, assignment]
+        task.renderer = spy  # type: ignore[method-assign, assignment]
         vec = envs.GymVectorEnv(task, 2, render_mode="rgb_array")
         vec.reset(seed=0)
         vec.render()
@@ -305,7 +305,7 @@ class TestPictures:
 
 
 @pytest.mark.skipif(not gl_works(), reason="no GL")
-def test_painters_that_live_to_the_end_leave_in_silence() -> None:
+def test_renderers_that_live_to_the_end_leave_in_silence() -> None:
     """The GL library is gone before the first finalizer of the process, whose place the others share."""
     code = (
         "import weakref; kept = {1}; weakref.finalize(kept, print)\n"

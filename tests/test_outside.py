@@ -216,7 +216,7 @@ def test_experts_get_copies_seed_by_seed(tmp_path: Path) -> None:
     code = "seen = []\ndef control(obs, theta):\n    seen.append(len(obs))\n"
     (tmp_path / "mine.py").write_text(f"{code}    theta *= 0\n    obs *= 0\n    return obs[:, :1]\n")
     expert = policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
-    assert isinstance(expert, policy.OwnExpert)
+    assert isinstance(expert, policy.CallableExpert)
     obs, theta = np.ones((6, 6)), np.ones((6, 1))
     expert.mean(obs, theta, groups=2)
     assert obs.all()

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Painter, Task
+from deconfounded.envs.task import Renderer, Task
 
 
 class Push(Task):
@@ -46,7 +46,7 @@ class Push(Task):
     def terminated(self, state: Array) -> np.ndarray:
         return (np.abs(state[:, 0]) > 1.2) | (np.abs(state[:, 0]) < 0.1)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         raise NotImplementedError
 
 
@@ -90,7 +90,7 @@ class Arms(Task):
     def expert_probs(self, obs: Array, theta: Array) -> Array:
         return np.where(np.arange(3) == theta, 0.6, 0.2)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         raise NotImplementedError
 
 

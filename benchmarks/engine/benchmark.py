@@ -18,7 +18,7 @@ from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import store
 from deconfounded.experts.rollout import Agent, run_trials
@@ -151,7 +151,7 @@ class BenchmarkJob(Job):
                 elif isinstance(agent, LearnedAgent):
                     store.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
-                told = f"its agent is not kept: {outside.told(error)}"
+                told = f"its agent is not kept: {error_line(error)}"
         return told
 
 

@@ -21,6 +21,7 @@ from deconfounded.benchmarks.engine.jobs import Job
 from deconfounded.benchmarks.engine.scheduler import Engine
 from deconfounded.benchmarks.engine.worker import Files, Unlike, work
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
 
@@ -155,7 +156,7 @@ def connect(address: str) -> None:
         ray.init(address, log_to_driver=False, logging_level="ERROR")
     except Exception as error:  # Ray tells in many ways
         remedy = "; `ray start --head` starts one" * (address == "auto")
-        raise envs.InputError(f"--cluster {address}: {outside.told(error)}{remedy}") from None
+        raise envs.InputError(f"--cluster {address}: {error_line(error)}{remedy}") from None
     finally:
         signal.signal(signal.SIGTERM, heard)  # Ray has one of its own
 

@@ -27,6 +27,7 @@ from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts.rollout import Agent
 
@@ -72,9 +73,9 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
                 save(agent, folder, **described)
                 say("done", "", time.process_time())
             except Exception as error:
-                say("done", outside.told(error), time.process_time())
+                say("done", error_line(error), time.process_time())
     except (Exception, SystemExit) as error:  # or the other end is gone, and nobody hears it
-        say("failed", outside.told(error))
+        say("failed", error_line(error))
 
 
 class Guest(Agent):

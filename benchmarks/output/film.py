@@ -33,7 +33,7 @@ class Pane:
     def __init__(self, task: envs.Task, name: str, clip: dict[str, NDArray[Any]]) -> None:
         self.task, self.name, self.clip = task, name, clip
         self.starts = np.flatnonzero(np.diff(clip["episode"], prepend=-1))
-        self._painters: dict[int, Any] = {}
+        self._renderers: dict[int, Any] = {}
         state, action, theta = clip["state"], clip["action"], clip["theta"][clip["episode"]]
         reward = np.append(0.0, task.reward(state[:-1], action[1:], state[1:], theta[1:]))
         reward[self.starts] = 0
@@ -49,9 +49,9 @@ class Pane:
     def picture(self, episode: int, t: int) -> Image.Image:
         """The whole pane at a step."""
         row, over = self.row(episode, t)
-        if episode not in self._painters:
-            self._painters = {episode: self.task.painter(self.clip["theta"][episode])}
-        seen = Image.fromarray(self._painters[episode](self.clip["state"][row], self.clip["action"][row]))
+        if episode not in self._renderers:
+            self._renderers = {episode: self.task.renderer(self.clip["theta"][episode])}
+        seen = Image.fromarray(self._renderers[episode](self.clip["state"][row], self.clip["action"][row]))
         latents = self.task.latents
         pane = Image.new("RGB", (WIDTH, HEAD + HEIGHT + STRIP * len(latents)), "white")
         pane.paste(seen.resize((WIDTH, HEIGHT)), (0, HEAD))

@@ -23,7 +23,7 @@ from deconfounded.benchmarks.output import film, records, score
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import mark, save_figure
-from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
 
 
@@ -40,7 +40,7 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     try:
         pictures(task, results, finished, folder)
     except Exception as error:  # a GL, a font or an encoder can fail in many ways
-        print(f"no pictures: {outside.told(error)}")
+        print(f"no pictures: {error_line(error)}")
     write_atomically(folder / "report.html", page(results, folder))
     head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
     return f"\n{head}\n\n{score.table(results)}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
@@ -63,7 +63,7 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
     try:
         film.write(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
     except Exception as error:  # no GL, or no encoder: the run is good all the same
-        print(f"no video: {outside.told(error)}")
+        print(f"no video: {error_line(error)}")
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from deconfounded.deconf.given import Environments
-from deconfounded.experts.sb3 import Bare
+from deconfounded.experts.sb3 import BatchVecEnv
 
 if TYPE_CHECKING:
     from deconfounded.deconf.methods.gail import GailConfig
@@ -25,7 +25,7 @@ Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]
 """Of observations [N, O], actions [N, A] and what followed [N, O]: [N]. The task's own reward is told to nobody."""
 
 
-class Practice(Bare):
+class Practice(BatchVecEnv):
     """The environments of a vector in which a whole trial is one episode: `done` says that the trial is over.
 
     What is observed [N, O + F + 1]: the observation, scaled; the action before it, one-hot if discrete; and whether an

@@ -1,1 +1,1 @@
-"""What every task must hold, as checks: its maths, its physics, its protocols."""
+"""The contract of tasks, as checks: of their maths, their physics, their interfaces."""

@@ -1,4 +1,4 @@
-"""Does a task hold together? Asked before anything is trained or measured: a slip in a task file is one line then."""
+"""A quick check of a task, before anything is trained or measured: a slip in a task file is reported in one line."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.probe import actions, beyond_bounds
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Streams
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.support.outside import told
+from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.task import Task
 
 
 def sentence(error: Exception) -> str:
-    """One line: what an error says and, unless it is a check's own, its type and where it was raised."""
-    ours = isinstance(error, AssertionError) and str(error)
-    return " ".join(str(error).split()) if ours else told(error)
+    """An error in one line: its message and, unless a check raised it, its type and its place in the source."""
+    from_check = isinstance(error, AssertionError) and str(error)
+    return " ".join(str(error).split()) if from_check else error_line(error)
 
 
 @contextmanager
@@ -34,7 +33,7 @@ def _part(task: Task, name: str) -> Iterator[None]:
 
 
 def check_task(task: Task) -> None:
-    """Build it, take one step, then an episode of random actions. Raises InputError that names what does not fit."""
+    """Build a task, take a step, then an episode of random actions. Raises InputError that names what does not fit."""
     if isinstance(task, MujocoTask):
         _check_model(task)
     with _part(task, "action_space"):
@@ -65,7 +64,7 @@ def check_task(task: Task) -> None:
 
 
 def _check_model(task: MujocoTask) -> None:
-    """The model compiles, every joint has its noise stated, and pictures have their camera."""
+    """The model compiles, every joint has its noise stated, and there is a camera for pictures."""
     with _part(task, f"the model ({task.home.name}/{task.name}.xml, or what `spec` makes)"):
         model = task.model
     with _part(task, "process_noise"):
@@ -83,7 +82,7 @@ def _check_model(task: MujocoTask) -> None:
 
 
 def _check_actions(task: Task) -> None:
-    """Actions are those that experts, networks and random agents make, and the expert's have a density."""
+    """The action space is one that all agents act in, and the expert's actions have a density."""
     if task.n_actions:
         return
     space = task.action_space
@@ -100,7 +99,7 @@ def _check_actions(task: Task) -> None:
 
 
 def _check_episodes(task: Task) -> None:
-    """Rewards and observations keep to their bounds, in an episode each of 16 environments with random actions."""
+    """Rewards and observations are within their bounds, in an episode of 16 environments with random actions."""
     env = BatchEnv(task, 16)
     env.reset(0)
     for action in actions(task, 16, task.horizon):

@@ -1,11 +1,11 @@
-"""The contract as a library: what every task must hold, each check by name, so that any task can be held to it.
+"""The contract as a library of named checks, which any task can be tested by.
 
     for check in CONTRACT.values():
         check(task)
 
-A check returns nothing, or raises AssertionError or InputError with a sentence that says what it found, or Skipped if
-it does not apply or cannot be made here. All are of the task at hand: no registry is asked. What adapters must do is in
-protocols.py, and what is MuJoCo's in physics.py.
+A check returns nothing; or it raises AssertionError or InputError with a message, or Skipped if it does not apply or
+cannot be made here. Checks use the task alone, not the registry. Those of interfaces are in protocols.py, those of
+MuJoCo tasks in physics.py.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from deconfounded.envs.task import Task
 
 
 def no_leak(task: Task) -> None:
-    """Same seed, many thetas: the first observations and infos are identical."""
+    """First observations and infos are identical for the same seed under different thetas."""
     env = GymEnv(task)
     first = [env.reset(seed=3, options={"theta": theta}) for theta in far_thetas(task)]
     for theta, (obs, info) in zip(far_thetas(task), first, strict=True):
@@ -37,9 +37,9 @@ def no_leak(task: Task) -> None:
 
 
 def effect(task: Task) -> None:
-    """Same seed and actions, another theta: another trajectory. Where no tier has a cure, exactly the same one.
+    """Different thetas give different trajectories for the same seed and actions; if the tier is None, identical ones.
 
-    Actions are random or, since Tier 3 may need to be looked for, each axis pushed for the whole episode.
+    Actions are random, or constant along an axis, since a Tier 3 task may show theta only where one goes on purpose.
     """
     plans, thetas = [actions(task, 1, task.horizon)], far_thetas(task)
     if isinstance(task, MujocoTask):
@@ -61,7 +61,7 @@ def effect(task: Task) -> None:
 
 
 def privileged_view(task: Task) -> None:
-    """It appends the encoded theta, and is the same otherwise."""
+    """The privileged view is the observation with the encoded theta appended."""
     plain, privileged = GymEnv(task), GymEnv(task, privileged=True)
     obs, seen = plain.reset(seed=5)[0], privileged.reset(seed=5)[0]
     same(seen[: len(obs)], obs, "observations with and without the privileged view")
@@ -71,7 +71,7 @@ def privileged_view(task: Task) -> None:
 
 
 def keep_theta(task: Task) -> None:
-    """A trial keeps its theta, but for what drifts, and gets a new start or noise; the next trial gets a new theta."""
+    """A trial keeps its theta, but for drift, with a new start or noise; the next trial draws a new theta."""
     batch = BatchEnv(task, 16)
     batch.reset(1)
     theta = batch.theta.copy()
@@ -90,10 +90,7 @@ def keep_theta(task: Task) -> None:
 
 
 def theta_follows_its_distribution(task: Task) -> None:
-    """The cdf of drawn thetas is uniform: Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003).
-
-    So is that of what they drift to.
-    """
+    """Thetas, drawn or drifted, follow p(theta): Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003)."""
     draws = task.sample_theta(streams(*range(2000)))
     if task.drifts:
         draws = task.drifted(draws, streams(*range(2000, 4000)))
@@ -108,7 +105,7 @@ def theta_follows_its_distribution(task: Task) -> None:
 
 
 def any_batch_size(task: Task) -> None:
-    """An environment's run depends on its own seed alone, to the bit."""
+    """An environment's run depends on its own seed alone, to the bit, whatever the batch size."""
     acts = actions(task, 5, task.horizon)
     large = BatchEnv(task, 5)
     seen = [large.reset(11)] + [large.step(action)[0] for action in acts]
@@ -119,7 +116,7 @@ def any_batch_size(task: Task) -> None:
 
 
 def seed_streams(task: Task) -> None:
-    """Environment i of seed s draws theta, start and noise from SeedSequence(s + i).spawn(3), in that order."""
+    """Environment i of seed s draws theta, start and noise from SeedSequence(s + i).spawn(3), in this order."""
     batch = BatchEnv(task, 2)
     batch.reset(20)
     for i in range(2):
@@ -129,7 +126,7 @@ def seed_streams(task: Task) -> None:
 
 
 def seed_kinds(task: Task) -> None:
-    """A seed is a number from 0 up, of any kind, or one for each environment."""
+    """A seed is an integer from 0 up, of any type, or a sequence with a seed for each environment."""
     batch = BatchEnv(task, 2)
     first = batch.reset(3)
     kinds: tuple[Any, ...] = (np.int64(3), [3, 4])
@@ -141,7 +138,7 @@ def seed_kinds(task: Task) -> None:
 
 
 def forced_theta_moves_nothing_else(task: Task) -> None:
-    """Start and noise belong to the seed: forcing the theta that would have been drawn changes no bit."""
+    """Start and noise depend on the seed alone: setting the theta that would have been drawn changes no bit."""
     acts = actions(task, 4, 10)
     free, forced = BatchEnv(task, 4), BatchEnv(task, 4)
     seen = [free.reset(2)] + [free.step(action)[0] for action in acts]
@@ -150,7 +147,7 @@ def forced_theta_moves_nothing_else(task: Task) -> None:
 
 
 def starts_vary_and_nothing_is_constant(task: Task) -> None:
-    """No observation stands still for whole episodes, and physics does not start in the same place each time."""
+    """No observation is constant over whole episodes, and MuJoCo tasks have random initial states."""
     batch = BatchEnv(task, 8)
     seen = np.array([batch.reset(0)] + [batch.step(action)[0] for action in actions(task, 8, task.horizon)])
     still = [name for name, ptp in zip(task.observation, np.ptp(seen, (0, 1)), strict=True) if not ptp > 0]
@@ -162,7 +159,7 @@ def starts_vary_and_nothing_is_constant(task: Task) -> None:
 
 
 def observations_share_no_memory(task: Task) -> None:
-    """What agents remember stays as it was."""
+    """Later steps do not change an observation that was returned before."""
     env = GymEnv(task)
     first, _ = env.reset(seed=0)
     copy = first.copy()
@@ -172,7 +169,7 @@ def observations_share_no_memory(task: Task) -> None:
 
 
 def theta_out_of_bounds(task: Task) -> None:
-    """A theta out of bounds, NaN or of the wrong length is refused, with the bounds."""
+    """A theta out of bounds, NaN or of the wrong length is refused; the message gives the bounds."""
     env, latent = GymEnv(task), task.latents[0]
     says = rf"^{re.escape(latent.name)} of {task.name} was .*must be .*{re.escape(f'{latent.high:g}')}"
     for wrong in (latent.high + 1, latent.low - 1, float("nan")):
@@ -208,9 +205,9 @@ def reset_options(task: Task) -> None:
 
 
 def log_prob_is_the_density_of_the_noise(task: Task) -> None:
-    """Importance sampling: under outcome p, E[q(s') / p(s')] = 1 for another theta's outcome q; 4,000 draws.
+    """Log_prob is normalised, and is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q.
 
-    It fails if log_prob is not normalised, or not that of the noise that apply_noise adds.
+    The expectation is over 4,000 draws of importance sampling.
     """
     m = 4000
     low, high = task.latents[0].grid(9)[[0, -1]]
@@ -222,9 +219,9 @@ def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     p = batch.simulator.outcome(batch.state, action)
     batch.reset(0, {"theta": [near, *rest]})
     q = batch.simulator.outcome(batch.state, action)
-    if (p == q).all():  # theta is not to be seen here: another action's outcome then
+    if (p == q).all():  # theta has no effect here: use another action's outcome
         q = batch.simulator.outcome(batch.state, 0.8 * action)
-    if isinstance(task, MujocoTask):  # at most one standard deviation off: the ratio's variance is finite then
+    if isinstance(task, MujocoTask):  # at most one standard deviation off, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])
     noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
@@ -238,14 +235,14 @@ def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
         fall = task.log_prob(p, p) - task.log_prob(drawn, p)
         right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
-        found = f"log_prob of {task.name} falls by {fall.mean():.3f} under its own noise; it must be {right:g}"
-        require(abs(fall.mean() - right) < bound, found)
+        message = f"log_prob of {task.name} falls by {fall.mean():.3f} under its own noise; it must be {right:g}"
+        require(abs(fall.mean() - right) < bound, message)
 
 
 def log_sense_is_the_density_of_the_readings(task: Task) -> None:
-    """As above, of what sensors read under one theta, and under another near by; 4,000 states of random episodes.
+    """Log_sense is normalised, and is the density of what sensors read, under two nearby thetas in 4,000 states.
 
-    A task whose theta moves no state must do so, and have readings that tell.
+    A task that states that theta moves no state must hold to it, and have readings that depend on theta.
     """
     batch, m = BatchEnv(task, 50), 4000
     thetas = task.theta_grid(9)[[0, -1]]
@@ -265,7 +262,7 @@ def log_sense_is_the_density_of_the_readings(task: Task) -> None:
         require(task.moves_state, f"theta of {task.name} moves no state, and its sensors read nothing")
         raise Skipped("this task has no sensors of theta")
     near = thetas[1]
-    for _ in range(30):  # so near that the ratio's variance is small
+    for _ in range(30):  # until the ratio's variance is small
         fall = task.log_sense(drawn, thetas[0]) - task.log_sense(drawn, near)
         if fall.mean() < 0.3:
             break

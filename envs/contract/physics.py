@@ -1,4 +1,4 @@
-"""The part of the contract that MuJoCo tasks must hold: their model, its noise, and pictures of it."""
+"""Checks of MuJoCo tasks: their model, its noise, and pictures of it."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ NAMED = ("bodies", "geoms", "joints", "actuators", "tendons", "cameras", "lights
 
 
 def bounds_are_wide_enough(task: Task) -> None:
-    """Observations are clipped to their bounds: random actions do not get there, in an episode that goes on."""
+    """Observations stay within their bounds, where they would be clipped, under random actions."""
     batch, steps = BatchEnv(physics(task), 32), 0
     batch.reset(0)
     for action in actions(task, 32, task.horizon):
         batch.step(action)
         steps += batch.alive.sum()
-        require(not (found := beyond_bounds(task, batch.state[batch.alive])), found)
+        require(not (message := beyond_bounds(task, batch.state[batch.alive])), message)
     require(steps >= 32, f"32 random episodes lasted {steps} steps in all; a start must not be an end")
 
 
 def set_in_place_equals_recompiled(task: Task) -> None:
-    """Every number of the model, after several thetas were set one after the other."""
+    """A model in which several thetas were set in turn equals one compiled with the last, in every number."""
     simulator = physics(task).simulator(1)
     for theta in far_thetas(task):
         simulator.set_theta(0, theta)
@@ -50,16 +50,16 @@ def set_in_place_equals_recompiled(task: Task) -> None:
 
 
 def nominal_model_is_not_touched(task: Task) -> None:
-    """Whatever theta is set, it is set in a copy."""
+    """Setting theta changes copies of the nominal model alone."""
     before = physics(task).spec().compile()
     BatchEnv(task, 2).reset(0)
     same_model(physics(task).model, before, "of the task, after a reset, and compiled anew")
 
 
 def same_model(model: mujoco.MjModel, other: mujoco.MjModel, what: str) -> None:
-    """Raises AssertionError, which says how they came to be, unless two models are equal in every array, to the bit.
+    """Raise AssertionError unless two models are equal in every array, to the bit. what: how they were made.
 
-    Only inertia, which scaling rounds in another order, and what follows from it need not be so in the last bits.
+    Inertia, which scaling rounds in another order, and quantities derived from it may differ in the last bits.
     """
     compared = 0
     for field in dir(model):
@@ -74,14 +74,14 @@ def same_model(model: mujoco.MjModel, other: mujoco.MjModel, what: str) -> None:
 
 
 def rollout_equals_single_steps(task: Task) -> None:
-    """The thread pool is mj_step, one environment at a time, without a warm start at a control step."""
+    """The thread pool gives the states of mj_step, without a warm start at a control step."""
     batch = BatchEnv(physics(task), 3)
     batch.reset(4)
     action = actions(task, 3, 1)[0]
     outcome = batch.simulator.outcome(batch.state, action)
     for i, model in enumerate(batch.simulator.models):  # type: ignore[attr-defined]
         data = mujoco.MjData(model)
-        size = mujoco.mj_stateSize(model, STATE.value)  # what sensors read follows
+        size = mujoco.mj_stateSize(model, STATE.value)  # without the readings
         mujoco.mj_setState(model, data, batch.state[i, :size], STATE.value)
         data.ctrl[:] = physics(task).control(action)[i]
         for _ in range(physics(task).substeps):
@@ -92,7 +92,7 @@ def rollout_equals_single_steps(task: Task) -> None:
 
 
 def every_element_is_named(task: Task) -> None:
-    """What a page or an error speaks of must have a name; pictures need a camera called view."""
+    """Every element of the MJCF has a name, for pages and errors; pictures need a camera called view."""
     spec = physics(task).spec()
     for kind in NAMED:
         unnamed = [i for i, element in enumerate(getattr(spec, kind)) if not element.name]
@@ -102,10 +102,9 @@ def every_element_is_named(task: Task) -> None:
 
 
 def noise_covers_every_coordinate_that_matters(task: Task) -> None:
-    """Else one step could give theta away, and the grid posterior would not be exact.
+    """Every coordinate has process noise; otherwise a single step could reveal theta, and no posterior would be exact.
 
-    A coordinate without noise must be one that theta does not move, or that is of no consequence: neither
-    observations nor what follows change if it is moved.
+    Exempt are coordinates that theta does not move, and those that affect neither observations nor later states.
     """
     mine = physics(task)
     stated, joints = set(mine.process_noise), {joint.name for joint in mine.spec().joints}
@@ -126,7 +125,7 @@ def noise_covers_every_coordinate_that_matters(task: Task) -> None:
 
 
 def down_is_down_in_pictures(task: Task) -> None:
-    """Whatever theta does to gravity, it points down in the picture."""
+    """Gravity points down in the picture under every theta."""
     for theta in far_thetas(physics(task)):
         simulator = physics(task).simulator(1)
         simulator.set_theta(0, theta)
@@ -135,12 +134,12 @@ def down_is_down_in_pictures(task: Task) -> None:
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         right, up, _ = model.opt.gravity @ data.cam_xmat[model.camera("view").id].reshape(3, 3)
-        found = f"of theta {theta.tolist()}, gravity points {right:g} to the right and {up:g} up in the picture"
-        require(abs(right) < 1e-6 and up < 1e-6, found)
+        message = f"of theta {theta.tolist()}, gravity points {right:g} to the right and {up:g} up in the picture"
+        require(abs(right) < 1e-6 and up < 1e-6, message)
 
 
 def without_gravity_pictures_are_as_the_camera_stands(task: Task) -> None:
-    """Where nothing is down, nothing is turned."""
+    """Without gravity, the camera is not turned."""
     model = physics(task).simulator(1).models[0]
     model.opt.gravity[:] = 0
     before = model.camera("view").quat.copy()
@@ -149,7 +148,7 @@ def without_gravity_pictures_are_as_the_camera_stands(task: Task) -> None:
 
 
 def picture_shows_theta_or_state(task: Task) -> None:
-    """A picture is of 240 x 320 pixels, and another one five steps later."""
+    """A picture has 240 x 320 pixels, and differs five steps later."""
     physics(task)
     if not gl_works():
         raise Skipped("no GL for pictures works here")

@@ -1,4 +1,4 @@
-"""What checks of a task share: actions, thetas and generators to ask it with, and sentences for what they find."""
+"""Helpers of checks: actions, thetas and generators to test a task with, and assertions with a message."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from deconfounded.envs.task import Task
 
 
 class Skipped(Exception):  # noqa: N818 (nothing is wrong)
-    """A check that does not apply, or that cannot be made here: one line that says why."""
+    """A check that does not apply, or cannot be made here; the message says why."""
 
 
 def require(condition: object, message: str) -> None:
-    """Raises AssertionError with the message unless the condition holds; under `python -O`, too."""
+    """Raise AssertionError with a message unless a condition holds; under `python -O`, too."""
     if not condition:
         raise AssertionError(message)
 
 
-def same(one: object, other: object, what: str) -> None:
-    """Raises AssertionError, with the first place where they differ, unless two arrays are equal; NaN equals NaN."""
-    a, b = np.asarray(one), np.asarray(other)
+def same(left: object, right: object, what: str) -> None:
+    """Raise AssertionError, with the first differing entry, unless two arrays are equal; NaN equals NaN."""
+    a, b = np.asarray(left), np.asarray(right)
     require(a.shape == b.shape, f"{what} differ: their shapes are {a.shape} and {b.shape}")
     places = np.argwhere((a != b) & ((a == a) | (b == b)))
     if len(places):
@@ -40,7 +40,7 @@ def same(one: object, other: object, what: str) -> None:
 
 @contextmanager
 def refused(what: str, says: str) -> Iterator[None]:
-    """Raises AssertionError unless an InputError that matches `says`, a regular expression, is raised within."""
+    """Context that raises AssertionError unless an InputError is raised in it that matches the pattern `says`."""
     try:
         yield
     except InputError as error:
@@ -50,40 +50,40 @@ def refused(what: str, says: str) -> Iterator[None]:
 
 
 @contextmanager
-def told_by(whom: str) -> Iterator[None]:
-    """Whatever another library's checker raises is an AssertionError that names the library."""
+def reported_by(checker: str) -> Iterator[None]:
+    """Context that turns any error of another library's checker into an AssertionError that names the checker."""
     try:
         yield
     except Exception as error:
-        raise AssertionError(f"{whom}: {' '.join(str(error).split())} ({type(error).__name__})") from error
+        raise AssertionError(f"{checker}: {' '.join(str(error).split())} ({type(error).__name__})") from error
 
 
 def physics(task: Task) -> MujocoTask:
-    """The task itself. Raises Skipped if it is not MuJoCo's."""
+    """The task, if it is a MujocoTask. Raises Skipped otherwise."""
     if not isinstance(task, MujocoTask):
-        raise Skipped("this is of MuJoCo tasks")
+        raise Skipped("this check is for MuJoCo tasks")
     return task
 
 
 def actions(task: Task, n: int, steps: int) -> Array:
-    """[steps, n, A] random actions, the same for the same arguments."""
+    """Random actions [steps, n, A], the same for the same arguments."""
     rng = np.random.default_rng(99)
     shape = (steps, n, task.action_width)
     return rng.integers(task.n_actions, size=shape).astype(float) if task.n_actions else rng.uniform(-1, 1, shape)
 
 
 def far_thetas(task: Task) -> Array:
-    """[J, L] thetas that span the range of every latent."""
+    """Thetas [J, L] that span the range of every latent."""
     return np.array(list(product(*(lat.grid(5)[::2] for lat in task.latents))))
 
 
 def streams(*seeds: int) -> Streams:
-    """A generator for each environment."""
+    """Streams with a generator for each seed."""
     return Streams([np.random.default_rng(seed) for seed in seeds])
 
 
 def gl_works() -> bool:
-    """Whether pictures can be made here."""
+    """Whether a GL for pictures works here."""
     try:
         render.backend()
     except InputError:
@@ -92,7 +92,7 @@ def gl_works() -> bool:
 
 
 def beyond_bounds(task: Task, state: Array) -> str:
-    """A sentence about an observation of states [N, S] beyond its bounds by more than 1e-3, which clips it; or ""."""
+    """A message about an observation of states [N, S] that is out of its bounds by more than 1e-3, or ""."""
     if not len(state):
         return ""
     seen = task.observe(state)

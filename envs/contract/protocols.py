@@ -1,4 +1,4 @@
-"""The part of the contract that is about protocols: gymnasium, Stable-Baselines3, dm_env, and that they all agree."""
+"""Checks of the interfaces: gymnasium, Stable-Baselines3 and dm_env, and that all of them agree."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from gymnasium.vector import SyncVectorEnv
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
-from deconfounded.envs.contract.probe import Skipped, actions, gl_works, require, same, told_by
+from deconfounded.envs.contract.probe import Skipped, actions, gl_works, reported_by, require, same
 from deconfounded.envs.task import Task
 
 
 def gymnasium_env(task: Task) -> None:
-    """gymnasium's own checker finds nothing to warn of."""
+    """Gymnasium's environment checker raises no error and no warning."""
 
     def entry(**kwargs: Any) -> GymEnv:
         return GymEnv(task, **kwargs)
 
     env = gymnasium.make(EnvSpec(task.gym_id, entry_point=entry))
-    with told_by("gymnasium's checker"), warnings.catch_warnings():
+    with reported_by("gymnasium's checker"), warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped, skip_render_check=not gl_works())
 
 
 def stable_baselines(task: Task) -> None:
-    """Nor does Stable-Baselines3's, in the privileged view."""
+    """Stable-Baselines3's environment checker raises none either, in the privileged view."""
     try:
         from stable_baselines3.common.env_checker import check_env as check_env_sb3
     except ModuleNotFoundError as error:
         raise Skipped(f"{error.name} is not installed") from None
-    with told_by("Stable-Baselines3's checker"), warnings.catch_warnings():
+    with reported_by("Stable-Baselines3's checker"), warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env_sb3(GymEnv(task, privileged=True), skip_render_check=True)
 
 
 def dm_env_tests(task: Task) -> None:
-    """dm_env's own test mixin passes."""
+    """The tests of dm_env's mixin pass."""
     try:
         from dm_env import test_utils
     except ModuleNotFoundError as error:
         raise Skipped(f"{error.name} is not installed") from None
 
-    class Held(test_utils.EnvironmentTestMixin, unittest.TestCase):
+    class EnvironmentTest(test_utils.EnvironmentTestMixin, unittest.TestCase):
         def make_object_under_test(self) -> DmEnv:
             return DmEnv(task, seed=0)
 
@@ -62,14 +62,14 @@ def dm_env_tests(task: Task) -> None:
                     yield rng.uniform(-1, 1, spec.shape).astype("f4")
 
     result = unittest.TestResult()
-    unittest.defaultTestLoader.loadTestsFromTestCase(Held).run(result)
+    unittest.defaultTestLoader.loadTestsFromTestCase(EnvironmentTest).run(result)
     for test, trace in result.failures + result.errors:
         raise AssertionError(f"dm_env's {test.id().split('.')[-1]}: {trace.strip().splitlines()[-1]}")
     require(result.testsRun >= 4, f"dm_env's mixin ran {result.testsRun} tests; it must be at least 4")
 
 
 def adapters_agree(task: Task) -> None:
-    """The vector env, gymnasium's SyncVectorEnv, single envs and dm_env: same seeds, same bits, resets included."""
+    """GymVectorEnv, SyncVectorEnv of GymEnv, and DmEnv give the same bits for the same seeds and actions."""
     n = 3
     ours, theirs = GymVectorEnv(task, n), SyncVectorEnv([lambda: GymEnv(task) for _ in range(n)])
     dm = DmEnv(task, seed=7)
@@ -88,7 +88,7 @@ def adapters_agree(task: Task) -> None:
 
 
 def time_limit(task: Task) -> None:
-    """Truncation comes at exactly the time limit, if the episode has not ended before."""
+    """Episodes are truncated at exactly the time limit, unless they ended before."""
     batch = BatchEnv(task, 64)
     batch.reset(0)
     for step, action in enumerate(actions(task, 64, task.horizon), start=1):

@@ -1,4 +1,4 @@
-"""Handles of C++ libraries (thread pools, GL contexts): each belongs to one process, and to one object in it."""
+"""Handles of C++ resources (thread pools, GL contexts), each of which belongs to one process and one object in it."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ T = TypeVar("T")
 
 
 class Handle(Generic[T]):
-    """What `make` makes, when it is first asked for; a copy, a pickle and a forked process make one of their own.
+    """A resource that is created on first use; a copy, an unpickled handle and a forked process create their own.
 
-    make: with its arguments (`functools.partial`), which copies and pickles take along. close: what ends it, with this
-    handle or with the process.
+    make: creates it, with its arguments bound (`functools.partial`), since copies and pickles hold `make`. close: frees
+    it, when this handle or the process ends.
     """
 
     def __init__(self, make: Callable[[], T], close: Callable[[T], None] | None = None) -> None:
@@ -29,7 +29,7 @@ class Handle(Generic[T]):
         if not self._made:
             made = self._make()
             self._made.append(made)
-            if self._close is not None:  # at exit, before the library is gone: finalize's own place can be after
+            if self._close is not None:  # at exit, before the library is unloaded, which finalize alone does not ensure
                 self._end = weakref.finalize(self, self._close, made)
                 atexit.register(self._end)
         return self._made[0]
@@ -38,21 +38,21 @@ class Handle(Generic[T]):
         return Handle, (self._make, self._close)
 
     def _abandon(self) -> None:
-        """Forget what the parent process made: its threads are not here, and its destructor would wait for them."""
+        """Drop the parent process's resource undestroyed: its destructor would wait for threads that a fork lacks."""
         if self._end is not None:
             self._end.detach()
         for made in self._made:
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(made))  # so that it is never destroyed, at exit neither
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(made))  # so that it is never destroyed, not even at exit
         self._made.clear()
 
 
 _HANDLES: weakref.WeakSet[Handle[Any]] = weakref.WeakSet()
 
 
-def _forked() -> None:
+def _abandon_all() -> None:
     for handle in list(_HANDLES):
         handle._abandon()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forked)
+    os.register_at_fork(after_in_child=_abandon_all)

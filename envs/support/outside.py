@@ -1,4 +1,4 @@
-"""What is named from outside: `path/file.py:name`, or `package.module:name`."""
+"""Plug-ins: tasks, methods, experts and agents from outside, by `path/file.py:name` or `package.module:name`."""
 
 from __future__ import annotations
 
@@ -8,28 +8,26 @@ import importlib.util
 import inspect
 import os
 import sys
-import traceback
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.errors import InputError, error_line
 
-SENT = "DECONFOUNDED_OUTSIDE"  # in the environment of a worker elsewhere: the folder that such files were sent to
-
-RUN = "outside_"  # the beginning of the name of a module that was a file
+SENT = "DECONFOUNDED_OUTSIDE"  # environment variable of a cluster worker: the folder that plug-in files were sent to
+PREFIX = "outside_"  # of the module names of plug-in files
 
 
 def is_outside(reference: str) -> bool:
-    """Whether it names something by where it is, and not a registered one."""
+    """Whether a name is a plug-in's reference, and not a registered name."""
     return ":" in reference
 
 
 def find(kind: str, reference: str) -> Any:
-    """The object named. kind: what it should be, for the error.
+    """Import the object that a reference names. kind: what it should be, for the error.
 
-    A file is run once, as Python runs a script: what lies beside it can be imported, after all that is installed.
-    Raises InputError if there is no such file, module or name in it, or if running it fails.
+    A file is executed once, and its folder is appended to the import path. Raises InputError if there is no such file,
+    module or name in it, or if executing it fails.
     """
     where, _, name = reference.rpartition(":")
     if not where or not name:
@@ -41,41 +39,30 @@ def find(kind: str, reference: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        raise InputError(f"{kind} {reference!r}: {told(error)}") from error
+        raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
     if not hasattr(module, name):
-        known = [key for key in vars(module) if not key.startswith("_")]
-        raise InputError(f"{kind} {reference!r}: {where} has no {name!r}; it has {', '.join(known)}")
+        names = [key for key in vars(module) if not key.startswith("_")]
+        raise InputError(f"{kind} {reference!r}: {where} has no {name!r}; it has {', '.join(names)}")
     return getattr(module, name)
 
 
-def told(error: BaseException) -> str:
-    """An error as part of one line: what it says, its type, and where it came from. One of ours says enough."""
-    text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
-    if isinstance(error, InputError):
-        return text
-    if isinstance(error, SyntaxError) and error.filename:
-        return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
-    frame = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
-
-
 def absolute(reference: str) -> str:
-    """The same, wherever it is read from."""
+    """The reference with an absolute path, valid in any working directory."""
     where, colon, name = reference.rpartition(":")
     return f"{Path(where).resolve()}:{name}" if where.endswith(".py") else f"{where}{colon}{name}"
 
 
 def reference(cls: type) -> str:
-    """What `find` takes for a class in another process, whatever that has imported; "" if it cannot be named so."""
+    """The reference of a class, for `find` in another process; "" if it has none, as a class inside a function."""
     if cls.__qualname__ != cls.__name__:
         return ""
-    if cls.__module__ in ("__main__", "__mp_main__") or cls.__module__.startswith(RUN):
+    if cls.__module__ in ("__main__", "__mp_main__") or cls.__module__.startswith(PREFIX):
         return f"{file}:{cls.__name__}" if (file := source(cls)) else ""
     return f"{cls.__module__}:{cls.__name__}"
 
 
 def file(reference: str) -> Path | None:
-    """Where it is defined, without running it; None for a module that has no file."""
+    """The file that a reference points to, which is not executed; None for a module that has no file."""
     where, _, _ = reference.rpartition(":")
     if where.endswith(".py"):
         return here(Path(where)).resolve()
@@ -84,7 +71,7 @@ def file(reference: str) -> Path | None:
 
 
 def here(path: Path) -> Path:
-    """Where a file is on this machine: where it always was, or where a cluster sent it."""
+    """A file's path on this machine: its own, or that of the copy which a cluster sent."""
     sent = Path(os.environ[SENT], *path.parts[1:]) if SENT in os.environ and path.is_absolute() else path
     return sent if sent.exists() else path
 
@@ -99,7 +86,7 @@ def source(of: Any) -> Path | None:
 
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
-    name = f"{RUN}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
+    name = f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None

@@ -29,7 +29,7 @@ from deconfounded.envs.edits import Edit
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Painter
+from deconfounded.envs.task import Renderer
 from deconfounded.envs.tasks import gymnasium_body
 
 FAR = 1.0  # of goals, m
@@ -107,11 +107,11 @@ class AntGoal(MujocoTask):
         there, near = 1 / (1 + (distance / 0.5) ** 4), np.exp(-0.5 * distance**2)
         return 0.6 * there + 0.4 * near - 0.05 * np.square(action).mean(-1)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         """The goal is a red disc."""
         spec = self.spec()
         self.decorate(spec)
         render.chequer(spec, "MatPlane")
         disc, place = mujoco.mjtGeom.mjGEOM_CYLINDER, [*theta, 0.002]
         spec.worldbody.add_site(name="goal", type=disc, size=[0.3, 0.002, 0], pos=place, rgba=[0.9, 0.3, 0.2, 1])
-        return render.Painter(spec.compile())
+        return render.MujocoRenderer(spec.compile())

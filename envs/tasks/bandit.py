@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Painter, Task
+from deconfounded.envs.task import Renderer, Task
 
 ARMS = 5
 
@@ -53,7 +53,7 @@ class Bandit(Task):
         """pi_exp(a | s, theta): 6/10 for the best arm, 1/10 for each of the others."""
         return np.where(np.arange(ARMS) == theta, 0.6, 0.1)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         """Five arms; the best has a green base, the pulled one is filled: bright if it paid."""
 
         def paint(state: Array, action: Array) -> NDArray[np.uint8]:

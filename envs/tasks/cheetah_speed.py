@@ -29,7 +29,7 @@ from deconfounded.envs.edits import Edit
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Painter
+from deconfounded.envs.task import Renderer
 from deconfounded.envs.tasks import gymnasium_body
 
 WRONG = 0.2  # probability
@@ -98,7 +98,7 @@ class CheetahSpeed(MujocoTask):
         off = np.abs(self._off(next_state, theta))
         return 0.8 * np.exp(-0.5 * (off / 0.6) ** 2) + 0.2 * np.exp(-off) - 0.1 * np.square(action).mean(-1)
 
-    def painter(self, theta: Array) -> Painter:
+    def renderer(self, theta: Array) -> Renderer:
         """A post runs along at the hidden speed, from the start; it is the lamp: red is too fast, blue too slow."""
         spec = self.spec()
         self.decorate(spec)
@@ -106,7 +106,7 @@ class CheetahSpeed(MujocoTask):
         post, colours = mujoco.mjtGeom.mjGEOM_CYLINDER, {1: (0.9, 0.3, 0.2), -1: (0.2, 0.4, 0.9), 0: (0.6, 0.6, 0.6)}
         spec.worldbody.add_site(name="lamp", type=post, size=[0.04, 0.5, 0], pos=[0, 1, 0.5])
         model = spec.compile()
-        lamp, drawn = model.site("lamp"), render.Painter(model)
+        lamp, drawn = model.site("lamp"), render.MujocoRenderer(model)
 
         def paint(state: Array, action: Array) -> NDArray[np.uint8]:
             lamp.pos[0], lamp.rgba[:3] = theta[0] * state[0], colours[int(state[-1])]
