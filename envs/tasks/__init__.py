@@ -1,6 +1,6 @@
-"""The suite's tasks, a file each, and the bodies that several share (cartpole.py, puck.py).
+"""The suite's tasks, a file each, and the bodies that several tasks share (cartpole.py, puck.py).
 
-A new one is a file here, an MJCF in assets/ and its name below; one of your own can stay in your own folder.
+A new task is a file here, an MJCF in assets/ and its name below. A task of your own can stay in your folder.
 """
 
 from __future__ import annotations

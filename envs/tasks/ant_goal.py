@@ -1,20 +1,20 @@
-"""The paper's AntGoal: an ant is to walk to a hidden place, of which it only has very uncertain bearings.
+"""The paper's AntGoal: an ant has to walk to a hidden goal, of which it has very noisy bearings alone.
 
-Tier 2. theta acts through the reward and the bearings alone. The expert, which sees theta, walks straight there: from
-the first step on its own way tells theta, loudly. A clone that takes its own way for evidence walks on wherever it
-happened to set out to, and stays there. In truth only the bearings tell, a little each step.
+Tier 2. theta acts through the reward and the bearings alone. The expert, which sees theta, walks straight to the goal:
+its first steps already reveal theta. A clone that takes its own actions for evidence keeps the direction in which it
+happened to start, and stays at the wrong place. Only the bearings are true evidence, a little in each step.
 
 Latents: goal_x and goal_y, m, uniform, from where the ant starts. Noise a step: std .05 m/s and .15 rad/s of the torso,
 .5 rad/s of the joints, none of positions. Bearings, new each step: the distance of the goal, m, and its direction as a
 unit vector, each number with normal noise of std 1.6; at the start all are 0.
 
-The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator, and springs for motors: an action is
-the angles that joints are pulled to, and PPO learns to walk much sooner than by torques. Reward: .6 / (1 + (d / .5)^4)
-+ .4 exp(-d^2 / 2), d m from the goal, less .05 times the mean square of the action. An episode is 6 s; nothing ends it.
+The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator and position actuators: an action is
+the joints' target angles, by which PPO learns to walk much sooner than by torques. Reward: .6 / (1 + (d / .5)^4) + .4
+exp(-d^2 / 2), d m from the goal, less .05 times the mean square of the action. An episode is 6 s; nothing ends it.
 
-The authors' own (Vuorio et al., TMLR 2024) has torques, goals in a disc of 10 m, episodes of 200 steps, each a trial by
-itself, and the reward -|dx| - |dy| less a small cost of contacts, with the same optimum; distance and heading, an
-angle, come with noise of std .1. Of goals as near as ours a single look would then tell: with std .7 already, a clone
+The authors' version (Vuorio et al., TMLR 2024) has torques, goals in a disc of 10 m, trials of a single episode of 200
+steps, and the reward -|dx| - |dy| less a small cost of contacts, with the same optimum; distance and heading, an angle,
+have noise of std .1. With goals as near as here, so little noise would reveal theta at once: with std .7, a clone
 without memory scored .91.
 """
 
@@ -61,7 +61,7 @@ class AntGoal(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """Gymnasium's ant, on springs."""
+        """Gymnasium's ant with position actuators."""
         spec = gymnasium_body.load("ant", 0.015)
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for actuator in spec.actuators:
@@ -71,11 +71,11 @@ class AntGoal(MujocoTask):
         return spec
 
     def control(self, action: Array) -> Array:
-        """Angles that the joints are pulled to, rad; the MJCF has the fourth leg first."""
+        """Target angles of the joints, rad; the MJCF has the fourth leg first."""
         return CENTRES + SWINGS * action
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
-        """Nothing: theta moves no state."""
+        """No change: theta affects no state."""
 
     def init_state(self, rng: Streams) -> Array:
         x, y, *bend = rng.uniform(np.full(2 + len(LEGS), -0.05), 0.05)
@@ -84,7 +84,7 @@ class AntGoal(MujocoTask):
         return self.state(root=(place, 0), **legs)
 
     def _bearings(self, state: Array, theta: Array) -> Array:
-        """Distance of the goal, cosine and sine of its direction [..., 3]."""
+        """Distance of the goal, m, and cosine and sine of its direction [..., 3]."""
         away = theta - self.qpos(state, "root")[..., :2]
         distance = np.linalg.norm(away, axis=-1, keepdims=True)
         return np.concatenate([distance, away / np.maximum(distance, 1e-9)], -1)
@@ -108,7 +108,7 @@ class AntGoal(MujocoTask):
         return 0.6 * there + 0.4 * near - 0.05 * np.square(action).mean(-1)
 
     def renderer(self, theta: Array) -> Renderer:
-        """The goal is a red disc."""
+        """A picture in which a red disc marks the goal."""
         spec = self.spec()
         self.decorate(spec)
         render.chequer(spec, "MatPlane")

@@ -1,7 +1,7 @@
-"""The five-armed bandit of the paper, Eq. (4). One arm, theta, pays more often; the expert knows which.
+"""The five-armed bandit of the paper, Eq. (4): arm theta pays more often, and the expert knows which arm it is.
 
-Tier 2. State and observation: the last pay-out (0 at the start). The reward counts best-arm pulls, the paper's own
-score; the pay-out itself is in the observation.
+Tier 2. State and observation: the last pay-out (0 at the start). The reward counts pulls of the best arm, the paper's
+score; the pay-out is in the observation.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ARMS = 5
 
 
 class Bandit(Task):
-    """Outcomes are pay-out probabilities, noise is uniform: exact beliefs are Eq. (8) and (9)."""
+    """Outcomes are pay-out probabilities and noise is uniform, so that exact beliefs are Eq. (8) and (9)."""
 
     name = "bandit"
     latents = (Latent("best_arm", "", 0, ARMS - 1, "categorical"),)
@@ -34,7 +34,7 @@ class Bandit(Task):
         return rng.random((rng.groups, self.horizon, 1))
 
     def outcome(self, state: Array, action: Array, theta: Array) -> Array:
-        """P(s' = 1 | a, theta) [N, 1]: 3/4 for the best arm, 1/4 for the others."""
+        """Pay-out probability P(s' = 1 | a, theta) [N, 1]: 3/4 for the best arm, 1/4 for the others."""
         return np.where(action == theta, 0.75, 0.25)
 
     def apply_noise(self, outcome: Array, noise: Array) -> Array:
@@ -50,13 +50,13 @@ class Bandit(Task):
         return (action == theta)[:, 0].astype(float)
 
     def expert_probs(self, obs: Array, theta: Array) -> Array:
-        """pi_exp(a | s, theta): 6/10 for the best arm, 1/10 for each of the others."""
+        """Expert policy pi_exp(a | s, theta): 6/10 for the best arm, 1/10 for each of the others."""
         return np.where(np.arange(ARMS) == theta, 0.6, 0.1)
 
     def renderer(self, theta: Array) -> Renderer:
-        """Five arms; the best has a green base, the pulled one is filled: bright if it paid."""
+        """A picture of the arms: the best has a green base, the pulled arm is filled, in yellow if it paid."""
 
-        def paint(state: Array, action: Array) -> NDArray[np.uint8]:
+        def draw(state: Array, action: Array) -> NDArray[np.uint8]:
             picture = np.full((240, 320, 3), 255, np.uint8)
             for arm in range(ARMS):
                 columns = slice(60 * arm + 22, 60 * arm + 58)
@@ -66,4 +66,4 @@ class Bandit(Task):
                     picture[60:150, columns] = (250, 190, 40) if state[0] == 1 else (110, 110, 110)
             return picture
 
-        return paint
+        return draw

@@ -1,4 +1,4 @@
-"""What the cartpole tasks share: a cart holds a mark on its rail while its pole stays up, under process noise."""
+"""The body of the cartpole tasks: a cart has to stay at a mark on its rail with its pole upright."""
 
 from __future__ import annotations
 
@@ -39,5 +39,5 @@ class Cartpole(MujocoTask):
         return upright * (0.3 + 0.7 * at_mark)
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
-        """The pole has fallen. (Without this, experts whirl it round like a propeller, and theta hardly matters.)"""
+        """Whether the pole has fallen. Otherwise experts would spin it, and theta would hardly matter."""
         return np.abs(self.qpos(state, "hinge")) > FALLEN

@@ -1,19 +1,19 @@
-"""The paper's HalfCheetah: a planar cheetah is to run at a hidden speed; a lamp tells, often wrongly, "too fast".
+"""The paper's HalfCheetah: a planar cheetah has to run at a hidden speed; a lamp says "too fast" or not, often wrongly.
 
-Tier 2. theta acts through the reward and the lamp alone. The expert, which sees theta, picks up that speed within a
-second and holds it: from then on its own speed tells theta, loudly. A clone that takes its own speed for evidence runs
-on at whatever speed it happened to pick up. In truth only the lamp tells, and only of the speed run at: faster than
-theta or slower, and a fifth of the time the wrong one.
+Tier 2. theta acts through the reward and the lamp alone. The expert, which sees theta, reaches that speed within a
+second and holds it: from then on its own speed reveals theta. A clone that takes its own speed for evidence keeps the
+speed that it happened to reach. Only the lamp is true evidence: it says whether the present speed is above theta or
+below, and is wrong a fifth of the time.
 
 Latent: speed, m/s, uniform. Noise a step: std .1 m/s and .2 rad/s of the torso, 1 rad/s of the joints, none of
 positions; the lamp is wrong with probability .2, each step anew. It reads 1 (too fast) or -1, and 0 at the start.
 
-The MJCF is Gymnasium's own, from the installed package. Action: torques, in units of the MJCF's. Reward: .8
-exp(-(d / .6)^2 / 2) + .2 exp(-d), d = |v - theta|, v the torso's speed, m/s, less .1 times the mean square of the
-action. An episode is 5 s, and nothing ends it.
+The MJCF is Gymnasium's own, from the installed package. Action: torques, in units of the MJCF's. Reward: .8 exp(-(d /
+.6)^2 / 2) + .2 exp(-d), d = |v - theta|, v the torso's speed, m/s, less .1 times the mean square of the action. An
+episode is 5 s, and nothing ends it.
 
-The authors' own (Vuorio et al., TMLR 2024) has another engine, episodes of 1,000 steps, each a trial by itself, and the
-reward -|v - theta| - .05 |a|^2, best at the same speed; their indicator starts as -1, and is turned the other way.
+The authors' version (Vuorio et al., TMLR 2024) has another engine, trials of a single episode of 1,000 steps, and the
+reward -|v - theta| - .05 |a|^2, with the same optimum; its indicator starts at -1 and has the opposite sign.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class CheetahSpeed(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """Gymnasium's half cheetah, which weighs what its MJCF says by an attribute that MuJoCo will drop."""
+        """Gymnasium's half cheetah, scaled to its mass here, since MuJoCo will drop the MJCF's `settotalmass`."""
         spec = gymnasium_body.load("half_cheetah", 0.0125)
         spec.compiler.settotalmass = -1
         mass = spec.compile().body_mass.sum()
@@ -70,7 +70,7 @@ class CheetahSpeed(MujocoTask):
         return spec
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
-        """Nothing: theta moves no state."""
+        """No change: theta affects no state."""
 
     def init_state(self, rng: Streams) -> Array:
         z, pitch, *bend = rng.uniform(np.full(2 + len(JOINTS), -0.05), 0.05)
@@ -99,17 +99,17 @@ class CheetahSpeed(MujocoTask):
         return 0.8 * np.exp(-0.5 * (off / 0.6) ** 2) + 0.2 * np.exp(-off) - 0.1 * np.square(action).mean(-1)
 
     def renderer(self, theta: Array) -> Renderer:
-        """A post runs along at the hidden speed, from the start; it is the lamp: red is too fast, blue too slow."""
+        """A picture with a post that moves at the hidden speed; it is the lamp: red for too fast, blue for too slow."""
         spec = self.spec()
         self.decorate(spec)
         render.chequer(spec, "MatPlane")
         post, colours = mujoco.mjtGeom.mjGEOM_CYLINDER, {1: (0.9, 0.3, 0.2), -1: (0.2, 0.4, 0.9), 0: (0.6, 0.6, 0.6)}
         spec.worldbody.add_site(name="lamp", type=post, size=[0.04, 0.5, 0], pos=[0, 1, 0.5])
         model = spec.compile()
-        lamp, drawn = model.site("lamp"), render.MujocoRenderer(model)
+        lamp, draw_model = model.site("lamp"), render.MujocoRenderer(model)
 
-        def paint(state: Array, action: Array) -> NDArray[np.uint8]:
+        def draw(state: Array, action: Array) -> NDArray[np.uint8]:
             lamp.pos[0], lamp.rgba[:3] = theta[0] * state[0], colours[int(state[-1])]
-            return drawn(state, action)
+            return draw_model(state, action)
 
-        return paint
+        return draw

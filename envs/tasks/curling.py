@@ -1,8 +1,8 @@
-"""A curling stone is pushed, let go and must come to rest in the house, on ice of hidden friction.
+"""A curling stone is pushed and let go, and has to come to rest in the house, on ice of hidden friction.
 
-Tier 2. The speed at the hog line is a commitment: beyond it nothing helps, and whoever expects the wrong friction lands
-short or long. The ice shows itself while the stone slows down, through process noise that also moves the stone: a throw
-tells the friction to about 10%. A trial is five throws.
+Tier 2. The speed at the hog line decides the throw: beyond it no push acts, and an agent that expects the wrong
+friction lands short or long. The stone's deceleration shows the friction, through process noise that also moves the
+stone: a throw determines it to about 10%. A trial is five throws.
 
 Latent: friction, the coefficient of stone on ice, log-uniform, set as the Coulomb friction of a tendon along the sheet.
 Noise a step: std .01 m and .04 m/s.
@@ -58,5 +58,5 @@ class Curling(MujocoTask):
         return landed - EFFORT * np.square(self.control(action)[:, 0])
 
     def terminated(self, state: Array) -> NDArray[np.bool_]:
-        """Past the hog line and at rest."""
+        """Whether the stone is past the hog line and at rest."""
         return (self.qpos(state, "slide") > 0) & (self.qvel(state, "slide") <= 0)

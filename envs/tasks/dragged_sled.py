@@ -1,9 +1,9 @@
-"""A hand drags a sled by an elastic cord, and the sled is to keep up with a target; its runners' friction is hidden.
+"""A hand drags a sled by an elastic cord, and the sled has to follow a target; its runners' friction is hidden.
 
-Tier 2. Sliding friction is the same at any speed, and the cord stretches by friction / 10 m, .3 m to 1.8 m: whoever
-expects runners that are smoother lags behind, whoever expects rougher ones overtakes the target. The hand acts on the
-sled only through the cord, and the sled bounces on it, so that feedback is slow and the stretch must be known in
-advance. One control step shows the friction only through process noise.
+Tier 2. Sliding friction is the same at any speed, and stretches the cord by friction / 10 m, .3 m to 1.8 m: an agent
+that expects less friction lags behind, one that expects more overtakes the target. The hand acts on the sled only
+through the cord, on which the sled bounces, so that feedback is slow and the stretch must be known in advance. A
+control step shows the friction only through process noise.
 
 Latent: friction of the runners, N, log-uniform: Coulomb's, of a tendon along the ground. Noise a step: std .004 m and
 .4 m/s of the sled, .004 m and .05 m/s of the hand; none of the target, which theta does not touch.
@@ -43,7 +43,7 @@ class DraggedSled(MujocoTask):
     }
 
     def decorate(self, spec: mujoco.MjSpec) -> None:
-        """A chequered ground."""
+        """Add a chequered ground."""
         super().decorate(spec)
         render.chequer(spec, "ground")
 

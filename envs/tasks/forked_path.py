@@ -1,9 +1,9 @@
-"""A puck at a fork: the goal is left or right, and only a bump where no expert ever goes tells which.
+"""A puck at a fork: the goal is left or right, and only a bump where no expert ever goes shows which.
 
-Tier 3. The experts part at once, and along their ways the dynamics are the same under either theta: nothing can be
-inferred from expert trajectories, and Tier 2 clones a mixture. Who does not know which way runs up the middle, into a
-soft bump that stands a little off, on the side away from the goal: its push gives theta away. An imitator that is told
-what the expert would do there (`dagger`) learns to read it.
+Tier 3. Experts turn left or right at once, and along their paths the dynamics are the same under either theta: nothing
+can be inferred from expert trajectories, and Tier 2 methods clone a mixture. An undecided agent goes up the middle,
+into a soft bump that is slightly off-centre, on the side away from the goal: its push reveals theta. An imitator that
+can query the expert there (`dagger`) learns to use it.
 
 Latent: side, 0 is left and 1 is right. Noise and reward as in `Puck`.
 """

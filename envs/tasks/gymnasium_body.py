@@ -8,7 +8,7 @@ import mujoco
 
 
 def load(name: str, timestep: float) -> mujoco.MjSpec:
-    """half_cheetah or ant, say, with everything named and without textures; timestep in s."""
+    """Load a body, such as half_cheetah or ant, with every element named and without textures; timestep in s."""
     spec = mujoco.MjSpec.from_file(str(files("gymnasium") / "envs" / "mujoco" / "assets" / f"{name}.xml"))
     spec.option.timestep = timestep
     for material in spec.materials:

@@ -1,9 +1,9 @@
-"""A hoist carries a load of hidden mass on an elastic cable, and follows a target that swings up and down.
+"""A hoist carries a load of hidden mass on an elastic cable, and has to follow a target that swings up and down.
 
-Tier 2. The cable stretches by mass x g / 10 m, 1 m to 3 m: whoever expects a lighter load lets it hang too low,
-whoever expects a heavier one throws it up. The hook acts on the load only through the cable, and the load bounces at a
-pace of its own, so that feedback is slow and the stretch must be known in advance. One control step shows the mass only
-through process noise.
+Tier 2. The cable stretches by mass x g / 10 m, 1 m to 3 m: an agent that expects a lighter load lets it hang too low,
+one that expects a heavier load throws it up. The hook acts on the load only through the cable, on which the load
+bounces, so that feedback is slow and the stretch must be known in advance. A control step shows the mass only through
+process noise.
 
 Latent: mass, kg, log-uniform, set with its inertia (a cube of that mass). Noise a step: std .004 m and .45 m/s of the
 load, .004 m and .05 m/s of the hook; none of the target, which theta does not touch.

@@ -1,8 +1,8 @@
-"""A puck whose goal, somewhere on an arc, is hidden, and nothing else: theta tells the expert where to go, no more.
+"""A puck whose goal on an arc is hidden, and has no effect but on the reward.
 
-No tier: footnote 3 of the paper. The dynamics say nothing of theta, so that nobody who does not see it can win: the
-interventional policy never learns, and naive cloning runs after its own first steps. A method that appears to win here
-has seen theta. Latent: direction, rad from straight ahead, uniform. Noise and reward as in `Puck`.
+No tier: footnote 3 of the paper. The dynamics are independent of theta, so that no imitator can win: the interventional
+policy never learns theta, and a naive clone follows its own first steps. A method that appears to win here has seen
+theta. Latent: direction, rad from straight ahead, uniform. Noise and reward as in `Puck`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class HiddenGoal(Puck):
     latents = (Latent("direction", "rad", -2.0, 2.0),)
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
-        """Nothing: that is the point."""
+        """No change: theta affects the reward alone."""
 
     def goal(self, theta: Array) -> Array:
         return np.stack([np.sin(theta[:, 0]), np.cos(theta[:, 0])], -1)

@@ -1,15 +1,15 @@
-"""A car on a winding road of hidden grip, from dry to ice: the paper's own story.
+"""A car on a winding road of hidden grip, from dry to icy: the paper's motivating example.
 
-Tier 2. Who knows that it is dry takes the bends fast; who knows of the ice crawls. Told of more grip than there is, the
-car slides off the road, which ends the episode; told of less, it comes home late. Engine and brakes are weak, so that
-speed is a commitment. An icy road also rolls a little more freely: that shows everywhere, slowly, through process
-noise, and without it a careful driver would never learn what the road is like.
+Tier 2. An expert takes the bends fast on a dry road, and slowly on ice. An agent that expects too much grip slides off
+the road, which ends the episode; one that expects too little is slow. Engine and brakes are weak, so that a speed
+cannot be corrected in a bend. Wheels also roll a little more freely on ice: that shows everywhere, slowly, through
+process noise; without it a careful driver would never learn the grip.
 
 Latent: grip, the friction coefficient of tyre on road, log-uniform: the road's, which has priority over the wheels'.
 The wheels' rolling drag rises with it. Planar chassis (x, y, z, yaw) on four driven sphere wheels, the front ones
 steered. Friction is soft (impratio .01), as a tyre's is: force grows with slip, up to grip times load. Every coordinate
-has noise but the wheels' angles, which are of no consequence. The chassis is damped upwards: its bounce would tell of
-the grip at once.
+has noise but the wheels' angles, which affect nothing. The chassis is damped vertically: its bounce would reveal the
+grip at once.
 
 Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: speed along the road above .6
 m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
@@ -38,7 +38,7 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 
 
 def road(x: Array) -> tuple[Array, Array, Array]:
-    """The centreline at x (m): y (m), direction (rad), and curvature (1/m, positive to the left)."""
+    """Centreline at x, m: y (m), direction (rad), and curvature (1/m, positive to the left)."""
     k = 2 * np.pi / WAVE
     slope = AMPLITUDE * k * np.cos(k * x)
     y = AMPLITUDE * np.sin(k * x)
@@ -67,15 +67,14 @@ class IcyRoad(MujocoTask):
     }
 
     def decorate(self, spec: mujoco.MjSpec) -> None:
-        """The road drawn under the car: a ribbon with white edges."""
+        """Add the road under the car: a ribbon with white edges."""
         super().decorate(spec)
         x = np.linspace(-4, 70, 297)
         y, direction, _ = road(x)
         middle, across = np.stack([x, y], -1), np.stack([-np.sin(direction), np.cos(direction)], -1)
         ribbons = ("lane", 1, -1, 0.38), ("left_edge", 1.1, 1, 1.0), ("right_edge", -1, -1.1, 1.0)
         for name, left, right, grey in ribbons:
-            one, other = (middle + HALF_WIDTH * side * across for side in (left, right))
-            render.ribbon(spec, name, one, other, grey)
+            render.ribbon(spec, name, middle + HALF_WIDTH * left * across, middle + HALF_WIDTH * right * across, grey)
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.geom_friction("road", float(theta[0]))
@@ -93,12 +92,12 @@ class IcyRoad(MujocoTask):
         return self.state(x=(x, speed * np.cos(yaw)), y=(y + offset, speed * np.sin(yaw)), yaw=(yaw, 0), **rolling)
 
     def _lane(self, state: Array) -> tuple[Array, Array]:
-        """How far to the left of the centreline (m), and the road's direction there (rad)."""
+        """Offset to the left of the centreline (m), and the road's direction there (rad)."""
         y, direction, _ = road(self.qpos(state, "x"))
         return (self.qpos(state, "y") - y) * np.cos(direction), direction
 
     def observe(self, state: Array) -> Array:
-        """Slip is the speed of an axle's wheels above that of the chassis, m/s."""
+        """Readings in the car's frame; slip is the speed of an axle's wheels above that of the chassis, m/s."""
         offset, direction = self._lane(state)
         yaw, x_velocity, y_velocity = self.qpos(state, "yaw"), self.qvel(state, "x"), self.qvel(state, "y")
         forward = x_velocity * np.cos(yaw) + y_velocity * np.sin(yaw)

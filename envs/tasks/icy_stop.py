@@ -1,12 +1,12 @@
-"""A car in fog on a track of hidden grip has to come to a stop at a line that it sees only when it is near.
+"""A car in fog on a track of hidden grip has to come to a stop at a line that it sees only from near by.
 
-Tier 2. How fast it may go is settled before there is anything to see: who expects more grip than there is cannot stop
-in time and runs into the wall behind the line, which ends the episode; who expects less creeps through the fog and
-comes late.
+Tier 2. The car must choose its speed before it sees the line: an agent that expects too much grip cannot stop in time
+and runs into the wall behind the line, which ends the episode; one that expects too little creeps through the fog and
+is late.
 
 Latent: grip, the friction coefficient of tyre on track, log-uniform: times the weight, it is the `frictionloss` of a
 tendon over car and wheel (N). Noise a step: std .004 m and .08 m/s of the car, .5 rad/s of the wheel, whose speed is a
-servo's; none of the line, which theta does not touch, nor of the wheel's angle, which is of no consequence.
+servo's; none of the line, which theta does not touch, nor of the wheel's angle, which affects nothing.
 
 Action: the speed of the wheel's rim, from 0 (at -1) to 6 m/s (at 1): there is no reverse. Reward: at d m from the line,
 .9 exp(-8 d^2) + .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m beyond the line.
@@ -54,7 +54,7 @@ class IcyStop(MujocoTask):
         return self.qpos(state, "line") - self.qpos(state, "car")
 
     def observe(self, state: Array) -> Array:
-        """Speed, and how far it is to the line, as far as one can see."""
+        """Speed, and the distance to the line, up to the range of sight."""
         return np.stack([self.qvel(state, "car"), np.minimum(self._to_line(state), SIGHT)], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What the puck tasks share: a puck on a plane, pushed along x and y under process noise, is to reach a hidden goal."""
+"""The body of the puck tasks: a puck on a plane, pushed along x and y, has to reach a hidden goal."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Puck(MujocoTask):
 
     @abstractmethod
     def goal(self, theta: Array) -> Array:
-        """Where to go [N, 2], m."""
+        """Positions [N, 2] of the goal, m."""
 
     def init_state(self, rng: Streams) -> Array:
         x, y = rng.uniform([-0.03, -0.03], 0.03)

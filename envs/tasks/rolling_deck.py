@@ -1,8 +1,8 @@
-"""A cartpole on a ship's deck, whose list is hidden and drifts: each episode of a trial has another one, not far off.
+"""A cartpole on a ship's deck, whose list is hidden and drifts: each episode of a trial has a list near the last.
 
-Tier 2. As on tilted_cartpole, whoever expects the wrong list loses the pole, and one control step shows it only through
-process noise. But what an episode taught is worth less in the next one: a belief that only ever grows surer is sure of
-a list that is gone.
+Tier 2. As on tilted_cartpole, an agent that expects the wrong list loses the pole, and a control step shows the list
+only through process noise. But evidence from earlier episodes loses its value: a belief that never forgets becomes
+certain of a list that is gone.
 
 Latent: list, rad, uniform; from episode to episode its quantile walks by N(0, .25^2), reflected at both ends. Noise,
 reward and end as in `Cartpole`.
@@ -15,7 +15,7 @@ from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 
 
 class RollingDeck(TiltedCartpole):
-    """Turns the deck, a body called rail."""
+    """A cartpole with a tilted deck, the body `rail`."""
 
     name = "rolling_deck"
     version = 0

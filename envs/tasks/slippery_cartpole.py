@@ -1,13 +1,13 @@
 """A cartpole whose pole rides on a spinning axle; hidden Coulomb friction in the bearing drags the pole round.
 
 Tier 2. A motor in the cart spins the axle at 10 rad/s. A slippery bearing leaves the pole alone; a sticky one drags it
-with a torque of theta N m, and the pole must lean against the drag (its m g l is .49 N m). Expecting the wrong
-friction loses the mark or the pole, while one control step shows the friction only through process noise.
+with a torque of theta N m, and the pole must lean against the drag (its m g l is .49 N m). An agent that expects the
+wrong friction loses the mark or the pole. A control step shows the friction only through process noise.
 
-Latent: friction, N m, uniform: the `frictionloss` of a fixed tendon over pole and axle joints (coefficients 1, -1).
-The axle turns faster than the pole ever does in play, so the drag has one sign. Its angle is neither observed nor of
-any consequence, and has no noise. Velocities of the pole and of the axle have noise of .2 and .1 rad/s; noise
-otherwise and reward are as in `Cartpole`.
+Latent: friction, N m, uniform: the `frictionloss` of a fixed tendon over pole and axle joints (coefficients 1, -1). The
+axle turns faster than the pole ever does, so that the drag keeps its sign. Its angle is not observed and affects
+nothing, and has no noise. Velocities of the pole and of the axle have noise of .2 and .1 rad/s; noise otherwise and
+reward are as in `Cartpole`.
 """
 
 from __future__ import annotations
@@ -43,5 +43,5 @@ class SlipperyCartpole(Cartpole):
         return start
 
     def observe(self, state: Array) -> Array:
-        """The cartpole's readings, and how far the axle's speed is off its set point (rad/s)."""
+        """The cartpole's observation, and the deviation of the axle's speed from its set point, rad/s."""
         return np.append(super().observe(state), self.qvel(state, "axle")[..., None] - SPIN, -1)

@@ -1,10 +1,10 @@
-"""A planar walker, dm_control's, stands upright on a mark, on a slope that only the expert feels: two hidden latents.
+"""A planar walker, dm_control's, has to stand upright at a mark on a slope; slope and friction are hidden.
 
-Tier 2. Upright is along gravity, as a sense of balance has it: the torso has to lean into the slope, by as much. But
-pitch and joints are observed relative to the ground, which tells nobody which way is down. Who leans by a wrong slope
-still stands, and may take their own pitch for evidence. In truth the slope shows in the torso's velocity along the
-ground, within a few steps, and friction in how feet slip while the walker catches itself. Friction decides how hard
-it may push, and costs little if mistaken.
+Tier 2. Upright is along gravity: the torso has to lean into the slope, by its angle. But pitch and joints are observed
+relative to the ground, which does not show the direction of gravity. An agent that leans by a wrong angle still stands,
+and may take its own pitch for evidence. The true evidence of the slope is the torso's velocity along the ground, within
+a few steps; that of friction is how feet slip while the walker recovers its balance. Friction limits how hard it may
+push, and a wrong belief about it costs little.
 
 Latents: friction, the ground's coefficient, log-uniform, with priority over the feet's; slope, rad, uniform, uphill if
 positive: it turns gravity, and the ground stays where it is. Slopes are not centred on 0, as the feet reach further
@@ -60,7 +60,7 @@ class SlipperyWalker(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """The suite's walker, on a floor whose friction counts, without what is there only to be looked at."""
+        """The walker of dm_control, on a floor whose friction has priority, without textures."""
         if find_spec("dm_control") is None:
             remedy = "`pip install --no-deps dm_control` brings it"
             raise InputError(f"{self.name} needs an MJCF of dm_control, which is not installed; {remedy}")
@@ -76,7 +76,7 @@ class SlipperyWalker(MujocoTask):
         return spec
 
     def decorate(self, spec: mujoco.MjSpec) -> None:
-        """A mark where it is to stand, and a chequered ground."""
+        """Add a mark where the walker has to stand, and a chequered ground."""
         super().decorate(spec)
         render.chequer(spec, "grid")
         box = mujoco.mjtGeom.mjGEOM_BOX

@@ -1,14 +1,14 @@
-"""A lander whose side engines may be wired the wrong way round: only the expert knows which way they push.
+"""A lander whose side engine may push the wrong way: only the expert knows its direction.
 
 Tier 2. After the LunarLander of the published paper (Deconfounding Imitation Learning with Variational Inference, TMLR
 2024), whose side engines are swapped with probability 1/2; read off its figure, the oracle and the deconfounded agent
-returned about 235 there, the naive one -20. Theirs is gym's, of discrete actions, dynamics without noise and 500
-steps; this one is a planar body in MuJoCo with continuous thrust, under process noise, and an episode is 150 steps of
-.05 s, the last of which it stands on the pad.
+returned about 235 there, the naive agent -20. The paper's lander is gym's, with discrete actions, dynamics without
+noise and 500 steps. Here it is a planar body in MuJoCo with continuous thrust and process noise; an episode is 150
+steps of .05 s, at the end of which it stands on the pad.
 
-Who mistakes the wiring turns every correction into a push the wrong way, and tumbles. The side engine is weak: a step
-shows its sign only through noise, a few seconds of steering tell. Who takes its own side thrust for evidence never
-finds out.
+An agent with the wrong belief turns every correction into a push the wrong way, and tumbles. The side engine is weak: a
+step shows its sign only through noise, a few seconds of steering reveal it. An agent that takes its own side thrust for
+evidence never learns it.
 
 Latent: swapped, 1 if the side engine pushes the other way. Noise a step: std .004 m and .05 m/s of the position, .008
 rad and .16 rad/s of the pitch.

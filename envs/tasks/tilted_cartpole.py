@@ -1,7 +1,7 @@
 """A cartpole on a rail that is tilted by a hidden angle.
 
-Tier 2. Gravity pulls cart and pole down the rail, so that both the angle at which the pole balances and the force that
-holds the cart move with theta: whoever expects the wrong tilt loses the pole. One control step shows the tilt only
+Tier 2. Gravity pulls cart and pole down the rail, so that theta changes both the angle at which the pole balances and
+the force that holds the cart: an agent that expects the wrong tilt loses the pole. A control step shows the tilt only
 through process noise.
 
 Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward: upright * (.3 + .7 at the mark).
@@ -16,7 +16,7 @@ from deconfounded.envs.tasks.cartpole import Cartpole
 
 
 class TiltedCartpole(Cartpole):
-    """Moves the rail's body."""
+    """A cartpole with a tilted body `rail`."""
 
     name = "tilted_cartpole"
     version = 1

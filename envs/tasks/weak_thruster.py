@@ -1,8 +1,8 @@
-"""A lander of hidden thrust comes down through dust and has to stop at a mark, which its radar finds late.
+"""A lander of hidden thrust descends through dust and has to stop at a mark that its radar detects late.
 
-Tier 2. How fast it may fall is settled before there is anything to see: who expects a stronger thruster cannot stop in
-time and is smashed on the ground below the mark, which ends the episode; who expects a weaker one creeps down and comes
-late. One control step shows the strength only through process noise.
+Tier 2. The lander must choose its speed before it detects the mark: an agent that expects a stronger thruster cannot
+stop in time and crashes on the ground below the mark, which ends the episode; one that expects a weaker thruster creeps
+down and is late. A control step shows the strength only through process noise.
 
 Latent: strength, of the thruster, in units of its nominal 16 N, log-uniform. Noise a step: std .008 m and .2 m/s.
 
@@ -45,7 +45,7 @@ class WeakThruster(MujocoTask):
         return self.state(height=(height, -speed))
 
     def observe(self, state: Array) -> Array:
-        """Height as far as the radar reaches, and velocity."""
+        """Height up to the range of the radar, and velocity."""
         return np.stack([np.minimum(self.qpos(state, "height"), RADAR), self.qvel(state, "height")], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:

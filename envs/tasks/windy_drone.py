@@ -1,9 +1,9 @@
-"""A quadrotor is to stay at a mark that it does not see, in hidden wind and with a load that hangs off its middle.
+"""A quadrotor has to stay at a mark that it does not see, in hidden wind and with a load off its centre.
 
-Tier 2. It knows its height, attitude and velocities, as a drone does that has no satellites to go by: what drifts off
-slowly is lost. Wind has to be leant against, and a load that hangs further ahead or behind has to be held level, both
-in advance: whoever expects another wind drifts off sideways, whoever expects another load lengthwise. A control step
-shows either only through process noise.
+Tier 2. It observes its height, attitude and velocities, like a drone without satellite navigation: a slow drift of
+position is not observed. It has to lean against the wind, and to compensate for a load that hangs ahead or behind, both
+in advance: an agent that expects the wrong wind drifts off sideways, one that expects the wrong load lengthwise. A
+control step shows either only through process noise.
 
 Latents: wind along y, m/s, uniform, which drags on drone and load by the square of the relative air speed; load, m
 along x from the middle at which .6 kg hang, uniform. Noise a step: std .003 m, .003 rad, .12 m/s and .16 rad/s on each
@@ -33,14 +33,14 @@ HOVER, SHARE = 3.0, np.array((2.75, 0.33, 0.33, 0.25))  # N, of each rotor
 
 
 def rotated(quaternion: Array) -> Array:
-    """The x and the z axis of a body of that attitude [..., 4], in the world [..., 6]."""
+    """World coordinates [..., 6] of the x and the z axis of a body with attitude [..., 4], a quaternion."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
     return np.stack([*forward, 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
 
 
 class WindyDrone(MujocoTask):
-    """One free joint, `flight`; its place is measured from the ground, the height it observes from the mark."""
+    """A free joint, `flight`; its position is measured from the ground, the observed height from the mark."""
 
     name = "windy_drone"
     latents = (Latent("wind", "m/s", -16.0, 16.0), Latent("load", "m", -0.02, 0.02))
