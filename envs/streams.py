@@ -43,7 +43,7 @@ class Streams:
 
 
 def unseeded(rng: np.random.Generator) -> np.random.Generator:
-    """A generator in the same state, that does not hold the seed from which this state came."""
-    made = np.random.Generator(type(rng.bit_generator)(0))
-    made.bit_generator.state = rng.bit_generator.state
-    return made
+    """A generator in the same state that does not hold the seed from which this state came."""
+    copy = np.random.Generator(type(rng.bit_generator)(0))
+    copy.bit_generator.state = rng.bit_generator.state
+    return copy
