@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gymnasium import spaces
-
 from deconfounded.deconf.core.sizes import MANY, WIDE
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
@@ -69,7 +67,7 @@ class Method:
 
     def amounts(self, preset: str, task: Task, device: str) -> dict[str, Any]:
         """Its configuration on a task, under a preset, as plain values; empty if it has none."""
-        discrete = isinstance(task.action_space, spaces.Discrete)
+        discrete = task.n_actions > 0
         config = self.on_bandit if discrete and self.on_bandit is not None else self.on_control
         if config is None:
             return {}

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Discrete
 from numpy.typing import NDArray
 
 from deconfounded import envs
@@ -56,7 +55,7 @@ class Recorder(Agent):
             self.note()
         self.agent.reset(rngs)
         self.episode += 1
-        self._film(np.zeros(self.env.task.action_space.shape or (1,)))
+        self._film(np.zeros(self.env.task.action_width))
 
     def _film(self, action: Array) -> None:
         if not self.filmed or self.episode > self.env.task.episodes:
@@ -157,12 +156,7 @@ class BenchmarkJob(Job):
 
 def spaces(task: envs.Task) -> dict[str, int]:
     """What an agent must fit: O, A, and the number of discrete actions or 0."""
-    discrete = int(task.action_space.n) if isinstance(task.action_space, Discrete) else 0
-    return {
-        "observations": len(task.observation),
-        "action": int(np.prod(task.action_space.shape or 1)),
-        "actions": discrete,
-    }
+    return {"observations": len(task.observation), "action": task.action_width, "actions": task.n_actions}
 
 
 def evaluate(

@@ -154,8 +154,8 @@ class Guest(Agent):
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         """Clipped to [-1, 1] if continuous, as environments do. Raises InputError for what is not a row for each."""
-        given, space = self._do("act", obs), self.context.task.action_space
-        width = space.shape[0] if space.shape else 1
+        given, task = self._do("act", obs), self.context.task
+        width = task.action_width
         action = np.asarray(given, float) if isinstance(given, np.ndarray) else np.empty(0)
         if action.shape != (len(obs), width) or not np.isfinite(action).all():
             what = f"shape {action.shape}" if action.shape != (len(obs), width) else "NaN or infinity"
@@ -163,7 +163,7 @@ class Guest(Agent):
                 f"method {self.name} gave actions of {what} for {len(obs)} observations;"
                 f" they must be ({len(obs)}, {width}), finite"
             )
-        return action.clip(-1, 1) if space.shape else self.context.task.check_action(action, len(obs))
+        return task.check_action(action, len(obs)) if task.n_actions else action.clip(-1, 1)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, get_args, get_type_hints
 
-from gymnasium import spaces
-
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 
@@ -46,7 +44,7 @@ def preset(name: str, task: envs.Task, device: str, methods: Sequence[str] | Non
 
     Tasks with discrete actions take the bandit's, all others those of control.
     """
-    discrete = isinstance(task.action_space, spaces.Discrete)
+    discrete = task.n_actions > 0
     amounts = _BANDIT if discrete else _CONTROL
     if name == "smoke":
         amounts = _SMOKE_BANDIT if discrete else _SMOKE

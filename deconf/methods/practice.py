@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from deconfounded.deconf.given import Environments
+from deconfounded.envs.task import action_sizes
 from deconfounded.experts.sb3 import BatchVecEnv
 
 if TYPE_CHECKING:
@@ -37,8 +38,8 @@ class Practice(BatchVecEnv):
     ) -> None:
         """space: of actions. mean, std [O]: of the expert's observations."""
         self._environments, self._mean, self._std, self._reward = environments, mean, std, reward
-        self._actions = int(getattr(space, "n", 0))
-        self._features = self._actions or int(np.prod(space.shape or 1))
+        width, self._actions = action_sizes(space)
+        self._features = self._actions or width
         seen = spaces.Box(-np.inf, np.inf, (len(mean) + self._features + 1,), np.float32)
         super().__init__(environments.n, seen, space)
 
