@@ -27,10 +27,10 @@ from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
 from deconfounded.benchmarks.studies import cost, publish, site
+from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
 from deconfounded.experts.policy import OwnExpert
-from tests.fixtures import NoStakes, feedback
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]

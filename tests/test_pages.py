@@ -24,20 +24,6 @@ from deconfounded.envs.files import mark, mark_of, save_figure
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 
-def test_settings_share_what_is_the_same(tmp_path: Path) -> None:
-    one, other = tmp_path / "one", tmp_path / "other"
-    other.mkdir()
-    tune.share(tmp_path / "nowhere", one)
-    for name in ("gail-100", "expert-100", "demonstrations-100"):
-        (one / f"{name}.npz").write_text("one")
-    (other / "expert-100.npz").write_text("its own")
-    tune.share(one, other, but="gail")
-    assert {file.stem: file.read_text() for file in other.iterdir()} == {
-        "expert-100": "its own",
-        "demonstrations-100": "one",
-    }
-
-
 def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The preset's amount so many times is tried; of settings that score nearly alike, the cheaper is chosen."""
     for method, changes in tune.TRIED.items():

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
-from deconfounded.envs.files import write_atomically, write_json
+from deconfounded.benchmarks.studies import runs
+from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -78,14 +78,6 @@ def title(change: Change) -> str:
     return ", ".join(told) or "the preset"
 
 
-def share(source: Path, other: Path, but: str = "") -> None:
-    """Demonstrations and references are the same for all settings: those that another folder lacks are copied there."""
-    other.mkdir(parents=True, exist_ok=True)
-    for file in source.glob("*.npz"):
-        if not (other / file.name).exists() and file.stem.rpartition("-")[0] != but:
-            write_atomically(other / file.name, file.read_bytes())
-
-
 def kept(file: Path) -> list[dict[str, Any]]:
     """The rows of the file, one a setting."""
     return json.loads(file.read_bytes())["rows"] if file.is_file() else []
@@ -116,24 +108,6 @@ def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
     return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
 
 
-def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:
-    """The results of a setting on a task: those of the method and of the references."""
-    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import prepare
-    from deconfounded.benchmarks.output import records
-
-    own = out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
-    jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
-    with commands.locked(own), Local() as engine:
-        prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
-        share(out / task.name, own / "jobs")
-        finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
-        share(own / "jobs", out / task.name, but=name)
-    return records.gather(records.of_run(finished, "default", [], task.episodes))
-
-
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -141,6 +115,8 @@ def main() -> None:
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
     args = parser.parse_args()
     check_names("method", args.methods or (), list(TRIED))
+    from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
     file = DOCS / "tuning.json"
@@ -151,10 +127,13 @@ def main() -> None:
             continue
         row |= {"scores": {}, "loss": {}, "cpu_s": {}}
         for task in map(envs.get, TASKS):
-            found = run(name, change, settings[task.name], task, args.out)
-            row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
-            entry = found["methods"][name]
-            row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
+            # A folder a task: what does not depend on the setting, demonstrations and references, is made once.
+            base = began(preset("default", task, "cpu"))
+            made = runs.run(task, settings[task.name], (*REFERENCES, name), SEEDS, args.out / task.name, base=base)
+            results = records.gather(made)
+            row |= {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
+            entry = results["methods"][name]
+            row["scores"][task.name] = [round(score, 4) for score in last_scores(results["methods"])[name].values()]
             row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
             row["cpu_s"][task.name] = entry["cpu_s"]
         keep(row, file)
