@@ -21,12 +21,12 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
-from deconfounded.benchmarks import certify, commands, data
+from deconfounded.benchmarks import certify, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
-from deconfounded.benchmarks.studies import cost, publish, site
+from deconfounded.benchmarks.studies import publish, site
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
@@ -68,7 +68,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
         (("benchmarks/run.py", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
         (("benchmarks/certify.py", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
-        (("benchmarks/studies/speed.py", "--n", "100000000000000000000"), "it must be from 1 to 1,000,000"),
+        (("benchmarks/studies/performance.py", "sped"), "did you mean 'speed'?"),
         (
             ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
             "output folder /proc/none cannot be written",
@@ -93,11 +93,10 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
         (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
         (("benchmarks/studies/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
-        (("benchmarks/studies/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/studies/publish.py", "nowhere"), "holds no records and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
-        (("benchmarks/studies/speed.py", "--task", "bandit"), "no physics to time"),
+        (("benchmarks/studies/performance.py", "--tasks", "bandit"), "no physics to time"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -363,13 +362,6 @@ class TestFiles:
         write_json(tmp_path / "x.json", {**json.loads((tmp_path / "x.json").read_text()), **change})
         with pytest.raises(envs.InputError, match="is damaged, or was changed by hand"):
             read_sealed(tmp_path / "x.json")
-
-
-def test_cost_locks_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cost", "--task", "bandit", "--out", str(tmp_path)])
-    monkeypatch.setattr(scheduler, "run_all", None)
-    with commands.locked(tmp_path / "0.25"), pytest.raises(envs.InputError, match="another command is at work"):
-        cost.main()
 
 
 def test_time_worked_counts_overlaps_once() -> None:

@@ -38,7 +38,7 @@ from tests.tools import tiny_preset
 
 REACHED = (  # where a command's work begins
     *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
-    *("benchmarks.studies.speed.measure", "benchmarks.studies.growth.cpu", "benchmarks.studies.seeds.Context"),
+    *("benchmarks.studies.stepping.seconds", "benchmarks.studies.performance.update_seconds"),
     *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
     *("benchmarks.output.report.write", "benchmarks.studies.site.write", "benchmarks.studies.publish.keep"),
     *("benchmarks.check.check_task",),
@@ -83,16 +83,6 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
             **{"--methods": ("", "naive", "all,", "gone.py:fit", "os:path", "{junk}:fit", "-"), "--set": SETS},
             **{"--preset": ("", "smok", "DEFAULT", "1"), "--expert": EXPERTS, "--track": ("", "wandb")},
             **{"--seed": ("1",), "--list": ("x",), "--resume": ("yes",)},
-        },
-    ),
-    "cost": (
-        ("--task", "bandit", "--out", "{new}"),
-        {
-            "--task": TASKS[:6],
-            "--seeds": COUNTS,
-            "--device": DEVICES[:3],
-            "--out": FOLDERS,
-            "--methods": ("expert", "all "),
         },
     ),
     "paper": (
@@ -143,12 +133,10 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
     "report": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
     "publish": ((), {"run": ()}),
     "pages": ((), {"more": ("x",)}),
-    "seeds": (
-        (),
-        {"--task": TASKS[:6], "--preset": ("", "smok"), "--device": DEVICES, "--seeds": (*COUNTS, "1000000000")},
+    "performance": (
+        ("--tasks", CONTROL, "--out", "{new}"),
+        {"parts": ("", "sped", "-1"), "--tasks": (*TASKS[:6], "bandit"), "--device": DEVICES, "--out": FOLDERS},
     ),
-    "speed": (("--out", "{new}"), {"--task": (*TASKS[:6], "bandit"), "--n": COUNTS, "--out": FOLDERS}),
-    "growth": (("--out", "{new}"), {"--task": TASKS[:6], "--out": FOLDERS}),
 }
 
 
