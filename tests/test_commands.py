@@ -26,7 +26,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
-from deconfounded.benchmarks.studies import publish, site
+from deconfounded.benchmarks.studies import publish, results, site
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.files import check_file, read_sealed, save_figure, write_json, write_sealed
@@ -496,8 +496,8 @@ def test_records_are_few_and_small() -> None:
 
 def test_pages_are_up_to_date() -> None:
     """What site.py writes of tasks, certificates and results; README has a row for each of the latter two."""
-    for file, text in site.texts(site.published()).items():
-        assert file.read_text() == text, f"{file}: run `deconf pages`"
+    for file, text in site.texts(results.published()).items():
+        assert file.read_text() == text, f"{file}: run `deconf publish`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)
     tasks = {file.stem for file in (docs / "records").glob("*.jsonl")}

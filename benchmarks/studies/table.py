@@ -60,7 +60,7 @@ def main() -> None:
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.output import records
-    from deconfounded.benchmarks.studies.site import DOCS
+    from deconfounded.benchmarks.studies.cards import DOCS
 
     folder = args.out or Path("results") / "table"
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"

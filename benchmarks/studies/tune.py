@@ -22,12 +22,12 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.studies import runs
+from deconfounded.benchmarks.studies.cards import DOCS
 from deconfounded.envs.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
 Change = dict[str, float | str]
 """Amounts by name, each times so much, or what is put in its place."""

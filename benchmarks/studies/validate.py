@@ -24,6 +24,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.studies import noise, runs, unconfounded, validation
+from deconfounded.benchmarks.studies.cards import DOCS
 from deconfounded.benchmarks.studies.spectrum import variants
 from deconfounded.envs.files import write_json
 from deconfounded.envs.task import ASSETS
@@ -31,7 +32,6 @@ from deconfounded.envs.task import ASSETS
 if TYPE_CHECKING:
     from deconfounded.deconf.diagnosis.diagnose import Diagnosis
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 CASES: dict[str, str | None] = {
     **dict.fromkeys(envs.SUITE),
     **unconfounded.EXPERTS,

@@ -40,7 +40,7 @@ REACHED = (  # where a command's work begins
     *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
     *("benchmarks.studies.stepping.seconds", "benchmarks.studies.performance.update_seconds"),
     *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
-    *("benchmarks.output.report.write", "benchmarks.studies.site.write", "benchmarks.studies.publish.keep"),
+    *("benchmarks.output.report.write", "benchmarks.studies.site.write"),
     *("benchmarks.check.check_task",),
 )
 MOST = 4 << 30  # bytes of memory, so that what asks for more is seen here
@@ -131,8 +131,7 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
     ),
     "verify": ((), {"record": ("", "nowhere.json", "{folder}", "{file}", "{junk}", "/proc/none")}),
     "report": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
-    "publish": ((), {"run": ()}),
-    "pages": ((), {"more": ("x",)}),
+    "publish": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
     "performance": (
         ("--tasks", CONTROL, "--out", "{new}"),
         {"parts": ("", "sped", "-1"), "--tasks": (*TASKS[:6], "bandit"), "--device": DEVICES, "--out": FOLDERS},
