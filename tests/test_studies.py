@@ -10,7 +10,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import presets, scheduler
-from deconfounded.benchmarks.studies import performance, runs, stepping
+from deconfounded.benchmarks.studies import performance, runs, stepping, tune
 from tests.tools import tiny_preset
 
 
@@ -70,3 +70,24 @@ def test_runs_are_those_asked_for(tmp_path: Path) -> None:
     again = runs.run(task, settings, ["random"], [1], tmp_path)
     assert [(one["method"], one["seed"]) for one in again] == [("random", 1)]
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "jobs").glob("*.npz")} == before
+
+
+def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each setting its own numbers, and references that are made once; what is kept is not tried again."""
+    (tmp_path / "docs").mkdir()
+    for name, value in (("DOCS", tmp_path / "docs"), ("TASKS", ("bandit",)), ("BEFORE", {}), ("SEEDS", (100,))):
+        monkeypatch.setattr(tune, name, value)
+    monkeypatch.setattr(tune, "TRIED", {"naive_rnn": ({"width": 2},)})
+    monkeypatch.setattr(presets, "preset", lambda *_: tiny_preset())
+    monkeypatch.setattr("sys.argv", ["tune", "--out", str(tmp_path / "out")])
+    tune.main()
+    jobs, kept = tmp_path / "out" / "bandit" / "jobs", (tmp_path / "docs" / "tuning.json").read_text()
+    made = {file.stem: file.stat().st_mtime_ns for file in jobs.glob("*.npz")}
+    assert sorted(made) == ["demonstrations-100", "expert-100", "naive_rnn-100", "random-100"]
+    assert made["naive_rnn-100"] > max(made[name] for name in made if name != "naive_rnn-100")
+    usual, wide = json.loads(kept)["rows"]
+    assert (usual["setting"], wide["setting"]) == ("the preset", "width x 2")
+    assert 2 * usual["amounts"]["bandit"]["width"] == wide["amounts"]["bandit"]["width"]
+    assert usual["loss"] != wide["loss"]
+    tune.main()
+    assert (tmp_path / "docs" / "tuning.json").read_text() == kept

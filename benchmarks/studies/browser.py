@@ -23,8 +23,8 @@ def program() -> str | None:
 @contextmanager
 def page(width: int, height: int, dark: bool = False) -> Iterator[Page]:
     """An empty page of that size, px. Raises InputError without a browser, without Playwright, or for what it says."""
-    found = program()
-    if found is None:
+    path = program()
+    if path is None:
         raise InputError(f"no browser was found; install one of {', '.join(NAMES)}")
     try:
         from playwright.sync_api import Error, sync_playwright
@@ -32,7 +32,7 @@ def page(width: int, height: int, dark: bool = False) -> Iterator[Page]:
         raise InputError("playwright is not installed; `pip install -e .[dev]` brings it") from None
     look = {"viewport": {"width": width, "height": height}, "color_scheme": "dark" if dark else "light"}
     try:
-        with sync_playwright() as playwright, playwright.chromium.launch(executable_path=found) as browser:
+        with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path) as browser:
             yield browser.new_page(**look, is_mobile=width < 600)
     except Error as error:
         raise InputError(f"the browser says: {error.message.splitlines()[0]}") from None

@@ -94,20 +94,6 @@ def keep(row: dict[str, Any], file: Path) -> None:
     write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
 
 
-def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
-    """Of a method's setting: what each task's run has of everything, and what its row is known by."""
-    from deconfounded.benchmarks.engine.presets import preset
-
-    settings, versions = {}, {}
-    for task in map(envs.get, TASKS):
-        start = began(preset("default", task, "cpu"))
-        settings[task.name] = other(start, name, change)
-        versions[task.name] = task.version
-    amounts = {task: one.configs[name] for task, one in settings.items()}
-    of = {"method_version": METHODS[name].version, "task_versions": versions}
-    return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
-
-
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -119,26 +105,30 @@ def main() -> None:
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    file = DOCS / "tuning.json"
-    for name, change in [(method, one) for method in args.methods or TRIED for one in ({}, *TRIED[method])]:
-        settings, row = plan(name, change)
-        if any(all(one.get(key) == value for key, value in row.items()) for one in kept(file)):
+    file, tasks = DOCS / "tuning.json", [envs.get(name) for name in TASKS]
+    base = {task.name: began(preset("default", task, "cpu")) for task in tasks}
+    versions = {task.name: task.version for task in tasks}
+    for name, change in [(method, change) for method in args.methods or TRIED for change in ({}, *TRIED[method])]:
+        settings = {task: other(before, name, change) for task, before in base.items()}
+        amounts = {task: each.configs[name] for task, each in settings.items()}
+        row: dict[str, Any] = {"method": name, "setting": title(change), "amounts": amounts}
+        row |= {"method_version": METHODS[name].version, "task_versions": versions}
+        if any(all(held.get(key) == value for key, value in row.items()) for held in kept(file)):
             print(f"{name}, {row['setting']}: it is in {file.name}")
             continue
         row |= {"scores": {}, "loss": {}, "cpu_s": {}}
-        for task in map(envs.get, TASKS):
+        for task in tasks:
             # A folder a task: what does not depend on the setting, demonstrations and references, is made once.
-            base = began(preset("default", task, "cpu"))
-            made = runs.run(task, settings[task.name], (*REFERENCES, name), SEEDS, args.out / task.name, base=base)
-            results = records.gather(made)
+            own, asked = args.out / task.name, (*REFERENCES, name)
+            results = records.gather(runs.run(task, settings[task.name], asked, SEEDS, own, base=base[task.name]))
             row |= {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
             entry = results["methods"][name]
             row["scores"][task.name] = [round(score, 4) for score in last_scores(results["methods"])[name].values()]
             row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
             row["cpu_s"][task.name] = entry["cpu_s"]
         keep(row, file)
-        told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
-        print(f"{name}, {row['setting']}: {told}")
+        means = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
+        print(f"{name}, {row['setting']}: {means}")
     print(f"-> {file}")
 
 
