@@ -87,13 +87,15 @@ def main() -> None:
     parser.add_argument("task", help="its name, or path/file.py:Class")
     parser.add_argument("method", help="its name, or path/file.py:fit")
     parser.add_argument("seed", type=int)
-    parser.add_argument("--records", type=Path, help="folder or file of records; default: docs/records")
+    parser.add_argument("--records", type=Path, help="folder or file of records; default: docs/records of the checkout")
     parser.add_argument("--expert", help="the expert, if it is not the task's own")
     parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     args = parser.parse_args()
     task = envs.get(args.task)
     method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
     file = args.records or ROOT / "docs" / "records"
+    if not args.records and not file.is_dir():
+        raise envs.InputError("--records is missing; outside of a checkout give a run's, results/<run>/records")
     file = file / records.place(task.name) if file.is_dir() else file
     record = pick(file, method, args.seed)
     if record["method"] not in METHODS:

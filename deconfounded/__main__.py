@@ -24,13 +24,9 @@ COMMANDS = {
     "report": ("benchmarks.report", "make a run's report again, without training"),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
     "table": ("benchmarks.studies.table", "make the records that are missing"),
-    "publish": ("benchmarks.studies.publish", "keep a finished run in docs/"),
-    "pages": ("benchmarks.studies.pages", "write the pages of docs/ anew"),
+    "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too"),
     "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper"),
-    "speed": ("benchmarks.studies.speed", "how fast environments step"),
-    "growth": ("benchmarks.studies.growth", "how cost grows"),
-    "seeds": ("benchmarks.studies.seeds", "what seeds cost side by side"),
-    "cost": ("benchmarks.studies.cost", "score against CPU seconds"),
+    "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds"),
     "tune": ("benchmarks.studies.tune", "the opponents' tuning"),
     "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise"),
 }
@@ -43,7 +39,7 @@ def main() -> None:
         with quiet_pipe():
             print("usage: deconf COMMAND ...\n")
             for command, (module, text) in COMMANDS.items():
-                print(f"  {command:10} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
+                print(f"  {command:11} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
         return
     if name not in COMMANDS:
         print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)

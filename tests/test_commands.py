@@ -21,17 +21,17 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
-from deconfounded.benchmarks import certify, commands, data
+from deconfounded.benchmarks import certify, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
 from deconfounded.benchmarks.output.pictures import save_figure
-from deconfounded.benchmarks.studies import cost, publish, site
+from deconfounded.benchmarks.studies import publish, results, site
+from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
 from deconfounded.experts.policy import CallableExpert
-from tests.fixtures import NoStakes, feedback
 from tests.tools import tiny_preset
 
 ROOT = Path(__file__).parents[1]
@@ -69,7 +69,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
         (("benchmarks/run.py", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
         (("benchmarks/certify.py", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
-        (("benchmarks/studies/speed.py", "--n", "100000000000000000000"), "it must be from 1 to 1,000,000"),
+        (("benchmarks/studies/performance.py", "sped"), "did you mean 'speed'?"),
         (
             ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
             "output folder /proc/none cannot be written",
@@ -94,11 +94,10 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
         (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
         (("benchmarks/studies/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
-        (("benchmarks/studies/seeds.py", "--seeds", "0"), "must be at least 1"),
         (("benchmarks/studies/publish.py", "nowhere"), "holds no records and adaptation.png"),
         (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
-        (("benchmarks/studies/speed.py", "--task", "bandit"), "no physics to time"),
+        (("benchmarks/studies/performance.py", "--tasks", "bandit"), "no physics to time"),
     ],
 )
 def test_bad_input_is_one_line(
@@ -366,13 +365,6 @@ class TestFiles:
             read_sealed(tmp_path / "x.json")
 
 
-def test_cost_locks_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.argv", ["cost", "--task", "bandit", "--out", str(tmp_path)])
-    monkeypatch.setattr(scheduler, "run_all", None)
-    with commands.locked(tmp_path / "0.25"), pytest.raises(envs.InputError, match="another command is at work"):
-        cost.main()
-
-
 def test_time_worked_counts_overlaps_once() -> None:
     assert records.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
@@ -505,8 +497,8 @@ def test_records_are_few_and_small() -> None:
 
 def test_pages_are_up_to_date() -> None:
     """What site.py writes of tasks, certificates and results; README has a row for each of the latter two."""
-    for file, text in site.texts(site.published()).items():
-        assert file.read_text() == text, f"{file}: run `deconf pages`"
+    for file, text in site.texts(results.published()).items():
+        assert file.read_text() == text, f"{file}: run `deconf publish`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)
     tasks = {file.stem for file in (docs / "records").glob("*.jsonl")}

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as imageio
 import matplotlib.pyplot as plt
@@ -19,23 +19,12 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, report, score, statistics
 from deconfounded.benchmarks.output.answers import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
-from deconfounded.benchmarks.studies import browser, gap, publish, site, tune
+from deconfounded.benchmarks.studies import browser, findings, gap, publish, results, site, tune
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-
-
-def test_settings_share_what_is_the_same(tmp_path: Path) -> None:
-    one, other = tmp_path / "one", tmp_path / "other"
-    other.mkdir()
-    tune.share(tmp_path / "nowhere", one)
-    for name in ("gail-100", "expert-100", "demonstrations-100"):
-        (one / f"{name}.npz").write_text("one")
-    (other / "expert-100.npz").write_text("its own")
-    tune.share(one, other, but="gail")
-    assert {file.stem: file.read_text() for file in other.iterdir()} == {
-        "expert-100": "its own",
-        "demonstrations-100": "one",
-    }
 
 
 def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -61,8 +50,8 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
-    monkeypatch.setattr(site, "DOCS", tmp_path)
-    lines = site.tuning().splitlines()
+    monkeypatch.setattr(findings, "DOCS", tmp_path)
+    lines = findings.tuning().splitlines()
     words = [line.split(" | ")[-1].strip(" |") for line in lines[2:11]]
     assert words == ["kept", "", "", "", "", "", "", "chosen", ""], "palr is not through"
     assert lines[6:8] == ["| palr | a | 0.20 | 5 |  |", "| gail | a | 0.20 | 5 |  |"]
@@ -70,16 +59,16 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_presets_are_what_tuning_chose() -> None:
     """Today's preset is the setting that docs/tuning.json says, which can be tried again."""
-    rows = json.loads((site.DOCS / "tuning.json").read_text())["rows"]
+    rows = json.loads((DOCS / "tuning.json").read_text())["rows"]
     for method in dict.fromkeys(row["method"] for row in rows):
         tried, of = ({}, *tune.TRIED[method]), [row for row in rows if row["method"] == method]
-        assert len(tried) == site.BUDGET
+        assert len(tried) == findings.BUDGET
         if len(of) < len(tried):  # tuning has begun
             continue
         assert [row["setting"] for row in of] == [tune.title(change) for change in tried]
         for task in map(envs.get, tune.TASKS):
             today = preset("default", task, "cpu", [method])
-            assert today.configs[method] == site.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
+            assert today.configs[method] == findings.chosen(of)["amounts"][task.name], f"{method} on {task.name}"
             began = tune.other(today, method, tune.BEFORE.get(method, {}))
             for row, change in zip(of, tried, strict=True):
                 changed = tune.other(began, method, change).configs[method]
@@ -294,124 +283,136 @@ class TestIndex:
 
 
 @pytest.fixture(scope="module", params=[(1280, False), (400, True)], ids=["desk", "phone, dark"])
-def seen(request: pytest.FixtureRequest) -> Iterator[browser.Browser]:
-    """A browser of two sizes."""
+def seen(request: pytest.FixtureRequest) -> Iterator[Page]:
+    """A page of two sizes."""
     if browser.program() is None:
         pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    pytest.importorskip("playwright", reason="playwright is not installed")
     width, dark = request.param
-    with browser.Browser(width, 850, dark) as found:
-        yield found
+    with browser.page(width, 850, dark) as page:
+        yield page
+
+
+@pytest.fixture
+def errors(seen: Page) -> list[str]:
+    """What the page complains of from now on."""
+    heard = list[str]()
+    seen.on("pageerror", lambda error: heard.append(str(error)))
+    seen.on("console", lambda message: message.type in ("error", "assert") and heard.append(message.text))
+    return heard
 
 
 CELLS = "[...document.querySelectorAll('#matrix td[data-task={}]')].map(c => c.dataset.method)"
 
 
-def choose(seen: browser.Browser, **what: str) -> None:
+def choose(seen: Page, **what: str) -> None:
     """Use the page's filter."""
     for name, value in what.items():
-        seen.run(f"(form => {{ form.{name}.value = {json.dumps(value)}; form.dispatchEvent(new Event('change')) }})"
-                 "(document.getElementById('filter'))")  # fmt: skip
+        change = f"form.{name}.value = {json.dumps(value)}; form.dispatchEvent(new Event('change'))"
+        seen.evaluate(f"(form => {{ {change} }})(document.getElementById('filter'))")
 
 
 class TestInABrowser:
     @pytest.fixture(autouse=True)
-    def fresh(self, seen: browser.Browser) -> None:
-        seen.open(DOCS / "index.html")
+    def fresh(self, seen: Page, errors: list[str]) -> None:
+        seen.goto((DOCS / "index.html").as_uri())
 
-    def test_it_fits_and_does_not_complain(self, seen: browser.Browser) -> None:
+    def test_it_fits_and_does_not_complain(self, seen: Page, errors: list[str]) -> None:
         """No error, no request that leaves the disk, nothing wider than the screen, with all tasks open."""
-        seen.run("document.querySelectorAll('details').forEach(one => { one.open = true })")
-        seen.run("new Promise(done => setTimeout(done, 100))")
-        assert seen.errors == []
-        assert seen.run("document.documentElement.scrollWidth") <= seen.size[0]
-        loaded = seen.run("performance.getEntriesByType('resource').map(one => one.name)")
+        seen.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true })")
+        seen.evaluate("new Promise(done => setTimeout(done, 100))")
+        assert errors == []
+        assert seen.evaluate("document.documentElement.scrollWidth") <= seen.evaluate("innerWidth")
+        loaded = seen.evaluate("performance.getEntriesByType('resource').map(one => one.name)")
         assert [name for name in loaded if not name.startswith(("file:", "data:"))] == []
-        pale = seen.run("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
-        assert max(pale) < 60 if seen.dark else min(pale) > 200
-        assert seen.run(
+        pale = seen.evaluate("getComputedStyle(document.body).backgroundColor.match(/[0-9]+/g).map(Number)")
+        dark = seen.evaluate("matchMedia('(prefers-color-scheme: dark)').matches")
+        assert max(pale) < 60 if dark else min(pale) > 200
+        assert seen.evaluate(
             "[...document.querySelectorAll('.adaptation, .learning > figure')].every(one => one.querySelector('svg'))"
         )
 
-    def test_sorting(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+    def test_sorting(self, seen: Page, made: dict[str, Any]) -> None:
         task = made["tasks"][0]["name"]
         of_task = [row for row in made["rows"] if row["task"] == task]
         expected = [row["method"] for row in sorted(of_task, key=lambda row: -row["value"])]
         click = f"document.querySelector('#matrix button[data-key={task}]').click()"
-        seen.run(click)
+        seen.evaluate(click)
         values = {row["method"]: row["value"] for row in of_task}
-        shown = seen.run(CELLS.format(task))
+        shown = seen.evaluate(CELLS.format(task))
         assert [values[name] for name in shown] == [values[name] for name in expected]
-        seen.run(click)
-        assert [values[name] for name in seen.run(CELLS.format(task))] == [values[name] for name in expected[::-1]]
-        seen.run("document.querySelector('#all button[data-key=cpu]').click()")
-        cpu = seen.run("[...document.querySelectorAll('#all tbody tr')].map(row => Number(row.cells[13].textContent))")
+        seen.evaluate(click)
+        assert [values[name] for name in seen.evaluate(CELLS.format(task))] == [values[name] for name in expected[::-1]]
+        seen.evaluate("document.querySelector('#all button[data-key=cpu]').click()")
+        cells = "[...document.querySelectorAll('#all tbody tr')].map(row => row.cells[13].textContent)"
+        cpu = [float(text) for text in seen.evaluate(cells)]
         assert cpu == sorted(cpu, reverse=True)
         assert len(cpu) == len(made["rows"])
 
-    def test_filters(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+    def test_filters(self, seen: Page, made: dict[str, Any], errors: list[str]) -> None:
         tiers = {task["name"]: task["tier"] for task in made["tasks"]}
         counted = "document.getElementById('count').textContent"
         total = len(made["rows"])
         for tier in set(tiers.values()):
             choose(seen, tier=tier)
             kept = [row for row in made["rows"] if tiers[row["task"]] == tier]
-            assert seen.run(counted) == f"{len(kept)} of {total} results"
-            assert set(seen.run("[...document.querySelectorAll('#matrix td.open')].map(c => c.dataset.task)")) == {
+            assert seen.evaluate(counted) == f"{len(kept)} of {total} results"
+            assert set(seen.evaluate("[...document.querySelectorAll('#matrix td.open')].map(c => c.dataset.task)")) == {
                 row["task"] for row in kept
             }
         choose(seen, tier="", method="naive_rnn", task="hidden_goal")
-        assert seen.run(counted) == f"1 of {total} results"
-        assert seen.run(
+        assert seen.evaluate(counted) == f"1 of {total} results"
+        assert seen.evaluate(
             "[...document.querySelectorAll('details:not([hidden])')].map(d => d.dataset.task + d.open)"
         ) == ["hidden_goaltrue"]
         choose(seen, kind="3")  # naive_rnn is of another: nothing is left, and nothing breaks
-        assert seen.run(counted) == f"0 of {total} results"
-        assert seen.errors == []
+        assert seen.evaluate(counted) == f"0 of {total} results"
+        assert errors == []
 
-    def test_the_card_of_a_number(self, seen: browser.Browser, made: dict[str, Any]) -> None:
+    def test_the_card_of_a_number(self, seen: Page, made: dict[str, Any]) -> None:
         """On hover, or on a tap: seeds, interval, curves and the command; it lies on the screen."""
         row = next(row for row in made["rows"] if row["method"] == "naive_rnn" and row["trained"] > 1)
         cell = f"#matrix td[data-task={row['task']}][data-method=naive_rnn]"
-        if seen.size[0] > 600:
-            seen.point(cell)
+        if seen.evaluate("innerWidth") > 600:
+            seen.hover(cell)
         else:
-            seen.run(f"document.querySelector({json.dumps(cell)}).click()")
-        assert seen.run("document.querySelectorAll('#card svg').length") == 1 + len(row["curve"])
-        told = seen.run("document.getElementById('card').innerText")
+            seen.evaluate(f"document.querySelector({json.dumps(cell)}).click()")
+        assert seen.evaluate("document.querySelectorAll('#card svg').length") == 1 + len(row["curve"])
+        told = seen.evaluate("document.getElementById('card').innerText")
         assert row["command"] in told
         assert f"{row['n']} seeds" in told
-        box = seen.run(
+        box = seen.evaluate(
             "(b => [b.left, b.top, b.right, b.bottom])(document.getElementById('card').getBoundingClientRect())"
         )
         assert min(box) >= 0
-        assert box[2] <= seen.size[0]
-        assert box[3] <= seen.size[1]
-        seen.run("document.body.click()")
-        seen.run("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
-        assert seen.run("document.getElementById('card').hidden")
+        assert box[2] <= seen.evaluate("innerWidth")
+        assert box[3] <= seen.evaluate("innerHeight")
+        seen.evaluate("document.body.click()")
+        seen.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
+        assert seen.evaluate("document.getElementById('card').hidden")
 
-    def test_curves_tell_on_hover(self, seen: browser.Browser) -> None:
+    def test_curves_tell_on_hover(self, seen: Page) -> None:
         chart = "details[open] .adaptation"
-        seen.point(f"{chart} svg")
-        told = seen.run(f"document.querySelector('{chart} .readout').textContent")
+        seen.hover(f"{chart} svg")
+        told = seen.evaluate(f"document.querySelector('{chart} .readout').textContent")
         assert re.fullmatch(r"\w+, episode \d+: \S+, \S+ to \S+, \d+ seeds", told)
-        assert seen.run(f"document.querySelectorAll('{chart} .mark.on').length") == 1
+        assert seen.evaluate(f"document.querySelectorAll('{chart} .mark.on').length") == 1
 
 
-def test_report_in_a_browser(seen: browser.Browser, tmp_path: Path) -> None:
+def test_report_in_a_browser(seen: Page, errors: list[str], tmp_path: Path) -> None:
     """A run's report fits as well; its table scrolls, and each method has its curves."""
     results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
     report.adaptation(results, tmp_path / "adaptation.png")
     report.learning(results, tmp_path / "learning.png")
     (tmp_path / "report.html").write_text(report.page(results, tmp_path))
-    seen.open(tmp_path / "report.html")
-    assert seen.errors == []
-    assert seen.run("document.documentElement.scrollWidth") <= seen.size[0]
-    assert seen.run("document.querySelectorAll('td svg').length") >= len(results["methods"])
-    assert seen.run("document.querySelector('.outcome').textContent") == score.outcome(results["methods"])
+    seen.goto((tmp_path / "report.html").as_uri())
+    assert errors == []
+    assert seen.evaluate("document.documentElement.scrollWidth") <= seen.evaluate("innerWidth")
+    assert seen.evaluate("document.querySelectorAll('td svg').length") >= len(results["methods"])
+    assert seen.evaluate("document.querySelector('.outcome').textContent") == score.outcome(results["methods"])
     wide = "box.scrollWidth > box.clientWidth && getComputedStyle(box).overflowX"
-    assert seen.run(f"(box => {wide})(document.querySelector('.scroll'))") == "auto"
-    assert seen.run("document.images.length") == 3  # adaptation, learning, certificate
+    assert seen.evaluate(f"(box => {wide})(document.querySelector('.scroll'))") == "auto"
+    assert seen.evaluate("document.images.length") == 3  # adaptation, learning, certificate
 
 
 def test_certificate_of_a_report(tmp_path: Path) -> None:
@@ -439,8 +440,9 @@ def test_beliefs_are_drawn(tmp_path: Path) -> None:
 
 def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(browser, "NAMES", ("no-such-browser",))
-    with pytest.raises(envs.InputError, match=r"^no browser was found; install one of no-such-browser$"):
-        browser.Browser(400, 400)
+    says = r"^no browser was found; install one of no-such-browser$"
+    with pytest.raises(envs.InputError, match=says), browser.page(400, 400):
+        pass
 
 
 def test_commands_of_numbers() -> None:
@@ -448,11 +450,12 @@ def test_commands_of_numbers() -> None:
     task = envs.get("bandit")
     found = records.of_task(DOCS / "records", "bandit")
     outside = [{**one, "method": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
-    results = records.gather([*found, *outside], list(METHODS))
+    gathered = records.gather([*found, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"
-    assert site.command(task, results, "deconfounded_discrete_episode") == f"{start} --methods deconfounded_discrete"
-    assert site.command(task, results, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
-    assert site.command(task, results, "expert") == site.command(task, results)
+    episode = "deconfounded_discrete_episode"
+    assert results.command(task, gathered, episode) == f"{start} --methods deconfounded_discrete"
+    assert results.command(task, gathered, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
+    assert results.command(task, gathered, "expert") == results.command(task, gathered)
 
 
 def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:

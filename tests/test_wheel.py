@@ -57,23 +57,17 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def empty(tmp_path: Path) -> Path:
-    """A folder to work in, and a home beside it."""
-    for name in ("at work", "home"):
+    """A folder to work in; a home and one for temporary files are beside it."""
+    for name in ("at work", "home", "scratch"):
         (tmp_path / name).mkdir()
     return tmp_path / "at work"
 
 
 def run(built: Path, folder: Path, *args: str | Path) -> subprocess.CompletedProcess[str]:
-    environ = {"MUJOCO_GL": "off", "PYTHONPATH": str(built / "site"), "HOME": str(folder.parent / "home")}
+    environ = {"MUJOCO_GL": "off", "PYTHONPATH": str(built / "site")}
+    environ |= {name: str(folder.parent / own) for name, own in (("HOME", "home"), ("TMPDIR", "scratch"))}
     environ = {**os.environ, **environ, "MPLCONFIGDIR": matplotlib.get_cachedir()}  # fonts are looked for once
     return subprocess.run([sys.executable, *args], cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
-
-
-def deconf(built: Path, folder: Path, *args: str) -> str:
-    """What the installed console script says."""
-    done = run(built, folder, built / "site" / "bin" / "deconf", *args)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_they_are_whole(built: Path) -> None:
@@ -112,18 +106,58 @@ def test_what_needs_a_checkout_says_so(built: Path, empty: Path) -> None:
     assert files(built / "site") == before
 
 
+SCRIPT = """
+import sys
+from functools import partial
+from deconfounded import __main__ as entrance
+from deconfounded.deconf.diagnosis import diagnose
+from deconfounded.deconf.diagnosis.measures import Amounts
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
+
+offline = OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4)
+networks = CloningConfig(updates=5), RecurrentConfig(updates=6, batch=4), offline, DeconfoundedConfig()
+diagnose.DiagnoseConfig = partial(diagnose.DiagnoseConfig, refits=1, amounts=Amounts(.25, 2, 4, *networks))
+for line in sys.argv[1].splitlines():
+    sys.argv = ["deconf", *line.split()]
+    try:
+        entrance.main()
+    except SystemExit as ended:
+        assert not ended.code, line
+"""  # in one process: each would import for seconds
+LINES = """
+run --task bandit --preset smoke --methods blind_bc --set eval_trials=4 expert_trials=8 blind_bc.updates=5
+report results/bandit-smoke
+score --agent results/bandit-smoke/agents/blind_bc-0 --task bandit --trials 4 --out scores/bandit.json
+verify bandit blind_bc 0 --records results/bandit-smoke/records
+data --task bandit --trials 24 --out sets
+diagnose --trials sets/deconf/bandit/expert24s0-v0
+check --task bandit
+certify --task bandit
+train --task slippery_cartpole --steps 64
+play --agent results/bandit-smoke/agents/blind_bc-0 --task bandit
+"""
+
+
 def test_commands_work_as_installed(built: Path, empty: Path) -> None:
-    """They read and write nothing but the folder they are in; data there and in a checkout are known to be the same."""
+    """They write under --out or where their --help says, and not in the package, at home or in /tmp.
+
+    Data there and in a checkout are known to be the same.
+    """
+    installed = {name for name, (module, _) in COMMANDS.items() if not module.startswith(STUDIES)}
+    assert {line.split()[0] for line in LINES.split("\n") if line} == installed
     before = files(built / "site")
-    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "blind_bc.updates=5")
-    deconf(built, empty, "run", "--task", "bandit", "--methods", "blind_bc", *small)
-    agent = ("--agent", "results/bandit-smoke/agents/blind_bc-0", "--task", "bandit")
-    assert "returns" in deconf(built, empty, "play", *agent)
-    deconf(built, empty, "data", "--task", "bandit", "--trials", "2", "--out", "data sets")
+    done = run(built, empty, "-c", SCRIPT, LINES.strip())
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "returns" in done.stdout.splitlines()[-1]
     code = "from deconfounded import envs; from deconfounded.benchmarks.engine import identity, sources;"
     code += "print(identity.demonstrations(envs.get('icy_road'), None, 8, 0), sources.package())"
     expected = f"{identity.demonstrations(envs.get('icy_road'), None, 8, 0)} {sources.package()}\n"
     assert run(built, empty, "-c", code).stdout == expected
     assert {name.partition("/")[0] for name in files(empty.parent)} == {"at work"}
-    assert {name.partition("/")[0] for name in files(empty)} == {"results", "data sets"}
+    weights = {"slippery_cartpole.safetensors", "slippery_cartpole.json"}
+    assert {name.partition("/")[0] for name in files(empty)} == {"results", "scores", "sets", *weights}
+    assert {file.name for file in (empty / "results").iterdir()} == {"bandit-smoke", "certificates", "diagnosis"}
     assert files(built / "site") == before

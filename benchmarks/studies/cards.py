@@ -37,6 +37,21 @@ def nats(certificate: dict[str, Any]) -> list[str]:
     return [f"{value:,.2f}" if value < 10 else f"{value:,.0f}" for value in told]
 
 
+def certified() -> dict[str, dict[str, Any]]:
+    """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
+    return {name: found for name in envs.SUITE if (found := kept(DOCS / "certificates", name))}
+
+
+def certificates(held: dict[str, Any]) -> str:
+    """README's table of certificates."""
+    rows, asked = [], list[str]()
+    for name, found in held.items():
+        measured = (f"{check['measured']:.2f}" for check in found["checks"].values())
+        rows.append((name, *measured, *nats(found), found["verdict"]))
+        asked = [f"{name} ({check['required']})" for name, check in found["checks"].items()]
+    return markdown_table(("task", *asked, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)
+
+
 def _certificate(task: envs.Task) -> str:
     found = kept(DOCS / "certificates", task.name)
     if found is None:
@@ -118,6 +133,6 @@ def tasks_page() -> str:
     """docs/tasks.md: all cards."""
     head = """# Tasks
 
-Made by `deconf pages` from the tasks' own classes and docs/certificates. Ideas that failed their
+Made by `deconf publish` from the tasks' own classes and docs/certificates. Ideas that failed their
 certificate are in [tried.md](tried.md)."""
     return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"

@@ -26,8 +26,8 @@ from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.benchmarks.engine.store import Finished, by_method
 from deconfounded.benchmarks.output import score
-from deconfounded.benchmarks.output.figures import figure_2, figure_3
 from deconfounded.benchmarks.output.records import covered
+from deconfounded.benchmarks.studies.figures import figure_2, figure_3
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent

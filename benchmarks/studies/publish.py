@@ -1,8 +1,9 @@
-"""Keep a finished run in docs/: `deconf publish results/slippery_cartpole-default`
+"""Keep a finished run in docs/, and write the pages anew: `deconf publish results/slippery_cartpole-default`
 
 Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
-certificate; makes a small animated picture of the video; and brings the pages up to date that show them (`site.py`).
-All of it is looked at before anything is changed.
+certificate; makes a small animated picture of the video; and brings the pages up to date (`site.py`). All of it is
+looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
+README's picture of docs/index.html, which takes Chromium.
 """
 
 from __future__ import annotations
@@ -13,12 +14,14 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 import hashlib
+import json
 import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import imageio.v3 as imageio
+import numpy as np
 from PIL import Image
 
 from deconfounded import envs
@@ -26,8 +29,9 @@ from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.output.pictures import mark, mark_of
-from deconfounded.benchmarks.studies import site
-from deconfounded.benchmarks.studies.site import DOCS
+from deconfounded.benchmarks.studies import browser, site
+from deconfounded.benchmarks.studies.cards import DOCS
+from deconfounded.envs.support.files import write_atomically
 
 LOOK: dict[str, Any] = {"duration": 150, "loop": 0, "quality": 30, "method": 4}  # of clips
 
@@ -42,6 +46,19 @@ def copy(source: Path, file: Path) -> None:
     """Copy a picture, unless the one that is there was made of the same."""
     if not mark_of(source) or mark_of(source) != mark_of(file):
         shutil.copy(source, file)
+
+
+def check_certificate(file: Path, task: envs.Task) -> None:
+    """Raises InputError for a file that is no certificate of the task, as pages show it."""
+    try:
+        found = json.loads(file.read_bytes())
+        numbers = [check["measured"] for check in found["checks"].values()] + found["conditional"]["score"]
+        numbers += [found["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
+        whole = np.isfinite(np.array(numbers, float)).all() and found["verdict"] in ("passed", "failed")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        whole = False
+    if not whole or (found["task"], found["task_version"]) != (task.name, task.version):
+        raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
 
 
 def keep(run: Path) -> None:
@@ -65,7 +82,7 @@ def keep(run: Path) -> None:
     certificates = [file for file in (run.parent / "certificates").glob(f"{task.name}.*") if not file.is_symlink()]
     for file in certificates:
         if file.suffix == ".json":
-            site.check_certificate(file, task)
+            check_certificate(file, task)
     with tempfile.TemporaryDirectory() as scratch:
         small = Path(scratch) / "clip.webp"
         if (run / "video.mp4").exists():
@@ -88,9 +105,16 @@ def keep(run: Path) -> None:
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
-    parser.add_argument("run", type=Path, help="output folder of a finished run")
-    keep(parser.parse_args().run)
+    parser.add_argument("run", type=Path, nargs="?", help="output folder of a finished run")
+    parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")
+    args = parser.parse_args()
+    if args.run is not None:
+        keep(args.run)
     print(site.write())
+    if args.still:
+        with browser.page(1280, 960) as page:
+            page.goto((DOCS / "index.html").as_uri())
+            write_atomically(DOCS / "index.png", page.screenshot())
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from itertools import chain
 from pathlib import Path
 
@@ -21,12 +20,11 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
-from deconfounded.benchmarks.studies import noise
+from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES, check_names
+from deconfounded.benchmarks.studies import noise, runs
 from deconfounded.benchmarks.studies.spectra import KINDS, LEARNED, Point, picture
 from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
-from deconfounded.experts import policy
 
 
 def variants(base: str) -> list[tuple[str, str, float, str]]:
@@ -42,34 +40,25 @@ def main() -> None:
     args = parser.parse_args()
     methods = commands.check(args, LEARNED, LEARNED)
     check_names("task", args.tasks, list(noise.BASES))
-    from deconfounded.benchmarks.certify import certify
-    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
-    from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
     folder, points = args.out or Path("results") / "spectrum", list[Point]()
+    options = {"preset": args.preset, "changes": args.set, "device": args.device, "cluster": args.cluster}
     for base, kind, factor, name in chain(*map(variants, args.tasks)):
         task, weights = envs.get(name), str(ASSETS / "experts" / f"{base}.safetensors")
         settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
-        wanted = [*REFERENCES, *EXACT, *(name for name in METHODS if name in methods)]
-        seeds = tuple(range(args.seeds))
-        jobs = [BenchmarkJob(task.reference, settings, one, seeds, own / "jobs", expert=weights) for one in wanted]
-        with commands.locked(own), commands.engine(args.cluster) as engine:
-            prepare(own, commands.about(BenchmarkJob, task, args.preset, settings, args.set), resume=True)
-            if not (kept := own / "certificate.json").is_file():
-                write_json(kept, certify(task, policy.load(task, weights)))
-            finished, _ = run_all(jobs, args.device, task.name, engine)
-        results = records.gather(records.of_run(finished, args.preset, args.set, task.episodes))
-        last = {one: [*of.values()] for one, of in last_scores(results["methods"]).items() if one in wanted}
-        certificate = json.loads(kept.read_bytes())
-        made = {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
-        point = {"task": base, "kind": kind, "factor": factor, **made}
+        certificate, wanted = runs.certificate(task, weights, own), (*REFERENCES, *EXACT, *methods)
+        made = runs.run(task, settings, wanted, range(args.seeds), own, expert=weights, **options)
+        results = records.gather(made)
+        scores = last_scores(results["methods"])
+        last = {method: [*scores[method].values()] for method in scores if method in wanted}
+        about = {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
+        point = {"task": base, "kind": kind, "factor": factor, **about}
         points.append({**point, "certificate": certificate, "scores": last})
-        told = ", ".join(f"{one} {np.mean(last[one]):.2f}" for one in (*EXACT, *methods))
-        print(f"{task.name}: certificate {certificate['verdict']}; {told}")
+        means = ", ".join(f"{method} {np.mean(last[method]):.2f}" for method in (*EXACT, *methods))
+        print(f"{task.name}: certificate {certificate['verdict']}; {means}")
     write_json(folder / "spectrum.json", {"seeds": args.seeds, "preset": args.preset, "points": points})
     picture(points, folder / "spectrum.png")
     print(f"-> {folder / 'spectrum.png'}")

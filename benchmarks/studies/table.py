@@ -13,7 +13,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.studies import runs
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.jobs import Job
@@ -59,10 +59,8 @@ def main() -> None:
     methods = [name for name in METHODS if name in asked]
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
-    from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
-    from deconfounded.benchmarks.studies.site import DOCS
+    from deconfounded.benchmarks.studies.cards import DOCS
 
     folder = args.out or Path("results") / "table"
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
@@ -85,15 +83,10 @@ def main() -> None:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
         return
+    options = {"preset": args.preset, "changes": args.set, "device": args.device, "cluster": args.cluster}
     for job, seeds in left.items():
-        task, own = envs.get(job.task), job.folder.parent
-        # Workers of its own: a record tells the code that is there when it is made, and they have imported it.
-        with commands.locked(own), commands.engine(args.cluster) as engine:
-            prepare(own, commands.about(BenchmarkJob, task, args.preset, job.preset, args.set), resume=True)
-            label = f"{task.name}, {job.method}, seeds {seeds[0]} to {seeds[-1]}"
-            finished, _ = run_all([replace(job, seeds=seeds)], args.device, label, engine)
-        new = [one for one in finished if one[0] == job.method and one[1] in seeds]
-        records.write(kept, records.of_run(new, args.preset, args.set, task.episodes))
+        made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
+        records.write(kept, made)
 
 
 if __name__ == "__main__":

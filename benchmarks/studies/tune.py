@@ -19,15 +19,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
-from deconfounded.envs.support.files import write_atomically, write_json
+from deconfounded.benchmarks.studies import runs
+from deconfounded.benchmarks.studies.cards import DOCS
+from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 TASKS, SEEDS = ("tilted_cartpole", "bandit"), (100, 101)
 Change = dict[str, float | str]
 """Amounts by name, each times so much, or what is put in its place."""
@@ -78,14 +78,6 @@ def title(change: Change) -> str:
     return ", ".join(told) or "the preset"
 
 
-def share(source: Path, other: Path, but: str = "") -> None:
-    """Demonstrations and references are the same for all settings: those that another folder lacks are copied there."""
-    other.mkdir(parents=True, exist_ok=True)
-    for file in source.glob("*.npz"):
-        if not (other / file.name).exists() and file.stem.rpartition("-")[0] != but:
-            write_atomically(other / file.name, file.read_bytes())
-
-
 def kept(file: Path) -> list[dict[str, Any]]:
     """The rows of the file, one a setting."""
     return json.loads(file.read_bytes())["rows"] if file.is_file() else []
@@ -102,38 +94,6 @@ def keep(row: dict[str, Any], file: Path) -> None:
     write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
 
 
-def plan(name: str, change: Change) -> tuple[dict[str, Preset], dict[str, Any]]:
-    """Of a method's setting: what each task's run has of everything, and what its row is known by."""
-    from deconfounded.benchmarks.engine.presets import preset
-
-    settings, versions = {}, {}
-    for task in map(envs.get, TASKS):
-        start = began(preset("default", task, "cpu"))
-        settings[task.name] = other(start, name, change)
-        versions[task.name] = task.version
-    amounts = {task: one.configs[name] for task, one in settings.items()}
-    of = {"method_version": METHODS[name].version, "task_versions": versions}
-    return settings, {"method": name, "setting": title(change), "amounts": amounts, **of}
-
-
-def run(name: str, change: Change, settings: Preset, task: envs.Task, out: Path) -> dict[str, Any]:
-    """The results of a setting on a task: those of the method and of the references."""
-    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import prepare
-    from deconfounded.benchmarks.output import records
-
-    own = out / f"{task.name}-{name}-{title(change).replace(' ', '_')}"
-    jobs = [BenchmarkJob(task.reference, settings, one, SEEDS, own / "jobs") for one in (*REFERENCES, name)]
-    with commands.locked(own), Local() as engine:
-        prepare(own, commands.about(BenchmarkJob, task, "default", settings, []), resume=True)
-        share(out / task.name, own / "jobs")
-        finished, _ = run_all(jobs, "cpu", f"{name}, {title(change)}, {task.name}", engine)
-        share(own / "jobs", out / task.name, but=name)
-    return records.gather(records.of_run(finished, "default", [], task.episodes))
-
-
 def main() -> None:
     """The command line."""
     parser = Parser(__doc__)
@@ -141,25 +101,34 @@ def main() -> None:
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")
     args = parser.parse_args()
     check_names("method", args.methods or (), list(TRIED))
+    from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.output.index import last_scores
 
-    file = DOCS / "tuning.json"
-    for name, change in [(method, one) for method in args.methods or TRIED for one in ({}, *TRIED[method])]:
-        settings, row = plan(name, change)
-        if any(all(one.get(key) == value for key, value in row.items()) for one in kept(file)):
+    file, tasks = DOCS / "tuning.json", [envs.get(name) for name in TASKS]
+    base = {task.name: began(preset("default", task, "cpu")) for task in tasks}
+    versions = {task.name: task.version for task in tasks}
+    for name, change in [(method, change) for method in args.methods or TRIED for change in ({}, *TRIED[method])]:
+        settings = {task: other(before, name, change) for task, before in base.items()}
+        amounts = {task: each.configs[name] for task, each in settings.items()}
+        row: dict[str, Any] = {"method": name, "setting": title(change), "amounts": amounts}
+        row |= {"method_version": METHODS[name].version, "task_versions": versions}
+        if any(all(held.get(key) == value for key, value in row.items()) for held in kept(file)):
             print(f"{name}, {row['setting']}: it is in {file.name}")
             continue
         row |= {"scores": {}, "loss": {}, "cpu_s": {}}
-        for task in map(envs.get, TASKS):
-            found = run(name, change, settings[task.name], task, args.out)
-            row |= {"commit": found["commits"][-1], "machine": found["machine"], "versions": found["versions"]}
-            entry = found["methods"][name]
-            row["scores"][task.name] = [round(score, 4) for score in last_scores(found["methods"])[name].values()]
+        for task in tasks:
+            # A folder a task: what does not depend on the setting, demonstrations and references, is made once.
+            own, asked = args.out / task.name, (*REFERENCES, name)
+            results = records.gather(runs.run(task, settings[task.name], asked, SEEDS, own, base=base[task.name]))
+            row |= {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
+            entry = results["methods"][name]
+            row["scores"][task.name] = [round(score, 4) for score in last_scores(results["methods"])[name].values()]
             row["loss"][task.name] = {kind: curve["loss"][-1] for kind, curve in entry["curve"].items()}
             row["cpu_s"][task.name] = entry["cpu_s"]
         keep(row, file)
-        told = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
-        print(f"{name}, {row['setting']}: {told}")
+        means = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
+        print(f"{name}, {row['setting']}: {means}")
     print(f"-> {file}")
 
 

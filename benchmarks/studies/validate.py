@@ -1,7 +1,7 @@
 """Is a diagnosis right, where the truth is known? `deconf validate`
 
 It diagnoses expert trials, with exploration, of every task of the suite, of three that are not confounded
-(tests/fixtures.py), and of two under more and less process noise (noise.py), which were not looked at when the
+(unconfounded.py), and of two under more and less process noise (noise.py), which were not looked at when the
 thresholds were set. Each row of docs/diagnose/validation.json has the verdict, the task's certificate, and the scores
 that were measured; a case that is diagnosed again takes its row's place. Interrupted, it goes on where it was.
 """
@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import check_names
-from deconfounded.benchmarks.studies import noise, validation
+from deconfounded.benchmarks.studies import noise, runs, unconfounded, validation
+from deconfounded.benchmarks.studies.cards import DOCS
 from deconfounded.benchmarks.studies.spectrum import variants
 from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
@@ -32,12 +32,9 @@ from deconfounded.envs.task import ASSETS
 if TYPE_CHECKING:
     from deconfounded.deconf.diagnosis.diagnose import Diagnosis
 
-ROOT = Path(__file__).resolve().parents[2]
-DOCS = ROOT / "docs"
-FIXTURES = {"NoStakes": "feedback", "ShownAtOnce": "compensating", "NothingHidden": "blind"}
 CASES: dict[str, str | None] = {
     **dict.fromkeys(envs.SUITE),
-    **{f"{ROOT}/tests/fixtures.py:{task}": f"{ROOT}/tests/fixtures.py:{expert}" for task, expert in FIXTURES.items()},
+    **unconfounded.EXPERTS,
     **{
         case: str(ASSETS / "experts" / f"{base}.safetensors")
         for base, kind, factor, case in (one for base in noise.BASES for one in variants(base))
@@ -103,45 +100,28 @@ def point(task: envs.Task) -> dict[str, Any] | None:
 
 def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, float]:
     """Scores of the last episode: of the records in docs/, of docs/spectrum.json, or of a run made here."""
-    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
-    from deconfounded.benchmarks.engine.local import Local
+    from deconfounded.benchmarks.engine.catalogue import REFERENCES
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
 
     if of := point(task):
         return {name: float(np.mean(of["scores"][name])) for name in LEARNED}
     kept = records.of_task(DOCS / "records", task.name)
     if not kept:
-        settings, seeds = preset("default", task, "cpu"), (0, 1, 2)
-        jobs = [
-            BenchmarkJob(task.reference, settings, name, seeds, folder / "jobs", expert=source)
-            for name in METHODS
-            if name in (*REFERENCES, *LEARNED)
-        ]
-        with commands.locked(folder), Local() as engine:
-            prepare(folder, commands.about(BenchmarkJob, task, "default", settings, [], source), resume=True)
-            finished, _ = run_all(jobs, "cpu", task.name, engine)
-        kept = records.of_run(finished, "default", [], task.episodes)
-    methods = records.gather(kept)["methods"]
-    return {name: float(methods[name]["score_last"]) for name in LEARNED if name in methods}
+        settings, methods = preset("default", task, "cpu"), (*REFERENCES, *LEARNED)
+        kept = runs.run(task, settings, methods, range(3), folder, expert=source)
+    found = records.gather(kept)["methods"]
+    return {name: float(found[name]["score_last"]) for name in LEARNED if name in found}
 
 
 def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     """Whether it is passed: docs/ says so of the suite and of its variants; of others it is made here."""
-    from deconfounded.benchmarks.certify import certify
-    from deconfounded.experts import policy
-
     if task.name in envs.SUITE:
         file = DOCS / "certificates" / f"{task.name}.json"
         return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
     if of := point(task):
         return bool(of["certificate"]["verdict"] == "passed")
-    if not (kept := folder / "certificate.json").is_file():
-        write_json(kept, certify(task, policy.load(task, source)))
-    return bool(json.loads(kept.read_bytes())["verdict"] == "passed")
+    return bool(runs.certificate(task, source, folder)["verdict"] == "passed")
 
 
 def main() -> None:

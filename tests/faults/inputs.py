@@ -38,9 +38,9 @@ from tests.tools import tiny_preset
 
 REACHED = (  # where a command's work begins
     *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
-    *("benchmarks.studies.speed.measure", "benchmarks.studies.growth.cpu", "benchmarks.studies.seeds.Context"),
+    *("benchmarks.studies.stepping.seconds", "benchmarks.studies.performance.update_seconds"),
     *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
-    *("benchmarks.output.report.write", "benchmarks.studies.site.write", "benchmarks.studies.publish.keep"),
+    *("benchmarks.output.report.write", "benchmarks.studies.site.write"),
     *("benchmarks.check.check_task",),
 )
 MOST = 4 << 30  # bytes of memory, so that what asks for more is seen here
@@ -83,16 +83,6 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
             **{"--methods": ("", "naive", "all,", "gone.py:fit", "os:path", "{junk}:fit", "-"), "--set": SETS},
             **{"--preset": ("", "smok", "DEFAULT", "1"), "--expert": EXPERTS, "--track": ("", "wandb")},
             **{"--seed": ("1",), "--list": ("x",), "--resume": ("yes",)},
-        },
-    ),
-    "cost": (
-        ("--task", "bandit", "--out", "{new}"),
-        {
-            "--task": TASKS[:6],
-            "--seeds": COUNTS,
-            "--device": DEVICES[:3],
-            "--out": FOLDERS,
-            "--methods": ("expert", "all "),
         },
     ),
     "paper": (
@@ -141,14 +131,11 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
     ),
     "verify": ((), {"record": ("", "nowhere.json", "{folder}", "{file}", "{junk}", "/proc/none")}),
     "report": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
-    "publish": ((), {"run": ()}),
-    "pages": ((), {"more": ("x",)}),
-    "seeds": (
-        (),
-        {"--task": TASKS[:6], "--preset": ("", "smok"), "--device": DEVICES, "--seeds": (*COUNTS, "1000000000")},
+    "publish": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
+    "performance": (
+        ("--tasks", CONTROL, "--out", "{new}"),
+        {"parts": ("", "sped", "-1"), "--tasks": (*TASKS[:6], "bandit"), "--device": DEVICES, "--out": FOLDERS},
     ),
-    "speed": (("--out", "{new}"), {"--task": (*TASKS[:6], "bandit"), "--n": COUNTS, "--out": FOLDERS}),
-    "growth": (("--out", "{new}"), {"--task": TASKS[:6], "--out": FOLDERS}),
 }
 
 

@@ -10,6 +10,8 @@ from deconfounded import envs
 from deconfounded.envs.edits import Edit
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.cartpole import Cartpole
+from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
+from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 
 
 class NoStakes(Cartpole):
@@ -19,7 +21,7 @@ class NoStakes(Cartpole):
     latents = (envs.Latent("friction", "N", 0.0, 3.0),)
 
     def spec(self) -> Any:
-        spec = envs.get("slippery_cartpole").spec()  # type: ignore[attr-defined]
+        spec = SlipperyCartpole().spec()
         for tendon in spec.tendons:
             spec.delete(tendon)
         tendon = spec.add_tendon(name="rail")
@@ -27,8 +29,8 @@ class NoStakes(Cartpole):
         spec.actuator("spin").ctrlrange = [0, 0]
         return spec
 
-    process_noise = envs.get("slippery_cartpole").process_noise
-    observation = envs.get("tilted_cartpole").observation
+    process_noise = SlipperyCartpole.process_noise
+    observation = TiltedCartpole.observation
 
     def control(self, action: Array) -> Array:
         return np.concatenate([action, np.zeros_like(action)], -1)
@@ -55,7 +57,7 @@ class ShownAtOnce(Cartpole):
     process_noise = {"slider": (0.0, 0.004), "hinge": (0.0, 0.004)}
 
     def spec(self) -> Any:
-        return envs.get("tilted_cartpole").spec()  # type: ignore[attr-defined]
+        return TiltedCartpole().spec()
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.actuator_gain("drive", float(theta[0]))
@@ -73,7 +75,7 @@ class NothingHidden(Cartpole):
     latents = (envs.Latent("nothing", "", 0.0, 1.0),)
 
     def spec(self) -> Any:
-        return envs.get("tilted_cartpole").spec()  # type: ignore[attr-defined]
+        return TiltedCartpole().spec()
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         """Nothing."""
@@ -82,3 +84,10 @@ class NothingHidden(Cartpole):
 def blind(obs: Array, theta: Array) -> Array:
     """The same controller, told of nothing."""
     return _balance(obs)
+
+
+EXPERTS = {
+    f"{__name__}:{task.__name__}": f"{__name__}:{expert.__name__}"
+    for task, expert in ((NoStakes, feedback), (ShownAtOnce, compensating), (NothingHidden, blind))
+}
+"""Of each task, its expert, both as references."""

@@ -1,0 +1,172 @@
+"""Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and opponents.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.output import index, records, score
+from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
+from deconfounded.benchmarks.studies import gap
+from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
+
+SUMMARY = (
+    *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "rma", "naive_rnn", "naive_obs"),
+    *("oracle_bc", "blind_bc", "conditional", "interventional"),
+)  # methods in README's table
+AUTHORS = {
+    "swapped_lander": {"oracle_bc": 235, "dagger": 235, "deconfounded": 235, "gail": 130, "naive_rnn": -20},
+    "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
+    "ant_goal": {"oracle_bc": -500, "dagger": -500, "deconfounded": -630, "gail": -1550, "naive_rnn": -2200},
+}  # returns in the published paper's control tasks, read off its figures, so approximate
+TIMED = ("bandit", "tilted_cartpole", "slippery_cartpole")  # in docs/speed.md
+
+
+def published() -> index.Found:
+    """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
+    found = []
+    for name in envs.SUITE:
+        task = envs.get(name)
+        if of_task := records.of_task(DOCS / "records", name):
+            found.append((task, records.gather(of_task, list(METHODS))))
+    return found
+
+
+def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
+    """That makes the results, or those of one method."""
+    methods = [name for name in METHODS if name in results["methods"]]
+    asked = " ".join(name for name in methods if name not in REFERENCES)
+    named = "" if methods == list(DEFAULT) else f" --methods {asked}"
+    seeds = len(results["seeds"])
+    if method and method not in REFERENCES:
+        seeds = len(results["methods"][method]["seeds"])
+        base = results["methods"][method]["method"]
+        named = f" --methods {base if base in METHODS else f'path/{base}.py:fit'}"
+    chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
+    counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
+    changed = f" --set {' '.join(results['set'])}" if "set" in results else ""
+    return f"python benchmarks/run.py --task {task.name}{chosen}{changed}{counted}{named}"
+
+
+def section(task: envs.Task, results: dict[str, Any]) -> str:
+    """A task's part of docs/results.md."""
+    seeds = score.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
+    versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
+    commits = ", ".join(dict.fromkeys(one[:7] for one in results["commits"]))
+    rows = []
+    for row in score.rows(results["methods"]):
+        beyond = results["methods"][row[0]].get("score_beyond")
+        rows.append((*row, score.two_decimals(beyond[-1]) if beyond else ""))
+    parts = [
+        f"## {task.name}",
+        f"`{command(task, results)}`",
+        f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
+        f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
+        markdown_table((*score.COLUMNS, "after as many again"), rows),
+        f"![score by episode]({task.name}.png)",
+    ]
+    if older := outdated(task, results):
+        parts.append(f"Of an older version, and not yet made again: {', '.join(older)}.")
+    if (DOCS / "records" / "superseded" / records.place(task.name)).exists():
+        link = f"records/superseded/{records.place(task.name)}"
+        parts.append(f"Superseded, and not to be compared: [the records of earlier versions]({link}).")
+    if (DOCS / f"{task.name}.webp").exists():
+        parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
+    return "\n\n".join(parts)
+
+
+def outdated(task: envs.Task, results: dict[str, Any]) -> list[str]:
+    """What of a task's results is of an older version than today's of the task or a method, and of which."""
+    older = [f"the task, v{results['task_version']} of v{task.version}"] * (results["task_version"] != task.version)
+    for name, entry in results["methods"].items():
+        method = METHODS.get(entry["method"])
+        if method is not None and entry["version"] != method.version:
+            older.append(f"{name}, v{entry['version']} of v{method.version}")
+    return older
+
+
+def results_page(found: index.Found, certified: dict[str, Any]) -> str:
+    """docs/results.md."""
+    head = """# Results
+
+Made by `deconf publish` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
+expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
+theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
+Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
+mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
+those of training."""
+    parts = [head, in_short(found, certified), *(section(*one) for one in found), gap.section(gaps(found))]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def in_short(found: index.Found, certified: dict[str, Any]) -> str:
+    """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
+    told = [f"- {answer}" for answer in answers(index.certified(found, certified))]
+    return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
+
+
+def gaps(found: index.Found) -> list[gap.Gap]:
+    """Of all tasks that have the records for it."""
+    return [one for task, results in found if (one := gap.gap(task, results["methods"]))]
+
+
+def summary(found: index.Found) -> str:
+    """README's table: scores in the last episode."""
+    rows, column = [], score.COLUMNS.index("last")
+    for task, results in found:
+        last = {row[0]: row[column] for row in score.rows(results["methods"])}
+        tier = "none" if task.tier is None else str(task.tier)
+        rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
+    methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
+    return markdown_table(("task", "tier", *methods, "seconds"), rows)
+
+
+def controls(found: index.Found) -> str:
+    """The table of docs/paper.md: the paper's control tasks, its returns beside ours."""
+    methods, rows = list(AUTHORS["ant_goal"]), []
+    ours = {task.name: results["methods"] for task, results in found if task.name in AUTHORS}
+    for task, theirs in AUTHORS.items():
+        rows.append((task, "the authors' return", *(f"{theirs[method]:,}" for method in methods)))
+        last = {
+            method: (np.mean(entry["return"], 0)[-1], entry["score_last"])
+            for method, entry in ours.get(task, {}).items()
+        }
+        for i, what in enumerate(("the return here", "the score here")):
+            rows.append(("", what, *(score.two_decimals(last[name][i]) if name in last else "" for name in methods)))
+    return markdown_table(("task", "in the last episode", *methods), rows)
+
+
+def costs(found: index.Found) -> str:
+    """The table of docs/speed.md: CPU seconds a seed of each method, on some tasks."""
+    by_task = {task.name: results["methods"] for task, results in found if task.name in TIMED}
+    rows = []
+    for method in METHODS:
+        seconds = [methods.get(method, {}).get("cpu_s") for methods in by_task.values()]
+        rows.append((method, *("" if one is None else f"{one:,.1f}" for one in seconds)))
+    return markdown_table(("method", *by_task), rows)
+
+
+def fared(found: index.Found, certified: dict[str, Any]) -> str:
+    """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
+    scores, rows = index.certified(found, certified), list[tuple[str, ...]]()
+    over = index.over_tasks(scores, list(scores))["methods"]
+    for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
+        means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
+        ends = (
+            f"{task}, {score.two_decimals(means[task])}"
+            for task in (end(means, key=means.__getitem__) for end in (min, max))
+        )
+        figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
+        rows.append((name, METHODS[name].tier, str(len(means)), *figures, *ends))
+    told = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
+    return markdown_table(("method", "tier", "tasks", *told), rows)
+
+
+def _with_interval(figure: dict[str, Any] | None) -> str:
+    """Two decimals, and from where to where."""
+    value, *ends = map(score.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
+    return f"{value} ({' to '.join(ends)})" if ends else value

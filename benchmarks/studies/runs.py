@@ -1,0 +1,64 @@
+"""What studies run, each over its own tasks and settings: methods with some seeds, and certificates.
+
+What a folder has of either stays, so that an interrupted study goes on where it was.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.envs.support.files import write_json
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.presets import Preset
+    from deconfounded.benchmarks.output.records import Record
+
+
+def run(
+    task: envs.Task,
+    settings: Preset,
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    expert: str | None = None,
+    preset: str = "default",
+    changes: Sequence[str] = (),
+    device: str = "cpu",
+    cluster: str | None = None,
+    base: Preset | None = None,
+) -> list[Record]:
+    """The records of the methods' seeds on a task; base: the settings the folder is for, if others follow there."""
+    from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+    from deconfounded.benchmarks.engine.scheduler import listed, run_all
+    from deconfounded.benchmarks.engine.store import prepare
+    from deconfounded.benchmarks.output import records
+
+    wanted, own = [name for name in METHODS if name in methods], tuple(seeds)
+    jobs = [BenchmarkJob(task.reference, settings, name, own, folder / "jobs", expert=expert) for name in wanted]
+    label = f"{task.name}, {', '.join(wanted)}, {listed(own)}"
+    # Workers of its own: a record names the code that is there when it is made, and they have imported it.
+    with commands.locked(folder), commands.engine(cluster) as engine:
+        about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert)
+        prepare(folder, about, resume=True)
+        finished, _ = run_all(jobs, device, label, engine)
+    asked = [entry for entry in finished if entry[0] in wanted and entry[1] in own]
+    return records.of_run(asked, preset, changes, task.episodes)
+
+
+def certificate(task: envs.Task, expert: str | None, folder: Path) -> dict[str, Any]:
+    """The task's certificate, made with that expert."""
+    from deconfounded.benchmarks.certify import certify
+    from deconfounded.experts import policy
+
+    if not (file := folder / "certificate.json").is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(file, certify(task, policy.load(task, expert)))
+    held: dict[str, Any] = json.loads(file.read_bytes())
+    return held

@@ -1,0 +1,93 @@
+"""What the studies share, and what the benchmark costs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.engine import presets, scheduler
+from deconfounded.benchmarks.studies import performance, runs, stepping, tune
+from tests.tools import tiny_preset
+
+
+def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All parts, small: each leaves its numbers, which are above 0, and its picture."""
+    for module, name, value in (
+        *((stepping, "SIZES", (1, 65)), (performance, "STEPS", (10, 20)), (performance, "VALUES", (2, 3))),
+        *((performance, "GRID", "bandit"), (performance, "SEEDS", (1, 2)), (performance, "TIMED", ("naive_rnn",))),
+        *((performance, "LEARNED", ("blind_bc",)), (performance, "SHARES", (0.5,))),
+    ):
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(presets, "preset", lambda *_: tiny_preset())
+    monkeypatch.setattr("sys.argv", ["performance", "--tasks", "tilted_cartpole", "--out", str(tmp_path)])
+    performance.main()
+    read = {file.stem: json.loads(file.read_text()) for file in tmp_path.glob("*.json")}
+    few, many = read["speed"]["tasks"]["tilted_cartpole"].values()
+    assert set(few) - set(many) == {"sync_vector_env"}, "65 single environments are too many"
+    assert all(rate > 0 for name, rate in [*few.items(), *many.items()] if name != "kib")
+    assert {what: [*by] for what, by in read["growth"].items()} == {
+        "steps of a trial": ["an update of the belief", "a pass of the RNN"],
+        "values of the grid": ["exact interventional", "exact conditional"],
+    }
+    assert [*read["growth"]["steps of a trial"]["a pass of the RNN"]] == ["10", "20"]
+    assert [*read["seeds"]["methods"]["naive_rnn"]] == ["1", "2"]
+    cost = read["cost-tilted_cartpole"]["methods"]
+    assert [(method, *points) for method, points in cost.items()] == [("blind_bc", "0.5")]
+    for name in ("speed", "growth", "cost-tilted_cartpole"):
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000
+
+
+def test_median_of_repeats_after_one_to_warm_up() -> None:
+    """Of runs in turn: one takes 100, 1, 2 and 9 seconds, the other none."""
+    now, took = 0.0, iter([100.0, 1.0, 2.0, 9.0])
+
+    def slow() -> None:
+        nonlocal now
+        now += next(took)
+
+    assert stepping.seconds({"slow": slow, "fast": lambda: None}, lambda: now, 3) == {"slow": 2, "fast": 0}
+    assert performance.power({1: 3.0, 2: 12.0, 4: 48.0}) == pytest.approx(2)
+
+
+def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scheduler, "run_all", None)
+    with commands.locked(tmp_path), pytest.raises(envs.InputError, match="another command is at work"):
+        runs.run(envs.get("bandit"), tiny_preset(), ["random"], [0], tmp_path)
+
+
+def test_runs_are_those_asked_for(tmp_path: Path) -> None:
+    """What else the folder has is not in their records; what it has of them is not made again."""
+    task, settings = envs.get("bandit"), tiny_preset()
+    made = runs.run(task, settings, ["random", "expert"], [0, 1], tmp_path)
+    assert sorted((one["method"], one["seed"]) for one in made) == [
+        (m, i) for m in ("expert", "random") for i in (0, 1)
+    ]
+    before = {file: file.stat().st_mtime_ns for file in (tmp_path / "jobs").glob("*.npz")}
+    again = runs.run(task, settings, ["random"], [1], tmp_path)
+    assert [(one["method"], one["seed"]) for one in again] == [("random", 1)]
+    assert {file: file.stat().st_mtime_ns for file in (tmp_path / "jobs").glob("*.npz")} == before
+
+
+def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of each setting its own numbers, and references that are made once; what is kept is not tried again."""
+    (tmp_path / "docs").mkdir()
+    for name, value in (("DOCS", tmp_path / "docs"), ("TASKS", ("bandit",)), ("BEFORE", {}), ("SEEDS", (100,))):
+        monkeypatch.setattr(tune, name, value)
+    monkeypatch.setattr(tune, "TRIED", {"naive_rnn": ({"width": 2},)})
+    monkeypatch.setattr(presets, "preset", lambda *_: tiny_preset())
+    monkeypatch.setattr("sys.argv", ["tune", "--out", str(tmp_path / "out")])
+    tune.main()
+    jobs, kept = tmp_path / "out" / "bandit" / "jobs", (tmp_path / "docs" / "tuning.json").read_text()
+    made = {file.stem: file.stat().st_mtime_ns for file in jobs.glob("*.npz")}
+    assert sorted(made) == ["demonstrations-100", "expert-100", "naive_rnn-100", "random-100"]
+    assert made["naive_rnn-100"] > max(made[name] for name in made if name != "naive_rnn-100")
+    usual, wide = json.loads(kept)["rows"]
+    assert (usual["setting"], wide["setting"]) == ("the preset", "width x 2")
+    assert 2 * usual["amounts"]["bandit"]["width"] == wide["amounts"]["bandit"]["width"]
+    assert usual["loss"] != wide["loss"]
+    tune.main()
+    assert (tmp_path / "docs" / "tuning.json").read_text() == kept
