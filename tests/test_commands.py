@@ -395,7 +395,7 @@ class TestScore:
             by_method[name] = [
                 {
                     **{"seed": seed, "returns": [value] * 2, "objective": [-value] * 2, "theta_r2": [1.0] * 2},
-                    **{"budget": {}, "cpu_s": 1.5, "tier": "1", "method_version": 1},
+                    **{"budget": {}, "cpu_s": 1.5, "tier": "1", "method_version": 1, "method": name, "deployment": ""},
                 }
                 for seed, value in enumerate(by_seed)
             ]
