@@ -46,6 +46,7 @@ def check_task(task: Task) -> None:
     with _part(task, "init_state"):
         state = task.init_state(rng)
     with _part(task, "outcome"):
+        env.simulator.outcome(state[:1], action[:1], np.arange(1))  # alone: a failure in a thread would end the process
         noise = task.sample_noise(rng)[:, 0]
         then = task.apply_noise(env.simulator.outcome(state, action), noise)
     for name, shape, ask in (
