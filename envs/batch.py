@@ -67,7 +67,7 @@ class BatchEnv:
         if not isinstance(options, dict):
             raise InputError(f"reset options were {options!r}; they must be a dictionary")
         if unknown := set(options) - {"keep_theta", "theta"}:
-            raise InputError(f"reset option {sorted(unknown)[0]!r} is unknown; there are keep_theta and theta")
+            raise InputError(f"reset option {min(map(repr, unknown))} is unknown; there are keep_theta and theta")
         keep, forced = self._keep_mask(options.get("keep_theta", False)), options.get("theta")
         if keep.any() and forced is not None:
             raise InputError("reset was given keep_theta and theta; give one of them")

@@ -2,15 +2,35 @@
 
 from __future__ import annotations
 
+import pickle
+import re
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
+from safetensors.numpy import save_file
 
 from deconfounded import envs
-from deconfounded.experts.rollout import Trials
+from deconfounded.benchmarks import check, data
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine.scheduler import run_job
+from deconfounded.deconf import methods
+from deconfounded.deconf.core.data import Draws
+from deconfounded.deconf.core.nets import Adam, Linear
+from deconfounded.deconf.methods import cloning, deconfounded, deconfounded_mean, naive_rnn
+from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
+from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.envs.streams import Array
+from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
+from deconfounded.experts import policy
+from deconfounded.experts.rollout import RandomAgent, Trials, run_trials
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
 MASK = np.ones((2, 1, 3), bool)
@@ -190,3 +210,178 @@ class TestTrials:
         np.testing.assert_array_equal(trials.obs[0, 0, 4:], np.tile(obs[0, 0, 3].astype("f4"), (2, 1)))
         np.testing.assert_array_equal(trials.obs[1, 0, [1, 2, 4, 5]], obs[1, 0, [1, 2, 4, 5]].astype("f4"))
         np.testing.assert_array_equal(trials.action[..., 0], np.where(mask, action[..., 0], 0).astype("f4"))
+
+
+class Rude(SlipperyCartpole):
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        raise SystemExit
+
+
+class RudeLater(SlipperyCartpole):
+    """Once the check is over."""
+
+    def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        if len(state) > 16:
+            sys.exit(0)
+        return super().reward(state, action, next_state, theta)
+
+
+class TestTasks:
+    @pytest.mark.parametrize(
+        ("name", "value", "says"),
+        [
+            ("episodes", 0, "episodes of slippery_cartpole was 0; it must be a whole number from 1 up"),
+            ("episodes", -3, "episodes of slippery_cartpole was -3"),
+            ("episodes", 2.5, "episodes of slippery_cartpole was 2.5"),
+            ("horizon", True, "horizon of slippery_cartpole was True"),
+            ("substeps", 0, "substeps of slippery_cartpole was 0"),
+            ("version", "one", "version of slippery_cartpole was 'one'; it must be a whole number from 0 up"),
+            ("tier", "x", "tier of slippery_cartpole was 'x'; it must be 1, 2, 3 or None"),
+            ("tier", True, "tier of slippery_cartpole was True"),
+        ],
+    )
+    def test_numbers_that_a_task_states(self, name: str, value: Any, says: str) -> None:
+        with pytest.raises(envs.InputError, match=f"^{says}"):
+            envs.check_task(type("Odd", (SlipperyCartpole,), {name: value})())
+
+    @pytest.mark.parametrize(
+        ("given", "says"),
+        [
+            (("x", "", "a", 1), "low of latent x was 'a'; it must be a number"),
+            (("x", "", 0, None), "high of latent x was None"),
+            (("x", "", False, 1), "low of latent x was False"),
+            (("x", "", 0, 1, "uniform", "slow"), "drift of latent x was 'slow'"),
+        ],
+    )
+    def test_latents(self, given: Any, says: str) -> None:
+        with pytest.raises(envs.InputError, match=says):
+            envs.Latent(*given)
+
+    @pytest.mark.parametrize("options", [{1: 1, "b": 2}, {None: 1}, {("a", 1): 1, 2: 2}])
+    def test_reset_options(self, options: Any) -> None:
+        with pytest.raises(envs.InputError, match=r"^reset option .* is unknown; there are keep_theta and theta"):
+            envs.make("bandit").reset(options=options)
+
+    def test_a_reward_that_ends_the_command(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+        """In silence, and as if all were well: in a check, in a command, and in a worker process of one."""
+        with pytest.raises(envs.InputError, match=r"reward of slippery_cartpole: .*SystemExit, test_doors.py:\d+"):
+            envs.check_task(Rude())
+        monkeypatch.setitem(envs.TASKS, "slippery_cartpole", RudeLater)
+        args = ["data", "--task", "slippery_cartpole", "--trials", "32", "--out", str(tmp_path)]
+        monkeypatch.setattr("sys.argv", args)
+        pytest.importorskip("minari")
+        with pytest.raises(SystemExit) as ended:
+            run_command(data.main)
+        assert ended.value.code == 2
+        assert re.fullmatch(r"error: .*SystemExit, test_doors.py:\d+\)\n", capsys.readouterr().err)
+
+        class Ending:
+            def run(self) -> str:
+                raise SystemExit(0)
+
+        with pytest.raises(envs.InputError, match=r"ended by 0 \(SystemExit, test_doors.py"):
+            run_job(Ending())  # type: ignore[arg-type]
+
+    def test_commands_may_end(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """As they do after --help, and where something failed."""
+        monkeypatch.setattr(check, "CONTRACT", {"broken": lambda task: 1 / 0})
+        for args, code in ((["--help"], 0), (["--task", "bandit"], 1)):
+            monkeypatch.setattr("sys.argv", ["check", *args])
+            with pytest.raises(SystemExit) as ended:
+                run_command(check.main)
+            assert ended.value.code == code
+
+    def test_one_line_of_many_values(self) -> None:
+        """Arrays print in several lines, from six values on."""
+        theta = np.arange(40.0).reshape(20, 2) / 3
+        with pytest.raises(envs.InputError, match="theta of bandit was array") as caught:
+            envs.make_vec("bandit", 4).reset(options={"theta": theta})
+        assert "\n" not in str(caught.value)
+        assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+
+    def test_expert_weights_of_integers(self, tmp_path: Path) -> None:
+        task = envs.get("slippery_cartpole")
+        width = len(task.observation) + task.theta_width
+        weights = {"0.weight": np.ones((1, width), np.int64), "0.bias": np.ones(1, np.float32)}
+        save_file(weights, tmp_path / "x.safetensors")
+        with pytest.raises(envs.InputError, match="is of int64 and float32, not of float32"):
+            policy.load(task, tmp_path / "x.safetensors")
+
+
+class TestRunTrials:
+    @pytest.mark.parametrize(
+        ("episodes", "seed", "says"),
+        [
+            (0, 0, "the number of episodes was 0"),
+            (-1, 0, "the number of episodes was -1"),
+            (1.5, 0, "the number of episodes was 1.5"),
+            (1, [], r"seed was \[\]; it must be"),
+            (1, np.zeros(0, int), r"seed was array"),
+            (1, "12", "seed was '12'"),
+            (1, [0, 1.5], r"seed was \[0, 1.5\]"),
+            (1, None, "seed was None"),
+            (1, -1, "seed was -1"),
+        ],
+    )
+    def test_no_episodes_or_seeds(self, episodes: Any, seed: Any, says: str) -> None:
+        env = envs.BatchEnv(envs.get("bandit"), 2)
+        with pytest.raises(envs.InputError, match=says):
+            run_trials(env, RandomAgent(env.task.action_space), episodes, seed)
+
+
+class TestTraining:
+    @pytest.mark.parametrize(
+        ("change", "says"),
+        [
+            ({"chunk": 0}, "chunk of RecurrentConfig was 0; it must be int, from 1 up"),
+            ({"width": 1.5}, "width of RecurrentConfig was 1.5"),
+            ({"updates": -1}, "updates of RecurrentConfig was -1; it must be int, from 0 up"),
+            ({"learning_rate": float("nan")}, "learning_rate of RecurrentConfig was nan; it must be float, from 0 up"),
+            ({"cooled": 1}, "cooled of RecurrentConfig was 1; it must be bool"),
+            ({"batch": True}, "batch of RecurrentConfig was True"),
+        ],
+    )
+    def test_amounts(self, change: dict[str, Any], says: str) -> None:
+        with pytest.raises(envs.InputError, match=says):
+            RecurrentConfig(**change)
+
+    def test_amounts_of_every_method(self) -> None:
+        """Each configuration is held to its types; None and names where they are allowed."""
+        for name in methods.METHODS:
+            config = methods.load(name).method.on_control  # type: ignore[attr-defined]
+            for part in () if config is None else asdict(config):
+                with pytest.raises(envs.InputError, match=f"^{part} of {type(config).__name__} was "):
+                    replace(config, **{part: b"x"})
+        DeconfoundedConfig(model="gru", inference_batch=None, beta=0)
+        with pytest.raises(envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'evidence' or"):
+            DeconfoundedConfig(model="tree")  # type: ignore[arg-type]
+
+    @pytest.mark.parametrize("drifts", [True, False])
+    def test_no_trials(self, drifts: bool) -> None:
+        """Of exploration that returns nothing, and of a source of demonstrations."""
+        trials, config = Trials(OBS, ACTION, MASK), DeconfoundedConfig(drifts=drifts)
+        rng = np.random.default_rng(0)
+        for call in (
+            lambda: deconfounded.train(trials, lambda agent: None, config, rng),  # type: ignore[arg-type,return-value]
+            lambda: deconfounded_mean.train(trials, lambda agent: None, MeanConfig(), rng),  # type: ignore[arg-type,return-value]
+            lambda: naive_rnn.train(lambda: None, RecurrentConfig(), rng),  # type: ignore[arg-type,return-value]
+            lambda: cloning.train(None, CloningConfig(), rng),  # type: ignore[arg-type]
+        ):
+            with pytest.raises(envs.InputError, match="trials were None; they must be Trials"):
+                call()
+
+    def test_a_loss_that_is_not_finite(self) -> None:
+        """Training ends there, in a line that names the loss and the update: no agent of NaN comes of it."""
+        rng = np.random.default_rng(0)
+        trials = Trials(rng.normal(size=(2, 1, 4, 3)), rng.uniform(-1, 1, (2, 1, 3, 1)), MASK)
+        config = CloningConfig(updates=20, batch=4, learning_rate=1e30)
+        with pytest.raises(envs.InputError, match=r"the loss of ActionHead failed in update [2-5]: it was (nan|inf)"):
+            cloning.train(trials, config, [np.random.default_rng(0), np.random.default_rng(1)])
+
+    def test_a_gradient_that_is_not_a_number(self) -> None:
+        """Of a finite loss: the root of 0 has none."""
+        layer = Linear(2, 1, Draws([np.random.default_rng(0)], "cpu"))
+        optimizer = Adam([layer], 1e-3)
+        optimizer.step(layer(torch.ones(1, 3, 2)).mean((1, 2)))
+        with pytest.raises(envs.InputError, match="the loss of Linear failed in update 2: its gradient was NaN"):
+            optimizer.step((0 * layer(torch.ones(1, 3, 2))).square().sum((1, 2)).sqrt())
