@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from deconfounded.deconf.core.sizes import MANY, WIDE
+from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 from deconfounded.experts.rollout import Agent
@@ -77,7 +77,7 @@ class Method:
             config = self.paper
         values = asdict(config)
         given: dict[str, Any] = {"device": device, "drifts": task.drifts}
-        if len(task.observation) >= MANY:
+        if len(task.observation) >= LARGE_OBSERVATION:
             given |= {"width": WIDE, **(self.many(config) if self.many else {})}
         return values | {key: value for key, value in given.items() if key in values}
 

@@ -119,7 +119,7 @@ def test_forgetting(kind: str) -> None:
     """What is kept whole stays as it was, to the bit; of what is not kept, nothing; and in between, in between."""
     draws = Draws([np.random.default_rng(0)], "cpu")
     unit = Scaler(draws.normal(50, 2), torch.ones(1, 50))
-    model = models.new(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
+    model = models.new_model(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
     step = Batch(draws.normal(4, 2), draws.normal(4, 1), draws.normal(4, 2), torch.ones(1, 4))
     memory = model.update(model.start(4), step)
     assert torch.equal(model.forget(memory), memory) or kind == "discrete"

@@ -47,7 +47,7 @@ def test_arrivals() -> None:
     """Of an episode of three steps of four the last arrival is its end; of one of four none is."""
     obs = np.arange(10.0).reshape(2, 1, 5, 1)
     mask = np.array([[[1, 1, 1, 0]], [[1, 1, 1, 1]]], bool)
-    came, over = termination.arrivals(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
+    came, over = termination.labelled(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
     assert came[:, 0].tolist() == [1, 2, 3, 6, 7, 8, 9]
     assert over.tolist() == pytest.approx([0, 0, 1, 0, 0, 0, 0])
 

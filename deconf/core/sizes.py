@@ -1,4 +1,4 @@
-"""How large networks are, by how much is observed."""
+"""Sizes of networks, by the width of observations."""
 
-MANY, WIDE = 16, 128  # from so many observed numbers on, all methods' networks on control are so wide
-SPACIOUS = 8  # dimensions of theta_hat there: with 4, one seed of three read it less well on ant_goal and the walker
+LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
+LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker

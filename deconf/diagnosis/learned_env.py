@@ -14,7 +14,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, extent, take
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, sample_index
-from deconfounded.deconf.core.termination import Endings
+from deconfounded.deconf.core.termination import TerminationModel
 from deconfounded.deconf.equations import belief_update
 
 
@@ -101,7 +101,7 @@ def farther(rivals: Tensor, known: Tensor, draws: Draws) -> Tensor:
     """For each of known ones [S, N] of latents [S, K, D], another, of the half that is farther from it."""
     half = max(1, rivals.shape[1] // 2)
     far = torch.cdist(rivals, rivals).argsort(-1, descending=True)[..., :half]
-    return take(far, known).gather(-1, draws.below(half, known.shape[1])[..., None])[..., 0]
+    return take(far, known).gather(-1, draws.integers(half, known.shape[1])[..., None])[..., 0]
 
 
 def seen_range(*data: Batch) -> tuple[Tensor, Tensor]:
@@ -127,12 +127,20 @@ class World:
     """
 
     def __init__(
-        self, judge: Expert, held: Batch, every: Sequence[Batch], episodes: int, horizon: int, ends: Endings | None
+        self,
+        judge: Expert,
+        held: Batch,
+        every: Sequence[Batch],
+        episodes: int,
+        horizon: int,
+        ends: TerminationModel | None,
     ) -> None:
         self.judge, self.horizon, self.ends = judge, horizon, ends
         n, starts = judge.theta_hat.shape[1], held.obs[:, :, 0]
         draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
-        self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
+        self.starts = [
+            take(starts, draws.integers(starts.shape[1], n)) for _ in range(episodes)
+        ]  # the same for everyone
         self.known, self.seen = known_range(held), seen_range(*every)
         self.scale = self._scale(held)
 
@@ -144,7 +152,7 @@ class World:
         n = theta_hat.shape[1]
         draws = Draws([np.random.default_rng(i) for i in range(len(theta_hat))], "cpu")
         obs = held.steps(held.draw_steps(16 * n, draws)).obs
-        one, other = (take(theta_hat, draws.below(n, 16 * n)) for _ in range(2))
+        one, other = (take(theta_hat, draws.integers(n, 16 * n)) for _ in range(2))
         apart = (self.judge.point(obs, one) - self.judge.point(obs, other)).abs().sum(-1)
         return apart.mean(1, keepdim=True).clamp(min=1e-3)
 

@@ -20,8 +20,8 @@ from torch import Tensor
 from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.agents import LearnedAgent, Monitor
 from deconfounded.deconf.core.data import Batch, Draws, take
-from deconfounded.deconf.core.drift import apart
-from deconfounded.deconf.core.sizes import MANY, SPACIOUS, WIDE
+from deconfounded.deconf.core.drift import split_episodes
+from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis import latent
 from deconfounded.deconf.diagnosis.deviation import back, oddest, strange, strayed, ways
 from deconfounded.deconf.diagnosis.latent import Explanation, mean
@@ -56,14 +56,14 @@ class Amounts:
 
     def fitting(self, observed: int) -> Amounts:
         """The same, of networks that are large enough for so many observed numbers."""
-        if observed < MANY:
+        if observed < LARGE_OBSERVATION:
             return self
         return replace(
             self,
             cloning=replace(self.cloning, width=WIDE),
             naive=replace(self.naive, width=WIDE),
-            offline=replace(self.offline, width=WIDE, latent=SPACIOUS),
-            exploring=replace(self.exploring, width=WIDE, latent=SPACIOUS),
+            offline=replace(self.offline, width=WIDE, latent=LARGE_LATENT),
+            exploring=replace(self.exploring, width=WIDE, latent=LARGE_LATENT),
         )
 
 
@@ -134,7 +134,7 @@ def measure(
     data = [shown] if explore is None else [shown, explore]
     ends = termination.fit(data, blind.scaler, draws)
     with torch.no_grad():
-        other, episodes = Batch.of(held, 1), Batch.of(apart(shown), 1)
+        other, episodes = Batch.of(held, 1), Batch.of(split_episodes(shown), 1)
         present = blind.policy.log_prob(blind.scaler(other.obs), other.action)
         memory = -float(recurrent.held_out_loss(other)) - mean(present, other)
         some = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # logs are ragged
@@ -159,8 +159,8 @@ def _dreamt(
 ) -> tuple[float, ...]:
     """Stakes and what follows in Findings. went: the ways of the data's episodes, [N, T, O]."""
     draws = Draws(rngs, "cpu")
-    rivals = take(found.latents, draws.below(found.latents.shape[1], amounts.rivals))
-    known = draws.below(amounts.rivals, amounts.dreams)
+    rivals = take(found.latents, draws.integers(found.latents.shape[1], amounts.rivals))
+    known = draws.integers(amounts.rivals, amounts.dreams)
     knower, mistaker = (
         Expert(found.model, found.policy, take(rivals, index)) for index in (known, farther(rivals, known, draws))
     )
@@ -200,7 +200,14 @@ def _by_world(
     units = [(expert, explored, 1, how)]
     if each > 1:
         longer = replace(how, inference_batch=batch and each * batch)  # as much evidence as of trials that are whole
-        units.append(((apart(expert[0]), apart(expert[1])), (apart(explored[0]), apart(explored[1])), each, longer))
+        units.append(
+            (
+                (split_episodes(expert[0]), split_episodes(expert[1])),
+                (split_episodes(explored[0]), split_episodes(explored[1])),
+                each,
+                longer,
+            )
+        )
     for i, (shown, tried, at_once, how) in enumerate(units):
         part = Part(tell, 0.25 + 0.55 * i / len(units), 0.25 + 0.55 * (i + 1) / len(units))
         found.append(latent.by_world(shown, tried, at_once, how, amounts.cloning, draws, part))

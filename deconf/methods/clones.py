@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 from torch import Tensor
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, trials_of
 from deconfounded.deconf.core.nets import Adam, Scaler
 from deconfounded.deconf.methods.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 
@@ -49,8 +49,8 @@ def clone(
     Or clone what draws them: fresh ones for every batch. start: makes an agent that knows nothing yet; the scaler is of
     the expert's observations. teach: makes what trains it, on trials of so many steps.
     """
-    rngs, monitor = listed(rng), monitor or Monitor()
-    shown = drawn(trials)
+    rngs, monitor = as_generators(rng), monitor or Monitor()
+    shown = trials_of(trials)
     data, draws = Batch.of(shown, len(rngs), config.device), Draws(rngs, config.device)
     agent = start(Signature.of(shown), Scaler(data.obs, data.mask), draws)
     learner = teach(agent, data.mask.shape[2], monitor)
@@ -61,7 +61,7 @@ def clone(
         if shown is trials:
             batch = data.draw_trials(config.batch, draws)
         else:
-            batch = Batch.of(drawn(trials), len(rngs), config.device)
+            batch = Batch.of(trials_of(trials), len(rngs), config.device)
         learner.learn(batch, batch.action)
         checkpoint.save(done=learner.done)
     return agent

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import LearnedAgent, Monitor
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.task import Array, InputError
@@ -70,7 +70,7 @@ def train(
     theta [B, E, F]: features of each episode's theta, for the oracle, whose agent then asks `side` for those [N, F] of
     the environments it acts in. Without both: blind BC.
     """
-    rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
+    rngs, signature, monitor = as_generators(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     scaler = Scaler(data.obs, data.mask)
     features = scaler(data.obs)

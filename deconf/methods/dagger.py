@@ -25,8 +25,8 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import LearnedAgent, Monitor
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take, take_steps
-from deconfounded.deconf.core.drift import apart
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, take_steps
+from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -123,13 +123,13 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     """Label roll-outs, train on all labels so far, and again. Raises InputError for less than one round."""
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, monitor = listed(rng), monitor or Monitor()
+    rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
 
     def labelled(behaviour: DaggerAgent | None) -> tuple[Signature, Batch, Tensor]:
         """Roll-outs, and their labels [S, B, T, A], joined as the trials' own actions are."""
         trials, labels = query(behaviour)
-        each = apart if config.drifts else lambda trials: trials
+        each = split_episodes if config.drifts else lambda trials: trials
         told = Trials(trials.obs, labels, trials.mask, trials.actions)
         acted, meant = (Batch.of(each(some), len(rngs), config.device) for some in (trials, told))
         return Signature.of(trials), acted, meant.action
@@ -139,13 +139,15 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     share = config.updates / (config.rounds * (config.rounds + 1) / 2)
     updates = [max(1, round(share * i)) for i in range(1, config.rounds + 1)]
     optimizer, done = Adam([agent.memory, agent.policy], config.learning_rate, sum(updates)), 0
-    agent.memory.whiten.left = sum(updates) // 2  # what roll-outs come to changes with each round, and so do moments
+    agent.memory.whiten.updates_left = (
+        sum(updates) // 2
+    )  # what roll-outs come to changes with each round, and so do moments
     for i in range(config.rounds):
         if i > 0:
             _, more, new = labelled(agent)
             data, label = data.joined(more), torch.cat([label, new], 1)
         for _ in range(updates[i]):
-            index, batch = draws.below(len(data), config.batch), data.beginnings(done, config.shortest)
+            index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)
             told = take(label[:, :, : batch.mask.shape[2]], index)
             agent.memory.train()
             loss = agent.loss(batch.trials(index), told, config.steps, draws)

@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor, ramp
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
-from deconfounded.deconf.core.drift import apart, choose_kept
-from deconfounded.deconf.core.models import LatentModel, final_belief
-from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
+from deconfounded.deconf.core.drift import choose_kept, split_episodes
+from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import LARGE_LATENT
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -150,7 +149,7 @@ class Explorer(DeconfoundedAgent):
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
         self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
-        self._drawn = take(self.latents, self._draws.below(self.latents.shape[1], self._n))
+        self._drawn = take(self.latents, self._draws.integers(self.latents.shape[1], self._n))
 
     def latent(self) -> Tensor:
         return torch.where(self._blind, self._drawn, super().latent())
@@ -170,10 +169,10 @@ def train(
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
-    each = apart if config.drifts else lambda trials: trials
-    shown, first = each(drawn(trials)), explore(None)
+    each = split_episodes if config.drifts else lambda trials: trials
+    shown, first = each(trials_of(trials)), explore(None)
     episodes, first = first.mask.shape[1], each(first)
     signature = Signature.of(shown)
     if Signature.of(first) != signature:
@@ -213,7 +212,7 @@ def train(
             new = Batch.of(each(explore(explorer)), seeds, device)
             seen = seen.joined(new) if config.accumulate else new
             if not config.accumulate:
-                expert = Batch.of(each(drawn(trials)), seeds, device)
+                expert = Batch.of(each(trials_of(trials)), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
             beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
@@ -276,7 +275,7 @@ PAPER = DeconfoundedConfig(  # appendix D and table 1; what they leave open is i
 
 def many(config: DeconfoundedConfig) -> dict[str, Any]:
     """Changes where much is observed: theta is inferred longer, at a lower rate (3e-3: ant_goal is worse)."""
-    return {"latent": SPACIOUS, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
+    return {"latent": LARGE_LATENT, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
 
 
 def once(agent: DeconfoundedAgent) -> DeconfoundedAgent:

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.agents import Checkpoint, Monitor
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import LARGE_LATENT
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -100,7 +100,7 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
     kl = masked_mean(gaussian_kl(mean, std, *before).flatten(1), batch.mask.flatten(1))
     theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
     ahead = min(config.ahead, batch.mask.shape[2])
-    offset = draws.below(ahead, config.inference_steps)
+    offset = draws.integers(ahead, config.inference_steps)
     index = batch.draw_steps(config.inference_steps, draws)  # of the latents
     steps = batch.mask.shape[2]
     inside = index % steps + offset < steps
@@ -128,7 +128,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
     first, draws = explore(None), Draws(rngs, device)
     expert, seen = Batch.of(trials, len(rngs), device), Batch.of(first, len(rngs), device)
     obs, change = scalers(seen.joined(expert))
@@ -196,7 +196,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     ),
     smoke={"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 20},
     smoke_bandit={"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 400},
-    many=lambda config: {"latent": SPACIOUS},
+    many=lambda config: {"latent": LARGE_LATENT},
 )
 def fit(given: Given) -> MeanAgent:
     """Rounds of exploration, inference and imitation."""

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.agents import Monitor, ramp
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, extent, listed, take
-from deconfounded.deconf.core.drift import apart, choose_kept
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
+from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import LARGE_LATENT
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -84,8 +84,15 @@ def explain(
 
 def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
     """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
-    rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
-    trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
+    rngs, signature, monitor, each = (
+        as_generators(rng),
+        Signature.of(trials),
+        monitor or Monitor(),
+        trials.mask.shape[1],
+    )
+    trials, times = (
+        (split_episodes(trials), each) if config.drifts else (trials, 1)
+    )  # single episodes: so many times as many
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     offline, online, policy = explain(data, signature, config, draws, monitor, times)
     latents = offline.sample(final_belief(offline, data), draws)
@@ -126,14 +133,14 @@ def synthesise(
     would say of the latent is noise.
     """
     n, (low, high) = config.synthetic, extent(expert.obs, expert.mask)
-    theta_hat = take(latents, draws.below(latents.shape[1], n))
+    theta_hat = take(latents, draws.integers(latents.shape[1], n))
     obs, other = starts[:, :1], latents[:, :1]  # replaced at once
     over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
     steps: list[tuple[Tensor, Tensor, Tensor]] = []
     for t in range(expert.mask.shape[2]):
         over = over | (t % horizon == 0)
-        obs = torch.where(over, take(starts, draws.below(starts.shape[1], n)), obs)
-        other = torch.where(over, take(latents, draws.below(latents.shape[1], n)), other)
+        obs = torch.where(over, take(starts, draws.integers(starts.shape[1], n)), obs)
+        other = torch.where(over, take(latents, draws.integers(latents.shape[1], n)), other)
         action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
         action = policy.signature.randomise(action, config.random_share, draws)
         next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
@@ -162,7 +169,7 @@ def synthesise(
     ),
     smoke={"offline_updates": 300, "online_updates": 300},
     smoke_bandit={"offline_updates": 300, "online_updates": 300},
-    many=lambda config: {"latent": SPACIOUS, "learning_rate": 2e-3},
+    many=lambda config: {"latent": LARGE_LATENT, "learning_rate": 2e-3},
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Algorithm 3."""

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
@@ -197,7 +197,7 @@ def train(
         raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
     from deconfounded.deconf.methods.practice import Player, Practice, new_ppo, numbers
 
-    rngs, monitor, signature = listed(rng), monitor or Monitor(), Signature.of(trials)
+    rngs, monitor, signature = as_generators(rng), monitor or Monitor(), Signature.of(trials)
     seeds, draws = len(rngs), Draws(rngs, config.device)
     expert = Batch.of(trials, seeds, config.device)
     obs, change = scalers(expert)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
@@ -112,7 +112,7 @@ def train(
     """
     if config.rounds < 1:
         raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, monitor = listed(rng), monitor or Monitor()
+    rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
     teacher = cloning.train(trials, _teacher(config), rngs, theta)
     signature, width = Signature.of(trials), config.width
@@ -132,7 +132,7 @@ def train(
         new, label = Batch.of(own, len(rngs), config.device), along(own, thetas, len(rngs), config.device)
         data, told = (new, label) if data is None else (data.joined(new), torch.cat([told, label], 1))
         for j in range(passes[i]):
-            index = draws.below(len(data), config.batch)
+            index = draws.integers(len(data), config.batch)
             error = _pass(agent, optimizer, data.trials(index), take(told, index), config.chunk)
             monitor.update((sum(passes[:i]) + j + 1) * chunks, total, {"theta": error}, agent)
         checkpoint.save(round=i + 1, data=data.tensors, told=told)
