@@ -22,8 +22,8 @@ USES = {
 }
 ENVIRONMENT = "environment"  # what evaluation steps, and the expert: for the suite's own references alone
 
-Ways = Mapping[str, Callable[[Any], Agent]]
-"""Further ways of deploying a trained agent, by name."""
+Deployments = Mapping[str, Callable[[Any], Agent]]
+"""Further deployments of a trained agent, by name."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Method:
     smoke: Mapping[str, Any] = field(default_factory=dict)
     smoke_bandit: Mapping[str, Any] = field(default_factory=dict)
     paper: Any = None
-    many: Callable[[Any], dict[str, Any]] | None = None
-    ways: Ways = field(default_factory=dict)
+    large: Callable[[Any], dict[str, Any]] | None = None
+    deployments: Deployments = field(default_factory=dict)
     exact: bool = False
     reference: str = ""
 
@@ -78,7 +78,7 @@ class Method:
         values = asdict(config)
         given: dict[str, Any] = {"device": device, "drifts": task.drifts}
         if len(task.observation) >= LARGE_OBSERVATION:
-            given |= {"width": WIDE, **(self.many(config) if self.many else {})}
+            given |= {"width": WIDE, **(self.large(config) if self.large else {})}
         return values | {key: value for key, value in given.items() if key in values}
 
     def config(self, values: Mapping[str, Any]) -> Any:

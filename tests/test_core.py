@@ -35,10 +35,10 @@ from deconfounded.deconf.equations import (
     reparametrise,
 )
 from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
-from deconfounded.deconf.methods import cloning, deconfounded, deconfounded_offline, naive_rnn
+from deconfounded.deconf.methods import deconfounded, deconfounded_offline, memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.recurrent_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials
@@ -456,11 +456,11 @@ class TestMethods:
 
     def test_bandit_oracle_and_blind(self) -> None:
         trials, env = demonstrations("bandit", 500, 1)
-        encode, config = env.task.encode_theta, cloning.CloningConfig(updates=300)
+        encode, config = env.task.encode_theta, memoryless_bc.MemorylessConfig(updates=300)
         score = envs.BatchEnv(env.task, 500)
         rng = np.random.default_rng
-        oracle = cloning.train(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
-        blind = cloning.train(trials, config, rng(0))
+        oracle = memoryless_bc.train(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
+        blind = memoryless_bc.train(trials, config, rng(0))
         assert run_trials(score, oracle, 1, 3).returns.mean() == pytest.approx(60, abs=2)
         assert run_trials(score, blind, 1, 3).returns.mean() == pytest.approx(20, abs=2)
 

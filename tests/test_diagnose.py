@@ -16,10 +16,10 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
-from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.recurrent_bc import RecurrentConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 TINY = Amounts(
     rivals=2,
     dreams=4,
-    cloning=CloningConfig(updates=5, batch=64),
+    cloning=MemorylessConfig(updates=5, batch=64),
     naive=RecurrentConfig(updates=6, batch=4),
     offline=OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4, offline_steps=16),
     exploring=DeconfoundedConfig(inference_updates=5, inference_batch=4, inference_steps=32),
@@ -197,7 +197,7 @@ def test_memory_is_found() -> None:
     obs, amounts = (
         rng.normal(size=(64, 1, 21, 1)),
         Amounts(
-            **{**vars(TINY), "cloning": CloningConfig(updates=200), "naive": RecurrentConfig(updates=150, chunk=20)}
+            **{**vars(TINY), "cloning": MemorylessConfig(updates=200), "naive": RecurrentConfig(updates=150, chunk=20)}
         ),
     )
     hidden = Trials(obs, sign, np.ones(shape, bool), 2)

@@ -13,13 +13,13 @@ from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.diagnosis import latent, measures
 from deconfounded.deconf.diagnosis.diagnose import SILENT
 from deconfounded.deconf.diagnosis.measures import Amounts, split
-from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.experts.rollout import Trials
 
 NOISE, FALL = 0.1, 1.5
 EXPLORING = DeconfoundedConfig(inference_updates=400, inference_rate=3e-3)
-CLONING = CloningConfig(updates=200)
+CLONING = MemorylessConfig(updates=200)
 
 
 def world(push: float, expert: bool, n: int, seed: int, episodes: int = 1, drifts: bool = False) -> Trials:

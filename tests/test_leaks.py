@@ -166,7 +166,7 @@ class TestData:
             raise KeyboardInterrupt
 
         if method in ("naive_obs", "palr"):
-            monkeypatch.setattr(modules[method], "clone_by_chunks", lambda kind, *given: spy(*given))
+            monkeypatch.setattr(modules[method], "train_recurrent", lambda kind, *given: spy(*given))
         else:
             monkeypatch.setattr(modules[method], "train", spy)
         context = Context(task, tiny_preset(), [0])

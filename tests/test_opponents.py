@@ -26,11 +26,11 @@ from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.gail import Discriminator, GailAgent, GailConfig
-from deconfounded.deconf.methods.naive_dropout import DroppingAgent
+from deconfounded.deconf.methods.gail_ppo import SequencePolicy, new_ppo
+from deconfounded.deconf.methods.naive_dropout import ActionDropoutAgent
 from deconfounded.deconf.methods.naive_obs import ObsAgent, ObsMemory
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
-from deconfounded.deconf.methods.practice import WholePolicy, new_ppo
 from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from deconfounded.experts.train import train
@@ -98,12 +98,12 @@ class TestActionsAside:
         """Two losses differ, and what is left of an action is 0 or twice as much; nothing is left out elsewhere."""
         draws = streams()
         batch = random_batch(draws, 50, 40)
-        agent = DroppingAgent.new(8, FLAT, scaler(batch), draws)
+        agent = ActionDropoutAgent.new(8, FLAT, scaler(batch), draws)
         agent.dropout, state, seen = 0.5, agent.memory.start(50), []
         embed = agent.memory._embed
 
         def spy(given: Batch) -> torch.Tensor:
-            seen.append(agent.memory.kept)
+            seen.append(agent.memory.action_mask)
             return embed(given)
 
         agent.memory._embed = spy  # type: ignore[method-assign]
@@ -193,7 +193,7 @@ class TestTransformer:
             with torch.no_grad():
                 agent.choose(now.obs)
             expected = torch.stack([full[s, range(3), at[s]] for s in range(2)])
-            torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+            torch.testing.assert_close(agent._features, expected, rtol=0, atol=1e-5)
             goes = ((~waits[:, :, t]) & (at < 11)).float()
             agent.remember(Batch(now.obs, now.action, now.next_obs, goes))
             at += goes.long()
@@ -213,7 +213,7 @@ class TestTransformer:
                 agent.choose(batch.obs[:, :, t])
             agent.remember(batch[:, :, t])
         expected = agent.net(agent.tokens(batch)[:, :, -8:])[:, :, -1]
-        torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(agent._features, expected, rtol=0, atol=1e-5)
 
     def test_held_out_loss_is_the_mean_over_steps(self) -> None:
         batch = random_batch(streams(), 40)
@@ -311,7 +311,7 @@ class TestRma:
         mask = np.array([[[1, 0, 0], [1, 1, 0]]], bool)
         theta = np.array([[[0.1], [0.2]]])
         trials = Trials(np.zeros((1, 2, 4, 1)), np.zeros((1, 2, 3, 1)), mask)
-        assert rma.along(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
+        assert rma.per_step(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
 
     def test_the_student_sees_no_theta(self) -> None:
         """Deployed, it is told nothing: a history makes it act alike under every theta."""
@@ -332,13 +332,13 @@ class TestRma:
 
 def practice(n: int = 3, task: str = CONTROL) -> tuple[Any, Vector]:
     """What GAIL practises in, and the environments behind it."""
-    from deconfounded.deconf.methods.practice import Practice
+    from deconfounded.deconf.methods.gail_ppo import TrialVecEnv
 
     context = Context(envs.get(task), tiny_preset(), [0])
     provider, width = Provider(context, ["exploration"], context.rngs), len(context.task.observation)
     environments = Environments(provider, provider("environments", 0, n), n)
     none: Callable[..., NDArray[np.float32]] = lambda obs, action, then: np.zeros(len(obs), np.float32)  # noqa: E731
-    made = Practice(environments, context.task.action_space, np.zeros(width), np.ones(width), none)
+    made = TrialVecEnv(environments, context.task.action_space, np.zeros(width), np.ones(width), none)
     return made, provider._vectors[0]
 
 
@@ -353,7 +353,7 @@ class TestGail:
             obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))
             obs.std.fill_(1)
             agent = GailAgent.blank({"width": 8}, signature, obs, streams())
-            agent.take(0, ppo.policy)
+            agent.load_policy(0, ppo.policy)
             agent.begin(4)
             agent.reset([np.random.default_rng(0)])
             state = tuple(torch.zeros(1, 4, 8) for _ in range(2))
@@ -382,12 +382,12 @@ class TestGail:
         lstm, state = torch.nn.LSTM(3, 5), tuple(torch.randn(1, 4, 5, generator=draws) for _ in range(2))
         found, calls = [], list[object]()
         lstm.register_forward_hook(lambda *call: calls.append(call))
-        for policy in (WholePolicy, WholePolicy.__base__):
+        for policy in (SequencePolicy, SequencePolicy.__base__):
             lstm.zero_grad()
             out, after = policy._process_sequence(features, state, starts, lstm)
             (out.sum() + after[1].sum()).backward()
             found.append([out, *after, *(weight.grad.clone() for weight in lstm.parameters())])
-            if policy is WholePolicy:
+            if policy is SequencePolicy:
                 assert len(calls) == (7 if any(i % 7 for i in begin) else 1)
         torch.testing.assert_close(*found, rtol=0, atol=1e-5)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from deconfounded.deconf.core.data import Rngs
-from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import CloningConfig, MemorylessAgent
+from deconfounded.deconf.methods import memoryless_bc
+from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent, MemorylessConfig
 from deconfounded.experts.rollout import Trials
 
 SHARE = 0.25  # of actions that are random
@@ -19,7 +19,7 @@ class Wanderer(MemorylessAgent):
         return self.policy.signature.randomise(super().choose(obs), SHARE, self._draws)
 
 
-def fit(trials: Trials, config: CloningConfig, rng: Rngs) -> Wanderer:
-    """Clone the expert's trials as in `cloning.fit`, to explore with."""
-    clone = cloning.train(trials, config, rng)
+def fit(trials: Trials, config: MemorylessConfig, rng: Rngs) -> Wanderer:
+    """Clone the expert without memory, as the basis of exploration."""
+    clone = memoryless_bc.train(trials, config, rng)
     return Wanderer(clone.policy, clone.scaler, None)

@@ -16,9 +16,9 @@ from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.diagnosis.learned_env import known_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
-from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
@@ -55,7 +55,7 @@ def by_world(
     explored: tuple[Trials, Trials],
     each: int,
     exploring: DeconfoundedConfig,
-    cloning: CloningConfig,
+    cloning: MemorylessConfig,
     draws: Draws,
     monitor: Monitor,
 ) -> Explanation:
@@ -170,7 +170,7 @@ def _told(
     return own, own - other
 
 
-def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
+def _conditional(model: VariationalModel, data: Batch, how: MemorylessConfig, draws: Draws) -> ActionHead:
     """A policy, cloned given the latents that a model infers from the trials."""
     policy = ActionHead(model.inputs.obs_width + model.latent, how.width, model.inputs.signature, draws)
     agent, belief = DeconfoundedAgent(model, policy), _belief(model, data)

@@ -26,11 +26,11 @@ from deconfounded.deconf.diagnosis import latent
 from deconfounded.deconf.diagnosis.deviation import back, oddest, strange, strayed, ways
 from deconfounded.deconf.diagnosis.latent import Explanation, mean
 from deconfounded.deconf.diagnosis.learned_env import Actor, Clone, Expert, Filter, World, farther
-from deconfounded.deconf.methods import cloning, naive_rnn
-from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.recurrent_bc import RecurrentConfig
 from deconfounded.experts.rollout import Agent, Trials
 
 CLEARLY = 0.1  # nats a step
@@ -47,7 +47,7 @@ class Amounts:
     held_out: float = 0.25  # share of the trials
     rivals: int = 32
     dreams: int = 192
-    cloning: CloningConfig = field(default_factory=lambda: CloningConfig(updates=1500))
+    cloning: MemorylessConfig = field(default_factory=lambda: MemorylessConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
     exploring: DeconfoundedConfig = field(
@@ -124,7 +124,7 @@ def measure(
     amounts = amounts.fitting(trials.obs.shape[-1])
     expert, rngs = split(trials, amounts.held_out, rng), [rng]
     shown, held = expert
-    blind = cloning.train(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
+    blind = memoryless_bc.train(shown, amounts.cloning, rng, monitor=Part(tell, 0, 0.1))
     recurrent = naive_rnn.train(shown, amounts.naive, rng, Part(tell, 0.1, 0.25))
     draws = Draws(rngs, "cpu")
     if explore is None:
