@@ -38,7 +38,7 @@ from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
 from deconfounded.deconf.methods import deconfounded, deconfounded_offline, memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent_bc import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials

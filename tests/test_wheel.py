@@ -115,7 +115,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent_bc import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 
 offline = OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4)
 networks = MemorylessConfig(updates=5), RecurrentConfig(updates=6, batch=4), offline, DeconfoundedConfig()

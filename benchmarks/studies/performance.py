@@ -65,7 +65,7 @@ def by_steps(steps: int) -> dict[str, float]:
     from deconfounded.deconf.core.data import Batch, Draws, Signature
     from deconfounded.deconf.core.models import VariationalModel
     from deconfounded.deconf.core.nets import Adam, scalers
-    from deconfounded.deconf.methods.recurrent_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
+    from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
     from deconfounded.experts.rollout import Trials
 
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Exploration near the expert: a clone without memory, which cannot know theta, and some random actions."""
+"""Exploration near the expert's trajectories, blind to theta: a memoryless clone with some random actions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from deconfounded.experts.rollout import Trials
 SHARE = 0.25  # of actions that are random
 
 
-class Wanderer(MemorylessAgent):
-    """Random actions alone seldom come to where experts go; a clone alone tries nothing."""
+class ExplorationPolicy(MemorylessAgent):
+    """A clone with random actions. These alone seldom go where experts go; a clone alone varies too little."""
 
     def choose(self, obs: Tensor) -> Tensor:
         return self.policy.signature.randomise(super().choose(obs), SHARE, self._draws)
 
 
-def fit(trials: Trials, config: MemorylessConfig, rng: Rngs) -> Wanderer:
-    """Clone the expert without memory, as the basis of exploration."""
+def fit(trials: Trials, config: MemorylessConfig, rng: Rngs) -> ExplorationPolicy:
+    """Clone the expert without memory, as an exploration policy."""
     clone = memoryless_bc.train(trials, config, rng)
-    return Wanderer(clone.policy, clone.scaler, None)
+    return ExplorationPolicy(clone.policy, clone.scaler, None)

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from deconfounded.deconf.methods.gail_ppo import TrialVecEnv
 
 Space = spaces.Box | spaces.Discrete
-MakeEnvironments = Callable[[int, int], Environments]
-"""Makes environments of the seed of an index; the second number counts them."""
+Make = Callable[[int, int], Environments]
+"""Makes environments for the seed of an index: that many."""
 
 
 @dataclass(frozen=True)
@@ -182,12 +182,7 @@ class Discriminator(nn.Module):
 
 
 def train(
-    trials: Trials,
-    environments: MakeEnvironments,
-    space: Space,
-    config: GailConfig,
-    rng: Rngs,
-    monitor: Monitor | None = None,
+    trials: Trials, environments: Make, space: Space, config: GailConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> GailAgent:
     """Adversarial imitation, in rounds of PPO and of the discriminator.
 

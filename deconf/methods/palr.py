@@ -16,7 +16,7 @@ from deconfounded.deconf.core.data import Batch, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.recurrent_bc import RecurrentAgent, RecurrentConfig, train_recurrent
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 @dataclass(frozen=True)
