@@ -68,7 +68,7 @@ class Witness(ExpertAgent):
         super().reset(rngs)
         if self.dynamics:
             self.beliefs.append(np.exp(self.log_belief))
-            self.log_belief = self.grid.drifted(self.log_belief)
+            self.log_belief = self.grid.predict(self.log_belief)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state

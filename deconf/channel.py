@@ -1,4 +1,4 @@
-"""The guest's end of the wall: what a method from outside asks for, and its agent, over a connection."""
+"""A guest's end of the connection: requests of a method from outside for data, and calls of its agent."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from deconfounded.deconf.wire import pack
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent
 
-ANSWERED = ("act", "features")
+RETURNING = ("act", "features")  # calls whose result is sent back
 
 
 class ChannelMonitor(Monitor):
-    """Sends progress; a method from outside keeps no checkpoint."""
+    """Sends progress over the connection; a method from outside has no checkpoints."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
@@ -27,35 +27,38 @@ class ChannelMonitor(Monitor):
 
 
 class ChannelAsk:
-    """Asks at the other end, and is the agent for it meanwhile. Raises InputError while it waits, or once closed."""
+    """Requests data over the connection, and meanwhile serves the agent that is rolled out for it.
+
+    Raises InputError for a request during another, or after `close`.
+    """
 
     def __init__(self, channel: Connection) -> None:
         self._channel: Connection | None = channel
 
-    def __call__(self, kind: str, *what: Any, agent: Agent | None = None) -> Any:
+    def __call__(self, kind: str, *details: Any, agent: Agent | None = None) -> Any:
         channel, self._channel = self._channel, None
         if channel is None:
             raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
         try:
-            channel.send_bytes(pack([kind, agent is not None, *what]))
+            channel.send_bytes(pack([kind, agent is not None, *details]))
             return serve(channel, agent)
         finally:
             self._channel = channel
 
     def close(self) -> None:
-        """Fitting is over."""
+        """Refuse requests from now on: fitting is over."""
         self._channel = None
 
 
 def serve(channel: Connection, agent: Agent | None) -> Any:
-    """Be the agent for the other end, until it says that this is over; returns what it sends with that."""
+    """Call the agent as the other end asks, until its message `over`; returns the data of that message."""
     while True:
-        asked, *given = channel.recv()
-        if asked == "over":
-            return given[0]
-        if asked == "refused":
-            raise InputError(given[0])
-        if asked == "reset":
-            given = [[np.random.default_rng(seed) for seed in given[0]]]
-        answer = getattr(agent, asked)(*given)
-        channel.send_bytes(pack(["done", answer if asked in ANSWERED else None, time.process_time()]))
+        call, *arguments = channel.recv()
+        if call == "over":
+            return arguments[0]
+        if call == "refused":
+            raise InputError(arguments[0])
+        if call == "reset":
+            arguments = [[np.random.default_rng(seed) for seed in arguments[0]]]
+        result = getattr(agent, call)(*arguments)
+        channel.send_bytes(pack(["done", result if call in RETURNING else None, time.process_time()]))
