@@ -7,8 +7,8 @@ belief.
 
 from __future__ import annotations
 
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Rngs, Source
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent

@@ -1,0 +1,123 @@
+"""A guest's end of the connection: requests of a method from outside for data, and calls of its agent."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from multiprocessing.connection import Client, Connection
+from typing import Any
+
+import numpy as np
+
+from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.wire import pack
+from deconfounded.envs.support.errors import InputError, error_line
+from deconfounded.experts.rollout import Agent
+
+RETURNING = ("act", "features")  # calls whose result is sent back
+
+
+class ChannelMonitor(Monitor):
+    """Sends progress over the connection; a method from outside has no checkpoints."""
+
+    def __init__(self, channel: Connection) -> None:
+        self._channel = channel
+
+    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+        self._channel.send_bytes(pack(["progress", done / total, losses]))
+
+
+class ChannelAsk:
+    """Requests data over the connection, and meanwhile serves the agent that is rolled out for it.
+
+    Raises InputError for a request during another, or after `close`.
+    """
+
+    def __init__(self, channel: Connection) -> None:
+        self._channel: Connection | None = channel
+
+    def __call__(self, kind: str, *details: Any, agent: Agent | None = None) -> Any:
+        channel, self._channel = self._channel, None
+        if channel is None:
+            raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
+        try:
+            channel.send_bytes(pack([kind, agent is not None, *details]))
+            return serve(channel, agent)
+        finally:
+            self._channel = channel
+
+    def close(self) -> None:
+        """Refuse requests from now on: fitting is over."""
+        self._channel = None
+
+
+def serve(channel: Connection, agent: Agent | None) -> Any:
+    """Call the agent as the other end asks, until its message `over`; returns the data of that message."""
+    while True:
+        call, *arguments = channel.recv()
+        if call == "over":
+            return arguments[0]
+        if call == "refused":
+            raise InputError(arguments[0])
+        if call == "reset":
+            arguments = [[np.random.default_rng(seed) for seed in arguments[0]]]
+        result = getattr(agent, call)(*arguments)
+        channel.send_bytes(pack(["done", result if call in RETURNING else None, time.process_time()]))
+
+
+def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
+    """Fit the method, then serve its agent until the connection is closed."""
+    from deconfounded.deconf.given import Given
+    from deconfounded.deconf.method import Method
+    from deconfounded.envs.support import outside
+    from deconfounded.experts.store import save
+
+    def send(*message: Any) -> None:
+        with contextlib.suppress(OSError):  # the other end is gone
+            channel.send_bytes(pack(list(message)))
+
+    try:
+        fit, ask, rngs = outside.find("method", reference), ChannelAsk(channel), [np.random.default_rng(about["rng"])]
+        config = getattr(fit, "method", Method(())).config(about["config"])
+        agent = fit(Given(ask, about, config, rngs, ChannelMonitor(channel)))
+        ask.close()
+        if not isinstance(agent, Agent):
+            raise InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
+        send("fitted")
+        while True:
+            folder, described = serve(channel, agent)
+            try:
+                save(agent, folder, **described)
+                send("done", "", time.process_time())
+            except Exception as error:
+                send("done", error_line(error), time.process_time())
+    except (Exception, SystemExit) as error:  # among them that the other end is gone
+        send("failed", error_line(error))
+
+
+def _end_with_parent() -> None:
+    """End with the parent, when standard input closes. It is read without Python's locks, which forks inherit."""
+    while os.read(0, 1):
+        pass
+    if hasattr(os, "killpg"):
+        os.killpg(0, signal.SIGKILL)  # this process leads a session
+    os._exit(1)
+
+
+def main() -> None:
+    """Connect to the run that started this process, and serve its requests."""
+    line = b""
+    while not line.endswith(b"\n") and (more := os.read(0, 65536)):
+        line += more
+    settings, sys.stdin = json.loads(line), open(os.devnull, encoding="utf-8")  # noqa: SIM115
+    sys.path[:] = settings["path"]
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with contextlib.suppress(AttributeError):  # characters that the output's encoding lacks are escaped
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+    with Client(settings["address"], authkey=bytes.fromhex(settings["key"])) as channel:
+        live(settings["reference"], channel, channel.recv())
