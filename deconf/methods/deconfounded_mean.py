@@ -105,13 +105,13 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
     index = batch.draw_steps(config.inference_steps, draws)  # of the latents
     steps = batch.mask.shape[2]
     inside = index % steps + offset < steps
-    then = batch.steps(torch.where(inside, index + offset, index))
-    mask = then.mask * inside
-    out = model.dynamics(then.obs, then.action, take_steps(theta_hat, index))[..., 0, :]
+    target = batch.steps(torch.where(inside, index + offset, index))
+    mask = target.mask * inside
+    out = model.dynamics(target.obs, target.action, take_steps(theta_hat, index))[..., 0, :]
     if model.inputs.signature.binary:
-        error = (torch.sigmoid(out) - then.next_obs).square().mean(-1)
+        error = (torch.sigmoid(out) - target.next_obs).square().mean(-1)
     else:
-        error = (out - model.dynamics.change(then.next_obs - then.obs)).square().mean(-1)
+        error = (out - model.dynamics.change(target.next_obs - target.obs)).square().mean(-1)
     return ahead * masked_mean(error, mask) + config.beta * kl
 
 
