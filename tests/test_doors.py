@@ -22,11 +22,11 @@ from deconfounded.benchmarks.engine.scheduler import run_job
 from deconfounded.deconf import methods
 from deconfounded.deconf.core.data import Draws
 from deconfounded.deconf.core.nets import Adam, Linear
-from deconfounded.deconf.methods import cloning, deconfounded, deconfounded_mean, naive_rnn
-from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods import deconfounded, deconfounded_mean, memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
@@ -365,7 +365,7 @@ class TestTraining:
             lambda: deconfounded.train(trials, lambda agent: None, config, rng),  # type: ignore[arg-type,return-value]
             lambda: deconfounded_mean.train(trials, lambda agent: None, MeanConfig(), rng),  # type: ignore[arg-type,return-value]
             lambda: naive_rnn.train(lambda: None, RecurrentConfig(), rng),  # type: ignore[arg-type,return-value]
-            lambda: cloning.train(None, CloningConfig(), rng),  # type: ignore[arg-type]
+            lambda: memoryless_bc.train(None, MemorylessConfig(), rng),  # type: ignore[arg-type]
         ):
             with pytest.raises(envs.InputError, match="trials were None; they must be Trials"):
                 call()
@@ -374,9 +374,9 @@ class TestTraining:
         """Training ends there, in a line that names the loss and the update: no agent of NaN comes of it."""
         rng = np.random.default_rng(0)
         trials = Trials(rng.normal(size=(2, 1, 4, 3)), rng.uniform(-1, 1, (2, 1, 3, 1)), MASK)
-        config = CloningConfig(updates=20, batch=4, learning_rate=1e30)
+        config = MemorylessConfig(updates=20, batch=4, learning_rate=1e30)
         with pytest.raises(envs.InputError, match=r"the loss of ActionHead failed in update [2-5]: it was (nan|inf)"):
-            cloning.train(trials, config, [np.random.default_rng(0), np.random.default_rng(1)])
+            memoryless_bc.train(trials, config, [np.random.default_rng(0), np.random.default_rng(1)])
 
     def test_a_gradient_that_is_not_a_number(self) -> None:
         """Of a finite loss: the root of 0 has none."""
