@@ -4,8 +4,6 @@ The suite's tasks are in tasks/; a task of your own stays in your folder: `get("
 package also registers every task with gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v1")` works.
 """
 
-from __future__ import annotations
-
 import os
 
 _gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` fails if the backend is missing, which only rendering needs

@@ -1,7 +1,5 @@
 """Interfaces of a BatchEnv: gymnasium Env and VectorEnv, and dm_env. They hold no maths of any task."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 

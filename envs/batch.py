@@ -1,7 +1,5 @@
 """N episodes of a task in lock step: seeding, theta, the time limit. All interfaces in adapters.py are built on it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

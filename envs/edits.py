@@ -1,7 +1,5 @@
 """Edits of MuJoCo models by a latent: in a compiled model, and in a specification before compilation."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 import mujoco

@@ -1,7 +1,5 @@
 """Hidden physical parameters and their distributions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """Process noise: normal on every coordinate of a joint; for rotations, on the tangent space at the outcome."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Batched MuJoCo: a model for each environment, stepped by mujoco.rollout's thread pool. No other file steps MuJoCo."""
 
-from __future__ import annotations
-
 import copy
 import os
 from abc import abstractmethod
@@ -34,7 +32,7 @@ def cores() -> int:
 class Physics(Simulator):
     """Models of n environments, each with its own theta, stepped in a thread pool of `cores()` threads."""
 
-    def __init__(self, task: MujocoTask, n: int) -> None:
+    def __init__(self, task: "MujocoTask", n: int) -> None:
         super().__init__(task, n)
         self._mujoco_task = task
         self.models = [copy.copy(task.model) for _ in range(n)]

@@ -1,7 +1,5 @@
 """The registry of tasks: `register`, `names`, `get`, `make`, `make_vec`, `make_dm`."""
 
-from __future__ import annotations
-
 import copyreg
 import difflib
 import re

@@ -1,7 +1,5 @@
 """Rendering of MuJoCo states without a screen: by EGL, else by OSMesa, else InputError."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

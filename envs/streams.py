@@ -1,7 +1,5 @@
 """Random numbers for a batch of rows in groups, with an independent generator for each group."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

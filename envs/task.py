@@ -11,8 +11,6 @@ is one integer column, so that actions are always [N, A]. A task holds no state 
 streams are passed in.
 """
 
-from __future__ import annotations
-
 import inspect
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -43,7 +41,7 @@ class Renderer(Protocol):
 class Simulator:
     """The noise-free part of p(s'|s, a, theta) for n environments, each with its own theta."""
 
-    def __init__(self, task: Task, n: int) -> None:
+    def __init__(self, task: "Task", n: int) -> None:
         self.task, self.theta = task, np.tile([lat.low for lat in task.latents], (n, 1)).astype(float)
 
     def set_theta(self, i: int, theta: Array) -> None:

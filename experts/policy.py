@@ -1,7 +1,5 @@
 """Experts, policies that see theta: the task's closed form if it has one, else a small network in safetensors."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from abc import ABC, abstractmethod

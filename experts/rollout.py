@@ -1,7 +1,5 @@
 """Roll-outs: trials, the data that imitators learn from; agents, which act in them; and the loop that runs them."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 from abc import ABC, abstractmethod
@@ -73,7 +71,7 @@ class Trials:
         return digest.hexdigest()
 
     @staticmethod
-    def from_minari(source: Path | str) -> Trials:
+    def from_minari(source: Path | str) -> "Trials":
         """The trials of a Minari data set's folder, without their thetas; see `experts.datasets.read`."""
         from deconfounded.experts import datasets
 
@@ -86,7 +84,7 @@ class Trials:
         write_atomically(file, buffer.getvalue())
 
     @staticmethod
-    def load(file: Path, made_of: str | None = None) -> Trials:
+    def load(file: Path, made_of: str | None = None) -> "Trials":
         """Read what `save` wrote. Raises InputError if the file is missing or damaged, or its `made_of` differs."""
         try:
             with np.load(file, allow_pickle=False) as data:
@@ -97,7 +95,7 @@ class Trials:
             raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
 
 
-def joined(parts: Sequence[Trials]) -> Trials:
+def joined(parts: Sequence[Trials]) -> "Trials":
     """Concatenate trials of the same shape."""
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
     return Trials(obs, action, mask, parts[0].actions)
@@ -137,7 +135,7 @@ class Agent(ABC):
         raise InputError(f"{type(self).__name__} cannot be saved; give it `state` and `from_state`")
 
     @classmethod
-    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Agent:
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> "Agent":
         """The agent whose `state` this is."""
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 

@@ -1,7 +1,5 @@
 """Batched environments as a Stable-Baselines3 VecEnv, for fast training of experts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Saved agents: folders with agent.json and agent.safetensors, without pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 from pathlib import Path

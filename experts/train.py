@@ -1,7 +1,5 @@
 """Training of experts: PPO (Stable-Baselines3) on the privileged view, which has theta."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

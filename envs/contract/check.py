@@ -1,7 +1,5 @@
 """A quick check of a task, before anything is trained or measured: a slip in a task file is reported in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

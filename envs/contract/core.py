@@ -8,8 +8,6 @@ cannot be made here. Checks use the task alone, not the registry. Those of inter
 MuJoCo tasks in physics.py.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Checks of MuJoCo tasks: their model, its noise, and pictures of it."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Helpers of checks: actions, thetas and generators to test a task with, and assertions with a message."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager

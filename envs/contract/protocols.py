@@ -1,7 +1,5 @@
 """Checks of the interfaces: gymnasium, Stable-Baselines3 and dm_env, and that all of them agree."""
 
-from __future__ import annotations
-
 import unittest
 import warnings
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Handles of C++ resources (thread pools, GL contexts), each of which belongs to one process and one object in it."""
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import os

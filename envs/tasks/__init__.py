@@ -3,8 +3,6 @@
 A new task is a file here, an MJCF in assets/ and its name below. A task of your own can stay in your folder.
 """
 
-from __future__ import annotations
-
 import importlib
 
 from deconfounded.envs.registry import register

@@ -18,8 +18,6 @@ have noise of std .1. With goals as near as here, so little noise would reveal t
 without memory scored .91.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces

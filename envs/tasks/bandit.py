@@ -4,8 +4,6 @@ Tier 2. State and observation: the last pay-out (0 at the start). The reward cou
 score; the pay-out is in the observation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray

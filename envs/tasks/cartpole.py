@@ -1,7 +1,5 @@
 """The body of the cartpole tasks: a cart has to stay at a mark on its rail with its pole upright."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

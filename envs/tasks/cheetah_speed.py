@@ -16,8 +16,6 @@ The authors' version (Vuorio et al., TMLR 2024) has another engine, trials of a 
 reward -|v - theta| - .05 |a|^2, with the same optimum; its indicator starts at -1 and has the opposite sign.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces

@@ -13,8 +13,6 @@ past the hog line, which ends the episode; 0 for one that is not there after 100
 .001, by the square of the push.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -12,8 +12,6 @@ Action: the hand's speed, in units of 3 m/s around 2 m/s. Reward: .8 exp(-12.5 d
 which goes at 1.5 to 2.5 m/s. An episode is 5 s, and ends with the sled 1.2 m off the target.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

@@ -8,8 +8,6 @@ can query the expert there (`dagger`) learns to use it.
 Latent: side, 0 is left and 1 is right. Noise and reward as in `Puck`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from deconfounded.envs.edits import Edit

@@ -12,8 +12,6 @@ Action: the hook's speed, in units of 3 m/s. Reward: .8 exp(-12.5 d^2) + .2 exp(
 with a load dropped or thrown, 1.2 m off the target.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

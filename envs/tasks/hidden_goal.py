@@ -5,8 +5,6 @@ policy never learns theta, and a naive clone follows its own first steps. A meth
 theta. Latent: direction, rad from straight ahead, uniform. Noise and reward as in `Puck`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from deconfounded.envs.edits import Edit

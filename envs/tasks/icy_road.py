@@ -15,8 +15,6 @@ Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m.
 m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces

@@ -12,8 +12,6 @@ Action: the speed of the wheel's rim, from 0 (at -1) to 6 m/s (at 1): there is n
 .9 exp(-8 d^2) + .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m beyond the line.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

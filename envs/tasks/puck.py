@@ -1,7 +1,5 @@
 """The body of the puck tasks: a puck on a plane, pushed along x and y, has to reach a hidden goal."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 
 import numpy as np

@@ -10,8 +10,6 @@ nothing, and has no noise. Velocities of the pole and of the axle have noise of 
 reward are as in `Cartpole`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from deconfounded.envs.edits import Edit

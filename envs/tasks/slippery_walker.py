@@ -16,8 +16,6 @@ d = x / .06 m and a = (pitch - slope) / .08 rad, less .1 times the mean square o
 ends with the torso below 1 m or pitched by more than .6 rad.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 from importlib.util import find_spec
 

@@ -19,8 +19,6 @@ less .05 times the mean square of both thrusts, in units of the largest. An epis
 than .8 rad, near the ground at more than 1 m/s, or 5 m off.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray

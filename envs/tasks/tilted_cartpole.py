@@ -7,8 +7,6 @@ through process noise.
 Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward: upright * (.3 + .7 at the mark).
 """
 
-from __future__ import annotations
-
 from deconfounded.envs.edits import Edit
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array

@@ -10,8 +10,6 @@ Action: throttle, from -1 for none to 1 for all; the lander weighs 9.81 N. Rewar
 + .1 exp(-|d| / 3). An episode is 3.5 s, and ends .5 m below the mark.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

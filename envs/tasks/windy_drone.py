@@ -14,8 +14,6 @@ They are spread over four rotors of 0 to 6 N. Reward: .7 exp(-(d / .25)^2 / 2) +
 episode is 125 steps of .04 s, and ends 1.5 m off, or tilted by more than a right angle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
