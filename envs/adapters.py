@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deconfounded.envs.batch import BatchEnv, check_number
+from deconfounded.envs.streams import Mask
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Renderer, Task
 
@@ -43,7 +44,7 @@ class _Pictures:
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_renderers": {}}  # a copy creates its own
 
-    def act(self, action: NDArray[Any], alive: NDArray[np.bool_]) -> None:
+    def act(self, action: NDArray[Any], alive: Mask) -> None:
         """Store the actions [N, A] of the environments that were stepped, `alive` [N], for the next pictures."""
         self._action = np.where(alive[:, None], action, self._action)
 
@@ -124,9 +125,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
         return obs, {}
 
-    def step(
-        self, actions: Any
-    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[NDArray[np.float32], NDArray[Any], Mask, Mask, dict[str, Any]]:
         array = np.asarray(actions)
         rows = array[:, None] if array.ndim == 1 else array
         alive = self.batch.alive

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 
@@ -69,7 +69,7 @@ class BatchEnv:
         self,
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-        where: NDArray[np.bool_] | None = None,
+        where: Mask | None = None,
     ) -> NDArray[np.float32]:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
@@ -113,7 +113,7 @@ class BatchEnv:
         self._steps[rows], self.alive[rows] = 0, True
         return self.observe()
 
-    def _keep_mask(self, keep: object) -> NDArray[np.bool_]:
+    def _keep_mask(self, keep: object) -> Mask:
         """True, False or booleans [N] -> booleans [N]. Raises InputError for anything else."""
         try:
             mask = np.asarray(keep)
@@ -133,7 +133,7 @@ class BatchEnv:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
 
-    def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def step(self, action: object) -> tuple[NDArray[np.float32], Array, Mask, Mask]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
         Environments whose episode is over are not stepped, whatever their action. Actions out of [-1, 1] are clipped.
@@ -142,7 +142,7 @@ class BatchEnv:
         ended = self.advance(action)
         return self.observe(), *ended
 
-    def advance(self, action: object) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def advance(self, action: object) -> tuple[Array, Mask, Mask]:
         """`step` without the observation, for a caller that resets ended episodes before it observes."""
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
@@ -116,7 +116,7 @@ class Task(ABC):
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         """Reward [N] of a step, at most 1. It is for scoring: imitators never see it."""
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         """Whether the episode ends in a state [N, S] -> [N]; by default never."""
         return np.zeros(len(state), bool)
 
@@ -225,7 +225,7 @@ class Task(ABC):
                 )
         return array
 
-    def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
+    def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:
         """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist.
 
         ignored [N]: rows that are not used, and that may hold any number.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.batch import generators
-from deconfounded.envs.streams import Array, Streams, unseeded
+from deconfounded.envs.streams import Array, Mask, Streams, unseeded
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.envs.task import action_sizes
 from deconfounded.experts.policy import Expert
@@ -31,7 +31,7 @@ class Trials:
 
     obs: NDArray[np.float32]
     action: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    mask: Mask
     actions: int = 0
 
     def __post_init__(self) -> None:
@@ -122,7 +122,7 @@ class Agent(ABC):
         """Observation [N, O] -> action [N, A]."""
 
     def observe(  # noqa: B027 (agents without memory need nothing here)
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: Mask
     ) -> None:
         """Take in a transition of each trial; where `alive` [N] is False, the episode had ended before it."""
 

@@ -8,9 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Renderer, Task
+from deconfounded.envs.task import Array, Latent, Renderer, Streams, Task
 
 ARMS = 5
 

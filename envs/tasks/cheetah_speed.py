@@ -23,11 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Renderer
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Renderer, Streams
 from deconfounded.envs.tasks import gymnasium_body
 
 WRONG = 0.2  # probability

@@ -14,12 +14,9 @@ past the hog line, which ends the episode; 0 for one that is not there after 100
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 START, TEE = -3.0, 7.0  # m from the hog line
 HOUSE = 1.7  # m
@@ -55,6 +52,6 @@ class Curling(MujocoTask):
         landed = np.exp(-0.5 * (off / HOUSE) ** 2) * self.terminated(next_state)
         return landed - EFFORT * np.square(self.control(action)[:, 0])
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         """Whether the stone is past the hog line and at rest."""
         return (self.qpos(state, "slide") > 0) & (self.qvel(state, "slide") <= 0)

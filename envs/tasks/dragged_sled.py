@@ -14,13 +14,10 @@ which goes at 1.5 to 2.5 m/s. An episode is 5 s, and ends with the sled 1.2 m of
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 MIDDLE, SPEED = 2.0, 3.0  # of the hand, m/s
 LOST = 1.2  # m
@@ -68,5 +65,5 @@ class DraggedSled(MujocoTask):
         off = self._off(next_state)
         return 0.8 * np.exp(-0.5 * (off / 0.2) ** 2) + 0.2 * np.exp(-off)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self._off(state) > LOST

@@ -13,12 +13,9 @@ with a load dropped or thrown, 1.2 m off the target.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 SPEED = 3.0  # m/s
 LOST = 1.2  # m
@@ -64,5 +61,5 @@ class HeavyPayload(MujocoTask):
         off = self._off(next_state)
         return 0.8 * np.exp(-0.5 * (off / 0.2) ** 2) + 0.2 * np.exp(-off)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self._off(state) > LOST

@@ -7,9 +7,8 @@ theta. Latent: direction, rad from straight ahead, uniform. Noise and reward as 
 
 import numpy as np
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent
 from deconfounded.envs.tasks.puck import Puck
 
 

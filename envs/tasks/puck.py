@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Array, Streams
 
 
 class Puck(MujocoTask):

@@ -12,9 +12,8 @@ reward are as in `Cartpole`.
 
 import numpy as np
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent, Streams
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 SPIN = 10.0  # rad/s

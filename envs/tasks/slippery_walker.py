@@ -22,14 +22,11 @@ from importlib.util import find_spec
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
 from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s
@@ -98,6 +95,6 @@ class SlipperyWalker(MujocoTask):
         there = np.exp(-0.5 * (x / 0.06) ** 2 - 0.5 * (lean / 0.08) ** 2)
         return 0.1 + 0.9 * there - 0.1 * np.square(action).mean(-1)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         fallen = HEIGHT + self.qpos(state, "rootz") < 1.0
         return fallen | (np.abs(self.qpos(state, "rooty")) > 0.6)

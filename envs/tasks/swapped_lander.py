@@ -21,12 +21,9 @@ than .8 rad, near the ground at more than 1 m/s, or 5 m off.
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 JOINTS = ("x", "z", "pitch")
 MAIN = 5.0  # N
@@ -67,7 +64,7 @@ class SwappedLander(MujocoTask):
         thrust = np.square(self.control(action) / (MAIN, 1)).mean(-1)
         return upright * (0.2 * np.exp(-off / 2) + 0.8 * np.exp(-0.5 * (off / 0.5) ** 2)) - 0.05 * thrust
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         x, z, pitch = (self.qpos(state, joint) for joint in JOINTS)
         hard = (z < LOW) & (self.qvel(state, "z") < -SPEED)
         return hard | (np.abs(pitch) > TILT) | (np.hypot(x, z) > FAR)

@@ -11,12 +11,9 @@ Action: throttle, from -1 for none to 1 for all; the lander weighs 9.81 N. Rewar
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 RADAR = 2.0  # m, as far as it reaches
 GROUND = -0.5  # m
@@ -50,5 +47,5 @@ class WeakThruster(MujocoTask):
         off = np.abs(self.qpos(next_state, "height"))
         return 0.9 * np.exp(-0.5 * (off / 0.25) ** 2) + 0.1 * np.exp(-off / 3)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self.qpos(state, "height") < GROUND
