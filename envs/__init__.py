@@ -17,39 +17,10 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.check import check_task
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.registry import (
-    TASKS,
-    closest,
-    get,
-    make,
-    make_dm,
-    make_registered_vec,
-    make_vec,
-    names,
-    register,
-)
+from deconfounded.envs.registry import TASKS, closest, get, make, make_dm, make_vec, names, register
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 from deconfounded.envs.tasks import SUITE
 
-__all__ = [
-    "SUITE",
-    "TASKS",
-    "BatchEnv",
-    "DmEnv",
-    "GymEnv",
-    "GymVectorEnv",
-    "InputError",
-    "Latent",
-    "MujocoTask",
-    "Task",
-    "check_task",
-    "closest",
-    "get",
-    "make",
-    "make_dm",
-    "make_registered_vec",
-    "make_vec",
-    "names",
-    "register",
-]
+__all__ = ["SUITE", "TASKS", "BatchEnv", "DmEnv", "GymEnv", "GymVectorEnv", "InputError", "Latent"]
+__all__ += ["MujocoTask", "Task", "check_task", "closest", "get", "make", "make_dm", "make_vec", "names", "register"]

@@ -19,11 +19,8 @@ from deconfounded.envs.task import Renderer, Task
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
-    base = task.observation_space
-    if not privileged:
-        return base
-    low, high = np.append(base.low, [-1.0] * task.theta_width), np.append(base.high, [1.0] * task.theta_width)
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    base, more = task.observation_space, np.ones(task.theta_width if privileged else 0, np.float32)
+    return spaces.Box(np.append(base.low, -more), np.append(base.high, more))
 
 
 def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
@@ -38,15 +35,10 @@ class _Pictures:
 
     def __init__(self, batch: BatchEnv) -> None:
         self._batch = batch
-        self._action = np.zeros((batch.n, batch.task.action_width))
         self._renderers: dict[int, tuple[NDArray[Any], Renderer]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_renderers": {}}  # a copy creates its own
-
-    def act(self, action: NDArray[Any], alive: Mask) -> None:
-        """Store the actions [N, A] of the environments that were stepped, `alive` [N], for the next pictures."""
-        self._action = np.where(alive[:, None], action, self._action)
 
     def __call__(self, i: int) -> NDArray[np.uint8]:
         """Environment i -> [H, W, 3]. Raises InputError before the first reset, and where no picture can be made."""
@@ -55,7 +47,7 @@ class _Pictures:
         theta = self._batch.theta[i].copy()
         if i not in self._renderers or (self._renderers[i][0] != theta).any():
             self._renderers[i] = theta, self._batch.task.renderer(theta)
-        return self._renderers[i][1](self._batch.state[i], self._action[i])
+        return self._renderers[i][1](self._batch.state[i], self._batch.action[i])
 
 
 class GymEnv(gym.Env[Any, Any]):
@@ -77,16 +69,12 @@ class GymEnv(gym.Env[Any, Any]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         super().reset(seed=seed)
-        obs = self.batch.reset(seed, options)[0]
         self._warned = False
-        return obs, {}
+        return self.batch.reset(seed, options)[0], {}
 
     def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        alive, row = self.batch.alive, np.asarray(action)
-        row = np.reshape(row, (1, 1)) if row.size == 1 else row[None]
-        obs, reward, terminated, truncated = self.batch.step(row)
-        if self.render_mode is not None:
-            self._pictures.act(row, alive)
+        row, alive = np.asarray(action), self.batch.alive
+        obs, reward, terminated, truncated = self.batch.step(row.reshape(1, 1) if row.size == 1 else row[None])
         if not alive[0] and not self._warned:
             gym.logger.warn(f"step of {self.task.name} was called after the end of an episode; it moves nothing: reset")
             self._warned = True
@@ -126,12 +114,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return obs, {}
 
     def step(self, actions: Any) -> tuple[NDArray[np.float32], NDArray[Any], Mask, Mask, dict[str, Any]]:
-        array = np.asarray(actions)
-        rows = array[:, None] if array.ndim == 1 else array
-        alive = self.batch.alive
-        ended = self.batch.advance(rows)
-        if self.render_mode is not None:
-            self._pictures.act(rows, alive)
+        rows, alive = np.asarray(actions), self.batch.alive
+        ended = self.batch.advance(rows[:, None] if rows.ndim == 1 else rows)
         if alive.all():
             return self.batch.observe(), *ended, {}
         keep = self._episode < self.episodes
@@ -159,24 +143,22 @@ class DmEnv(dm_env.Environment):
     def step(self, action: Any) -> dm_env.TimeStep:
         if not self._batch.alive[0]:
             return self.reset()
-        alive, row = self._batch.alive, np.reshape(action, (1, -1))
-        obs, reward, terminated, truncated = self._batch.step(row)
-        self._pictures.act(row, alive)
-        if terminated[0]:
-            return dm_env.termination(float(reward[0]), obs[0])
-        end = dm_env.truncation if truncated[0] else dm_env.transition
-        return end(float(reward[0]), obs[0])
+        obs, reward, terminated, truncated = self._batch.step(np.reshape(action, (1, -1)))
+        ended = dm_env.truncation if truncated[0] else dm_env.transition
+        return (dm_env.termination if terminated[0] else ended)(float(reward[0]), obs[0])
 
     def render(self) -> NDArray[np.uint8]:
         """The picture [H, W, 3] of the present state. Raises InputError before the first reset."""
         return self._pictures(0)
 
     def observation_spec(self) -> specs.BoundedArray:
-        space = self._space
-        return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
+        return _spec(self._space, "observation")
 
     def action_spec(self) -> specs.BoundedArray:
-        space = self.task.action_space
-        if isinstance(space, spaces.Box):
-            return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "action")
-        return specs.DiscreteArray(self.task.n_actions, name="action")
+        return _spec(self.task.action_space, "action")
+
+
+def _spec(space: spaces.Box | spaces.Discrete, name: str) -> specs.BoundedArray:
+    if isinstance(space, spaces.Discrete):
+        return specs.DiscreteArray(int(space.n), name=name)
+    return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, name)

@@ -33,8 +33,9 @@ def generators(seed: int | None) -> list[np.random.Generator]:
 class BatchEnv:
     """N environments of one task; each has its own theta and three random streams (theta, start, noise).
 
-    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `alive` [N], whether the
-    episode goes on. An environment whose episode has ended keeps its row, has reward 0, and waits for `reset`.
+    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `action` [N, A], the last one
+    taken, for pictures; `alive` [N], whether the episode goes on. An environment whose episode has ended keeps its row,
+    has reward 0, and waits for `reset`.
     """
 
     def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
@@ -44,6 +45,7 @@ class BatchEnv:
         self.simulator = task.simulator(n)
         self.alive = np.zeros(n, bool)
         self.state: Array = np.zeros((n, 0))
+        self.action = np.zeros((n, task.action_width))
         self._steps, self._all_rows = np.zeros(n, int), np.arange(n)
         self._noise: Array = np.zeros((n, 0, 0))
         self._streams: list[list[np.random.Generator]] = []
@@ -151,6 +153,7 @@ class BatchEnv:
         rows = np.flatnonzero(self.alive) if over.any() else None
         on = slice(None) if rows is None else rows
         before, taken, noise = self.state[on], checked[on], self._noise[self._all_rows[on], self._steps[on]]
+        self.action[on] = taken
         after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
         after = task.sense(after, self.theta[on], noise)
         reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)

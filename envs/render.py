@@ -30,8 +30,7 @@ def backend() -> str:
     raise InputError(f"no GL for pictures: tried {selected or 'egl and osmesa'}; install libegl1 or libosmesa6")
 
 
-_GL_PROCESSES: set[int] = set()
-"""Ids of processes that have created a GL context: this process, and those that it was forked from."""
+_GL_PROCESSES: set[int] = set()  # that created a GL context: this process, and those that it was forked from
 
 
 def _create(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
@@ -98,15 +97,19 @@ def chequer(spec: mujoco.MjSpec, material: str) -> None:
     spec.material(material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material
 
 
+def gravity_in_view(model: mujoco.MjModel) -> Array:
+    """Gravity [3] as the camera `view` sees it: to the right, up, and towards the camera."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model.opt.gravity @ data.cam_xmat[model.camera("view").id].reshape(3, 3)
+
+
 def level(model: mujoco.MjModel) -> None:
     """Roll the camera `view` until gravity points down in its picture, unless there is none across the view."""
-    view, data = model.camera("view"), mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    right, up, _ = model.opt.gravity @ data.cam_xmat[view.id].reshape(3, 3)
-    if np.hypot(right, up) <= 1e-6 * np.linalg.norm(model.opt.gravity):
-        return
-    roll, before = np.arctan2(right, -up) / 2, view.quat.copy()
-    mujoco.mju_mulQuat(view.quat, before, np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
+    right, up, _ = gravity_in_view(model)
+    if np.hypot(right, up) > 1e-6 * np.linalg.norm(model.opt.gravity):
+        roll, quat = np.arctan2(right, -up) / 2, model.camera("view").quat
+        mujoco.mju_mulQuat(quat, quat.copy(), np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
 
 
 class MujocoRenderer:

@@ -4,11 +4,12 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
@@ -29,11 +30,9 @@ def same(left: object, right: object, what: str) -> None:
     a, b = np.asarray(left), np.asarray(right)
     require(a.shape == b.shape, f"{what} differ: their shapes are {a.shape} and {b.shape}")
     places = np.argwhere((a != b) & ((a == a) | (b == b)))
-    if len(places):
-        at = tuple(places[0].tolist())
-        raise AssertionError(
-            f"{what} differ: {a[at]} and {b[at]} at {list(at)}, the first of {len(places)} such places"
-        )
+    for at in places[:1].tolist():
+        first = f"{a[tuple(at)]} and {b[tuple(at)]} at {at}, the first of {len(places)} such places"
+        raise AssertionError(f"{what} differ: {first}")
 
 
 @contextmanager
@@ -56,18 +55,17 @@ def reported_by(checker: str) -> Iterator[None]:
         raise AssertionError(f"{checker}: {' '.join(str(error).split())} ({type(error).__name__})") from error
 
 
-def physics(task: Task) -> MujocoTask:
-    """The task, if it is a MujocoTask. Raises Skipped otherwise."""
-    if not isinstance(task, MujocoTask):
-        raise Skipped("this check is for MuJoCo tasks")
-    return task
-
-
 def actions(task: Task, n: int, steps: int) -> Array:
     """Random actions [steps, n, A], the same for the same arguments."""
     rng = np.random.default_rng(99)
     shape = (steps, n, task.action_width)
     return rng.integers(task.n_actions, size=shape).astype(float) if task.n_actions else rng.uniform(-1, 1, shape)
+
+
+def observations(task: Task, acts: Array, seed: int, **options: Any) -> Array:
+    """Observations [T + 1, N, O] of environments that are reset with a seed and options, and take actions [T, N, A]."""
+    batch = BatchEnv(task, acts.shape[1])
+    return np.array([batch.reset(seed, options)] + [batch.step(action)[0] for action in acts])
 
 
 def far_thetas(task: Task) -> Array:
@@ -91,13 +89,8 @@ def gl_works() -> bool:
 
 def beyond_bounds(task: Task, state: Array) -> str:
     """A message about an observation of states [N, S] that is out of its bounds by more than 1e-3, or ""."""
-    if not len(state):
-        return ""
-    seen = task.observe(state)
-    for i, (name, (low, high)) in enumerate(task.observation.items()):
-        if (bad := ~((seen[:, i] >= low - 1e-3) & (seen[:, i] <= high + 1e-3))).any():
-            return (
-                f"observation {name} of {task.name} was {seen[bad, i][0]:g}; its bounds, {low:g} to {high:g}, must be"
-                f" wide enough never to clip"
-            )
+    for seen, (name, (low, high)) in zip(task.observe(state).T, task.observation.items(), strict=True):
+        for bad in seen[~((seen >= low - 1e-3) & (seen <= high + 1e-3))][:1]:
+            right = f"its bounds, {low:g} to {high:g}, must be wide enough never to clip"
+            return f"observation {name} of {task.name} was {bad:g}; {right}"
     return ""
