@@ -95,13 +95,13 @@ def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[t
     q, v = columns(model, joint)
     parts = {1: [q, v], 4: [q, v], 7: [q[:3], q[3:], v[:3], v[3:]]}[len(q)]
     kind = KINDS[mujoco.mjtJoint(int(model.joint(joint).type[0]))]
-    was = f"process_noise of joint {joint}, a {kind.name} joint, was {stds}; it must be"
+    was = f"process_noise of joint {joint}, a {kind.name} joint, was {stds}; "
     if len(stds) != len(kind.stds):
-        raise InputError(f"{was} {len(kind.stds)} standard deviations: {', '.join(kind.stds)}")
+        raise InputError(f"{was}it must be {len(kind.stds)} standard deviations: {', '.join(kind.stds)}")
     if not all(0 <= std < np.inf for std in stds):
-        raise InputError(f"{was} standard deviations, from 0 up")
+        raise InputError(f"{was}it must be standard deviations, from 0 up")
     if any(std > MAX_ROTATION_STD for part, std in zip(parts, stds, strict=True) if len(part) == 4):
-        raise InputError(f"{was} at most {MAX_ROTATION_STD} rad of a rotation")
+        raise InputError(f"{was}its rotation's must be at most {MAX_ROTATION_STD} rad")
     return list(zip(parts, stds, strict=True))
 
 

@@ -13,6 +13,7 @@ streams are passed in.
 
 import inspect
 from abc import ABC, abstractmethod
+from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -192,10 +193,7 @@ class Task(ABC):
 
     def transition(self, k: int) -> Array:
         """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next episode | theta of this episode)."""
-        matrix: Array = np.ones((1, 1))
-        for lat in self.latents:
-            matrix = np.kron(matrix, lat.transition(self._values_each(k)))
-        return matrix
+        return reduce(np.kron, (lat.transition(self._values_each(k)) for lat in self.latents))
 
     def encode_theta(self, theta: Array) -> Array:
         """Features [..., F] of theta [..., L], of about unit size, for experts and oracles alone."""
@@ -209,20 +207,13 @@ class Task(ABC):
                 raise TypeError
             array = np.broadcast_to(array.astype(float), (n, len(self.latents))).copy()
         except (TypeError, ValueError):
-            raise InputError(
-                f"theta of {self.name} was {theta!r}; it must be {len(self.latents)} number(s), or one row for each"
-                f" of the {n} environment(s)"
-            ) from None
-        for i, lat in enumerate(self.latents):
-            bad = ~((array[:, i] >= lat.low) & (array[:, i] <= lat.high))
-            if lat.distribution == "categorical":
-                bad |= array[:, i] != np.floor(array[:, i])
-            if bad.any():
-                kind = "a whole number" if lat.distribution == "categorical" else "a number"
-                raise InputError(
-                    f"{lat.name} of {self.name} was {array[bad, i][0]:g}; it must be {kind} from {lat.low:g} to"
-                    f" {lat.high:g} {lat.unit}".rstrip()
-                )
+            right = f"{len(self.latents)} number(s), or one row for each of the {n} environment(s)"
+            raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
+        for column, lat in zip(array.T, self.latents, strict=True):
+            whole = lat.distribution == "categorical"
+            for bad in column[~((column >= lat.low) & (column <= lat.high)) | whole & (column % 1 != 0)][:1]:
+                right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
+                raise InputError(f"{lat.name} of {self.name} was {bad:g}; it must be {right}")
         return array
 
     def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:
@@ -237,8 +228,7 @@ class Task(ABC):
             array = array.astype(float)
         except (TypeError, ValueError):
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
-        if array.shape != (n, self.action_width):
-            right = (n, self.action_width)
+        if array.shape != (right := (n, self.action_width)):
             raise InputError(f"action of {self.name} had shape {array.shape}; it must be {right}")
         if ignored is not None:
             array[ignored] = 0

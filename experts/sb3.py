@@ -53,11 +53,8 @@ class Sb3VecEnv(BatchVecEnv):
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in done]
         for i in np.flatnonzero(done):
-            infos[i] = {
-                "terminal_observation": obs[i].copy(),
-                "TimeLimit.truncated": bool(truncated[i]),
-                "episode": {"r": self._returns[i], "l": self._lengths[i], "t": 0.0},
-            }
+            infos[i] = {"terminal_observation": obs[i].copy(), "TimeLimit.truncated": bool(truncated[i])}
+            infos[i]["episode"] = {"r": self._returns[i], "l": self._lengths[i], "t": 0.0}
         if done.any():
             self._returns[done], self._lengths[done] = 0, 0
             obs = batch.reset(where=done)

@@ -41,10 +41,8 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     except InputError:
         raise
     except Exception as error:  # any error of the class's own `state`
-        raise InputError(
-            f"{cls.__qualname__} cannot be saved ({error_line(error)}); its state() must return a dictionary for json"
-            " and one of arrays"
-        ) from None
+        right = "its state() must return a dictionary for json and one of arrays"
+        raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
     check_folder(folder)
     if code is not None:
         write_atomically(folder / CODE, code)

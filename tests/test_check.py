@@ -128,7 +128,7 @@ class NoCamera(SlipperyCartpole):
         (OneTooMany, r"observe of slippery_cartpole gave \(2, 6\) of 2 environments; it must be \(2, 7\)"),
         (NoReward, r"reward of slippery_cartpole gave \[nan, nan\]; it must be finite"),
         (ColumnOfRewards, r"reward of slippery_cartpole gave \(2, 1\)"),
-        (NegativeNoise, r"process_noise of joint hinge was \(0.0, -0.1\)"),
+        (NegativeNoise, r"process_noise of joint hinge, a hinge joint, was \(0.0, -0.1\); it must be standard "),
         (SilentExpert, "expert_noise of slippery_cartpole was 0; it must be above 0"),
         (NanExpert, "expert_noise of slippery_cartpole was nan; it must be above 0"),
         (NoNoise, "process_noise of slippery_cartpole was 0 throughout"),
