@@ -13,9 +13,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from deconfounded.envs.batch import BatchEnv, check_number
-from deconfounded.envs.streams import Mask
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Renderer, Task
+from deconfounded.envs.task import InputError, Mask, Renderer, Task
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:

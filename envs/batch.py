@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Array, Mask, Streams
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, InputError, Mask, Streams, Task
 
 MAX_ENVS = 10_000_000
+Seed = int | Sequence[int | None] | None
 
 
 def check_number(what: str, given: object, most: float = np.inf) -> None:
@@ -56,7 +55,7 @@ class BatchEnv:
         """The hidden latents [N, L]."""
         return self.simulator.theta
 
-    def seed(self, seed: int | Sequence[int | None] | None) -> None:
+    def seed(self, seed: Seed) -> None:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
         if seed is None:
             seed = [None] * self.n
@@ -68,10 +67,7 @@ class BatchEnv:
         self._streams = [generators(value) for value in seed]
 
     def reset(
-        self,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-        where: Mask | None = None,
+        self, seed: Seed = None, options: dict[str, Any] | None = None, where: Mask | None = None
     ) -> NDArray[np.float32]:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
@@ -109,8 +105,7 @@ class BatchEnv:
                 self.simulator.set_theta(i, row)
         start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
         if first:
-            self.state = np.zeros((self.n, start.shape[1]))
-            self._noise = np.zeros((self.n, *noise.shape[1:]))
+            self.state, self._noise = np.zeros((self.n, start.shape[1])), np.zeros((self.n, *noise.shape[1:]))
         self.state[rows], self._noise[rows] = start, noise
         self._steps[rows], self.alive[rows] = 0, True
         return self.observe()
@@ -122,10 +117,8 @@ class BatchEnv:
         except ValueError:  # rows of many lengths
             mask = np.asarray(keep, object)
         if mask.dtype != bool or mask.shape not in ((), (self.n,)):
-            raise InputError(
-                f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be True, False, or bool of shape"
-                f" ({self.n},), one for each environment"
-            )
+            right = f"True, False, or bool of shape ({self.n},), one for each environment"
+            raise InputError(f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be {right}")
         return np.broadcast_to(mask, self.n)
 
     def observe(self) -> NDArray[np.float32]:
@@ -164,10 +157,7 @@ class BatchEnv:
         truncated &= ~terminated
         if not np.isfinite(reward).all():
             raise InputError(f"reward of {task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
-        if rows is None:
-            self.state = after
-        else:
-            self.state = self.state.copy()  # agents may hold the array before
-            self.state[rows] = after
+        self.state = self.state.copy()  # agents may hold the array before
+        self.state[on] = after
         self.alive = ~(over | terminated | truncated)
         return reward, terminated, truncated

@@ -120,6 +120,10 @@ class MujocoTask(Task):
         """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default one to one."""
         return action
 
+    def observe(self, state: Array) -> Array:
+        """By default positions, then velocities, of the joints of `process_noise`, in its order."""
+        return np.stack([read(state, joint) for read in (self.qpos, self.qvel) for joint in self.process_noise], -1)
+
     def spec(self) -> mujoco.MjSpec:
         """The nominal model, from <name>.xml in `home`. Every environment has a copy, so keep it small."""
         return mujoco.MjSpec.from_file(str(self.home / f"{self.name}.xml"))

@@ -10,8 +10,7 @@ import gymnasium
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.support import outside
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import InputError, Task
 
 TASKS: dict[str, type[Task]] = {}
 GROUP = "deconfounded.tasks"  # group of entry points of installed packages: name = "package.module:Class"

@@ -2,10 +2,10 @@
 
 import os
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium
 import numpy as np
@@ -15,6 +15,8 @@ from deconfounded.envs.streams import Array
 from deconfounded.envs.task import action_sizes
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
+ARRAYS = ("observations", "actions", "rewards", "terminations", "truncations")
+Collected = tuple[Trials, Array, list[list[list[Array]]]]  # trials, theta, and rewards and ends [N] by episode and step
 HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before
 
 
@@ -31,25 +33,15 @@ class _RecordingEnv(BatchEnv):
         return (then, *ended)
 
 
-def collect(
-    task: Task, n: int, agent: Callable[[BatchEnv], Agent], seed: int
-) -> tuple[Trials, Array, list[list[list[Array]]]]:
-    """Trials of an agent in n environments, their theta [N, E, L], and the reward and ends of each step.
-
-    agent: a function from the environments to the Agent.
-    """
+def collect(task: Task, n: int, agent: Callable[[BatchEnv], Agent], seed: int) -> Collected:
+    """Trials of the agent made for n environments, their theta [N, E, L], and each step's reward and ends."""
     env = _RecordingEnv(task, n)
     trials, _, theta = run_trials(env, agent(env), task.episodes, seed)
     return trials, theta, env.steps
 
 
 def write(
-    folder: Path,
-    task: Task,
-    name: str,
-    collected: tuple[Trials, Array, Any],
-    algorithm: str,
-    scores: tuple[float, float],
+    folder: Path, task: Task, name: str, collected: Collected, algorithm: str, scores: tuple[float, float]
 ) -> Path:
     """Write a Minari data set `deconf/<task>/<name>-v<version>` under a folder; returns its path.
 
@@ -57,7 +49,7 @@ def write(
     Minari's normalisation. Raises InputError if the data set exists already.
     """
     folder = folder.resolve()  # Minari would join a relative path to itself
-    with _root(folder), warnings.catch_warnings():
+    with patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder)), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about authors and links, which are optional
         import minari
         from minari.data_collector import EpisodeBuffer
@@ -71,30 +63,18 @@ def write(
         for b in range(len(trials)):
             for e in range(trials.mask.shape[1]):
                 length = int(trials.mask[b, e].sum())
-                reward, terminated, truncated = (np.array([step[i][b] for step in steps[e][:length]]) for i in range(3))
-                action = trials.action[b, e, :length]
-                buffers.append(
-                    EpisodeBuffer(
-                        id=len(buffers),
-                        observations=trials.obs[b, e, : length + 1],  # type: ignore[arg-type]
-                        actions=action[:, 0].astype(np.int64) if discrete else action,  # type: ignore[arg-type]
-                        rewards=reward,  # type: ignore[arg-type]
-                        terminations=terminated,  # type: ignore[arg-type]
-                        truncations=truncated,  # type: ignore[arg-type]
-                        infos={},
-                    )
-                )
+                obs, action = trials.obs[b, e, : length + 1], trials.action[b, e, :length]
+                action = action[:, 0].astype(np.int64) if discrete else action
+                ended = [np.array([step[i][b] for step in steps[e][:length]]) for i in range(3)]
+                arrays = dict(zip(ARRAYS, (obs, action, *ended), strict=True))
+                buffers.append(EpisodeBuffer(id=len(buffers), infos={}, **arrays))
                 metadata.append({"trial": b, "episode": e, "theta": theta[b, e]})
-        dataset = minari.create_dataset_from_buffers(
-            identity,
-            buffers,
-            env=gymnasium.spec(task.gym_id),
-            algorithm_name=algorithm,
-            description=f"{task.name}: {len(trials)} trials, each of {trials.mask.shape[1]} episodes under one theta",
-            ref_min_score=scores[0],
-            ref_max_score=scores[1],
-            data_format="hdf5",
+        about: dict[str, Any] = {"algorithm_name": algorithm, "ref_min_score": scores[0], "ref_max_score": scores[1]}
+        about["description"] = (
+            f"{task.name}: {len(trials)} trials, each of {trials.mask.shape[1]} episodes under one theta"
         )
+        spec = gymnasium.spec(task.gym_id)
+        dataset = minari.create_dataset_from_buffers(identity, buffers, env=spec, data_format="hdf5", **about)
         dataset.storage.update_metadata({HORIZON: trials.mask.shape[2]})
         dataset.storage.update_episode_metadata(metadata)
     return place
@@ -137,17 +117,3 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
     complete = all(value is not None for value in thetas.values())
     theta = np.array([[thetas[i, j] for j in range(e)] for i in range(b)]) if complete else None
     return Trials(obs, action, mask, n_actions), theta
-
-
-@contextmanager
-def _root(folder: Path) -> Iterator[None]:
-    """Context in which Minari's folder of data sets is the given one."""
-    before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ["MINARI_DATASETS_PATH"]
-        else:
-            os.environ["MINARI_DATASETS_PATH"] = before

@@ -95,14 +95,13 @@ class Trials:
             raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
 
 
-def joined(parts: Sequence[Trials]) -> "Trials":
+def joined(parts: Sequence[Trials]) -> Trials:
     """Concatenate trials of the same shape."""
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
     return Trials(obs, action, mask, parts[0].actions)
 
 
-State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
-"""Settings that json can hold, and arrays."""
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]  # settings that json can hold, and arrays
 
 
 class Agent(ABC):
@@ -112,10 +111,7 @@ class Agent(ABC):
         """Start n new trials, each under a theta of its own: reset all memory."""
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027 (nor those without random numbers)
-        """Start an episode of the present trials: theta stays, and so may memory.
-
-        rngs: a generator for each of equal groups of trials.
-        """
+        """Start an episode of the present trials under the same theta. rngs: one for each of equal groups of trials."""
 
     @abstractmethod
     def act(self, obs: NDArray[np.float32]) -> Array:
@@ -211,7 +207,7 @@ def run_trials(
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
     hidden = np.zeros((n, episodes, len(task.latents)))
-    action: NDArray[np.float32] | None = None
+    action = np.zeros((n, episodes, task.horizon, task.action_width), np.float32)
     for e in range(episodes):
         if e == 0:
             now = env.reset(each, None if theta is None else {"theta": theta})
@@ -226,8 +222,6 @@ def run_trials(
             chosen = agent.act(now)
             then, reward, _, _ = env.step(chosen)
             agent.observe(now, chosen, then, alive)
-            if action is None:
-                action = np.zeros((n, episodes, task.horizon, chosen.shape[-1]), np.float32)
             obs[:, e, t + 1] = np.where(alive[:, None], then, obs[:, e, t])
             action[:, e, t] = np.where(alive[:, None], chosen, 0)
             mask[:, e, t] = alive
@@ -236,5 +230,4 @@ def run_trials(
             if not env.alive.any():
                 obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
                 break
-    assert action is not None
     return Rollout(Trials(obs, action, mask, task.n_actions), returns, hidden)

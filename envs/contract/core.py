@@ -19,8 +19,7 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract import physics, protocols
 from deconfounded.envs.contract.probe import Skipped, actions, far_thetas, observations, refused, require, same, streams
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, Task
 
 
 def no_leak(task: Task) -> None:

@@ -1,6 +1,7 @@
 """Helpers of checks: actions, thetas and generators to test a task with, and assertions with a message."""
 
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
@@ -10,9 +11,7 @@ import numpy as np
 
 from deconfounded.envs import render
 from deconfounded.envs.batch import BatchEnv
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, InputError, Streams, Task
 
 
 class Skipped(Exception):  # noqa: N818 (nothing is wrong)
@@ -48,9 +47,11 @@ def refused(what: str, says: str) -> Iterator[None]:
 
 @contextmanager
 def reported_by(checker: str) -> Iterator[None]:
-    """Context that turns any error of another library's checker into an AssertionError that names the checker."""
+    """Context that turns any error or warning of another library's checker into an AssertionError that names it."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
     except Exception as error:
         raise AssertionError(f"{checker}: {' '.join(str(error).split())} ({type(error).__name__})") from error
 
@@ -70,7 +71,8 @@ def observations(task: Task, acts: Array, seed: int, **options: Any) -> Array:
 
 def far_thetas(task: Task) -> Array:
     """Thetas [J, L] that span the range of every latent."""
-    return np.array(list(product(*(lat.grid(5)[::2] for lat in task.latents))))
+    grids = [lat.grid(5) for lat in task.latents]
+    return np.array(list(product(*(grid[:: max(1, (len(grid) - 1) // 2)] for grid in grids))))
 
 
 def streams(*seeds: int) -> Streams:

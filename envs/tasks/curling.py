@@ -44,9 +44,6 @@ class Curling(MujocoTask):
         x, velocity = rng.uniform((START - 0.1, 0.0), (START + 0.1, 0.1))
         return self.state(slide=(x, velocity))
 
-    def observe(self, state: Array) -> Array:
-        return np.stack([self.qpos(state, "slide"), self.qvel(state, "slide")], -1)
-
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = self.qpos(next_state, "slide") - TEE
         landed = np.exp(-0.5 * (off / HOUSE) ** 2) * self.terminated(next_state)

@@ -30,11 +30,6 @@ class Puck(MujocoTask):
         x, y = rng.uniform([-0.03, -0.03], 0.03)
         return self.state(x=(x, 0), y=(y, 0))
 
-    def observe(self, state: Array) -> Array:
-        joints = ("x", "y")
-        positions, velocities = ([read(state, joint) for joint in joints] for read in (self.qpos, self.qvel))
-        return np.stack([*positions, *velocities], -1)
-
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = self.observe(next_state)[:, :2] - self.goal(theta)
         distance = np.linalg.norm(off, axis=-1)

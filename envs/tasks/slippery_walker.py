@@ -25,8 +25,7 @@ from gymnasium import spaces
 
 from deconfounded.envs import render
 from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Array, Latent, Mask, Streams
+from deconfounded.envs.task import Array, InputError, Latent, Mask, Streams
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s

@@ -55,9 +55,6 @@ class SwappedLander(MujocoTask):
         x, z, pitch, *velocities = rng.uniform(-spread, spread)
         return self.state(**dict(zip(JOINTS, zip((x, 3.5 + z, pitch), velocities, strict=True), strict=True)))
 
-    def observe(self, state: Array) -> Array:
-        return np.stack([read(state, joint) for read in (self.qpos, self.qvel) for joint in JOINTS], -1)
-
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = np.hypot(self.qpos(next_state, "x"), self.qpos(next_state, "z"))
         upright = (1 + np.cos(self.qpos(next_state, "pitch"))) / 2
