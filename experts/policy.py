@@ -5,7 +5,7 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,9 @@ from scipy.special import log_ndtr
 from deconfounded.envs import InputError, Task
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
-from deconfounded.envs.task import ASSETS, Array
+from deconfounded.envs.task import ASSETS, Array, Streams
 
-
-class RandomSource(Protocol):
-    """A source of random numbers: a numpy generator, or `envs.streams.Streams` of rows in `groups` equal groups."""
-
-    def random(self, size: tuple[int, ...]) -> Array: ...
-    def standard_normal(self, size: tuple[int, ...]) -> Array: ...
+RandomSource = np.random.Generator | Streams
 
 
 class Expert(ABC):
@@ -141,10 +136,9 @@ def names_callable(source: str) -> bool:
 
 
 def load(task: Task, source: str | Path | None = None) -> Expert:
-    """Load a task's expert: the closed form, the weights that come with the task, or others.
+    """Load a task's expert: the closed form, the weights that come with the task, or those of a .safetensors file.
 
-    source: a .safetensors file, or a callable (`CallableExpert`) as path/file.py:name or package.module:name. Raises
-    InputError if it is missing, damaged, or does not fit the task.
+    source: the file, or the reference of a callable (`CallableExpert`). Raises InputError if it does not fit the task.
     """
     if task.n_actions:
         if source is not None:

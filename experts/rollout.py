@@ -136,27 +136,26 @@ class Agent(ABC):
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 
 
-class ExpertAgent(Agent):
+class _Drawing(Agent):
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
+
+
+class ExpertAgent(_Drawing):
     """The expert as an agent. theta [N, L]: what it acts by; None: that of the environment."""
 
     def __init__(self, env: BatchEnv, expert: Expert, theta: Array | None = None) -> None:
         self.env, self.expert, self.theta = env, expert, theta
 
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self._rng = Streams(rngs)
-
     def act(self, obs: NDArray[np.float32]) -> Array:
         return self.expert.act(obs, self.env.theta if self.theta is None else self.theta, self._rng)
 
 
-class RandomAgent(Agent):
+class RandomAgent(_Drawing):
     """An agent with uniform actions: the zero of every score."""
 
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self._rng = Streams(rngs)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         width, n_actions = action_sizes(self.space)

@@ -36,8 +36,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
         content = to_bytes(arrays)
-        about["arrays"] = hashlib.sha256(content).hexdigest()
-        described = as_json(file, sealed(about))
+        described = as_json(file, sealed({**about, "arrays": hashlib.sha256(content).hexdigest()}))
     except InputError:
         raise
     except Exception as error:  # any error of the class's own `state`
@@ -68,8 +67,7 @@ def load(folder: Path | str) -> Agent:
     """
     if not isinstance(folder, str | Path):
         raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
-    folder = Path(folder)
-    about = describe(folder)
+    about = describe(folder := Path(folder))
     try:
         where, _, name = about["class"].rpartition(":")
         cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
