@@ -12,8 +12,11 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from deconfounded.envs.batch import BatchEnv, check_number
+from deconfounded.envs.batch import BatchEnv, Seed, check_number
+from deconfounded.envs.streams import Obs
 from deconfounded.envs.task import InputError, Mask, Renderer, Task
+
+Info = dict[str, Any]
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
@@ -63,14 +66,12 @@ class GymEnv(gym.Env[Any, Any]):
         self.action_space = copy.deepcopy(task.action_space)
         self._pictures, self._warned = _Pictures(self.batch), False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
         super().reset(seed=seed)
         self._warned = False
         return self.batch.reset(seed, options)[0], {}
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Obs, float, bool, bool, Info]:
         row, alive = np.asarray(action), self.batch.alive
         obs, reward, terminated, truncated = self.batch.step(row.reshape(1, 1) if row.size == 1 else row[None])
         if not alive[0] and not self._warned:
@@ -103,15 +104,13 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, n)
         self.action_space = batch_space(task.action_space, n)
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Obs, Info]:
         obs = self.batch.reset(seed, options)
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
         return obs, {}
 
-    def step(self, actions: Any) -> tuple[NDArray[np.float32], NDArray[Any], Mask, Mask, dict[str, Any]]:
+    def step(self, actions: Any) -> tuple[Obs, NDArray[Any], Mask, Mask, Info]:
         rows, alive = np.asarray(actions), self.batch.alive
         ended = self.batch.advance(rows[:, None] if rows.ndim == 1 else rows)
         if alive.all():
@@ -134,7 +133,7 @@ class DmEnv(dm_env.Environment):
         self._space, self._pictures = _observation_space(task, privileged), _Pictures(self._batch)
         self._batch.seed(seed)
 
-    def reset(self, options: dict[str, Any] | None = None) -> dm_env.TimeStep:
+    def reset(self, options: Info | None = None) -> dm_env.TimeStep:
         """Start an episode; `options` as in GymEnv.reset."""
         return dm_env.restart(self._batch.reset(options=options)[0])
 

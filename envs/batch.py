@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from deconfounded.envs.streams import Obs
 from deconfounded.envs.task import Array, InputError, Mask, Streams, Task
 
 MAX_ENVS = 10_000_000
@@ -66,9 +66,7 @@ class BatchEnv:
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [generators(value) for value in seed]
 
-    def reset(
-        self, seed: Seed = None, options: dict[str, Any] | None = None, where: Mask | None = None
-    ) -> NDArray[np.float32]:
+    def reset(self, seed: Seed = None, options: dict[str, Any] | None = None, where: Mask | None = None) -> Obs:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
         options: `keep_theta`, True or a mask [N], keeps theta but for its drift, for the next episode of a trial; other
@@ -121,14 +119,14 @@ class BatchEnv:
             raise InputError(f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be {right}")
         return np.broadcast_to(mask, self.n)
 
-    def observe(self) -> NDArray[np.float32]:
+    def observe(self) -> Obs:
         """Observations [N, O] of the present states; the privileged view appends the encoded theta."""
         obs = np.clip(self.task.observe(self.state).astype(np.float32), self._space.low, self._space.high)
         if self.privileged:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
 
-    def step(self, action: object) -> tuple[NDArray[np.float32], Array, Mask, Mask]:
+    def step(self, action: object) -> tuple[Obs, Array, Mask, Mask]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
         Environments whose episode is over are not stepped, whatever their action. Actions out of [-1, 1] are clipped.

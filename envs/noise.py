@@ -69,7 +69,10 @@ class ProcessNoise:
         """Outcome [N, S] and unit noise [N, Z] -> next state [N, S], in place; quaternions stay of unit length."""
         outcome[:, self._index] += self._sigma * noise[:, self._draws]
         for at, drawn, std in self._rotations:
-            rotated = _product(outcome[:, at], _exp(std * noise[:, drawn]))
+            w = std * noise[:, drawn]  # rad
+            half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
+            turn = np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)  # exp(w / 2)
+            rotated = _product(outcome[:, at], turn)
             outcome[:, at] = rotated / np.linalg.norm(rotated, axis=-1, keepdims=True)
         return outcome
 
@@ -112,9 +115,3 @@ def _product(p: Array, q: Array) -> Array:
     real, x = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g
     y, z = a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e
     return np.stack([real, x, y, z], -1)
-
-
-def _exp(w: Array) -> Array:
-    """Unit quaternions [..., 4] of rotation vectors [..., 3], rad."""
-    half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)

@@ -142,18 +142,11 @@ class MujocoTask(Task):
         return float(self.model.opt.timestep) * self.substeps
 
     def qpos(self, state: Array, joint: str) -> Array:
-        """Position [...] of a hinge or slide joint in states [..., S], rad or m.
-
-        Of a ball joint, its quaternion [..., 4]; of a free joint, position (m) and quaternion [..., 7].
-        """
+        """Position [...] of a joint, m or rad; of a ball joint a quaternion [..., 4]; of a free joint both [..., 7]."""
         return state[..., self._address(joint)[0]]
 
     def qvel(self, state: Array, joint: str) -> Array:
-        """Velocity [...] of a hinge or slide joint, rad/s or m/s.
-
-        Of a ball joint, its angular velocity about its own axes [..., 3]; of a free joint, velocity and angular
-        velocity [..., 6].
-        """
+        """Velocity [...] of a joint, rad/s or m/s; of a ball joint [..., 3] in its own axes; of a free one [..., 6]."""
         return state[..., self._address(joint)[1]]
 
     def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
@@ -174,8 +167,7 @@ class MujocoTask(Task):
     def _address(self, joint: str) -> tuple[int | slice, int | slice]:
         if joint not in self._addresses:
             q, v = columns(self.model, joint)
-            single = len(q) == 1
-            self._addresses[joint] = (q[0], v[0]) if single else (slice(q.start, q.stop), slice(v.start, v.stop))
+            self._addresses[joint] = (q[0], v[0]) if len(q) == 1 else (slice(q[0], q.stop), slice(v[0], v.stop))
         return self._addresses[joint]
 
     @cached_property

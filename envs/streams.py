@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
+Obs = NDArray[np.float32]
 
 
 class Streams:

@@ -60,8 +60,9 @@ def write(
         if place.exists():
             raise InputError(f"{place} is there already; remove it, or give another --out")
         discrete, buffers, metadata = trials.actions > 0, list[EpisodeBuffer](), list[dict[str, Any]]()
-        for b in range(len(trials)):
-            for e in range(trials.mask.shape[1]):
+        n, episodes, horizon = trials.mask.shape
+        for b in range(n):
+            for e in range(episodes):
                 length = int(trials.mask[b, e].sum())
                 obs, action = trials.obs[b, e, : length + 1], trials.action[b, e, :length]
                 action = action[:, 0].astype(np.int64) if discrete else action
@@ -70,12 +71,10 @@ def write(
                 buffers.append(EpisodeBuffer(id=len(buffers), infos={}, **arrays))
                 metadata.append({"trial": b, "episode": e, "theta": theta[b, e]})
         about: dict[str, Any] = {"algorithm_name": algorithm, "ref_min_score": scores[0], "ref_max_score": scores[1]}
-        about["description"] = (
-            f"{task.name}: {len(trials)} trials, each of {trials.mask.shape[1]} episodes under one theta"
-        )
+        about["description"] = f"{task.name}: {n} trials, each of {episodes} episodes under one theta"
         spec = gymnasium.spec(task.gym_id)
         dataset = minari.create_dataset_from_buffers(identity, buffers, env=spec, data_format="hdf5", **about)
-        dataset.storage.update_metadata({HORIZON: trials.mask.shape[2]})
+        dataset.storage.update_metadata({HORIZON: horizon})
         dataset.storage.update_episode_metadata(metadata)
     return place
 

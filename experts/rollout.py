@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.batch import generators
-from deconfounded.envs.streams import Array, Mask, Streams, unseeded
+from deconfounded.envs.streams import Array, Mask, Obs, Streams, unseeded
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.envs.task import action_sizes
 from deconfounded.experts.policy import Expert
@@ -114,12 +114,10 @@ class Agent(ABC):
         """Start an episode of the present trials under the same theta. rngs: one for each of equal groups of trials."""
 
     @abstractmethod
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         """Observation [N, O] -> action [N, A]."""
 
-    def observe(  # noqa: B027 (agents without memory need nothing here)
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: Mask
-    ) -> None:
+    def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:  # noqa: B027 (as begin)
         """Take in a transition of each trial; where `alive` [N] is False, the episode had ended before it."""
 
     def features(self) -> NDArray[np.float32] | None:
@@ -137,6 +135,8 @@ class Agent(ABC):
 
 
 class _Drawing(Agent):
+    """An agent that draws random numbers."""
+
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
 
@@ -147,7 +147,7 @@ class ExpertAgent(_Drawing):
     def __init__(self, env: BatchEnv, expert: Expert, theta: Array | None = None) -> None:
         self.env, self.expert, self.theta = env, expert, theta
 
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         return self.expert.act(obs, self.env.theta if self.theta is None else self.theta, self._rng)
 
 
@@ -157,13 +157,16 @@ class RandomAgent(_Drawing):
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
 
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         width, n_actions = action_sizes(self.space)
         draws = self._rng.random((len(obs), width))
         return np.floor(draws * n_actions) if n_actions else 2 * draws - 1
 
 
-def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
+Seeds = int | Sequence[int]  # one for all trials, or one for each of equal groups of them
+
+
+def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
     """Theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
     rng = Streams([generators(env_seed)[0] for env_seed in trial_seeds(n, seed)])
     by_episode = [task.sample_theta(rng)]
@@ -191,9 +194,7 @@ class Rollout(NamedTuple):
     theta: Array
 
 
-def run_trials(
-    env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
-) -> Rollout:
+def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: Array | None = None) -> Rollout:
     """Run an agent in N trials of `episodes` episodes each.
 
     seed: of the environments and, independently, of the agent; or a seed for each of equal consecutive groups of

@@ -199,29 +199,21 @@ def _density_ratio(what: str, fall: Array, pair: str) -> None:
 
 
 def log_prob_is_the_density_of_the_noise(task: Task) -> None:
-    """Log_prob is normalised, and is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q.
-
-    The expectation is over 4,000 draws of importance sampling.
-    """
-    m = 4000
-    low, high = task.latents[0].grid(9)[[0, -1]]
-    near = high if task.latents[0].distribution == "categorical" else low + 0.03 * (high - low)
-    rest = [lat.low for lat in task.latents[1:]]
-    batch = BatchEnv(task, 1)
-    batch.reset(0, {"theta": [low, *rest]})
-    action = actions(task, 1, 1)[0]
-    p = batch.simulator.outcome(batch.state, action)
-    batch.reset(0, {"theta": [near, *rest]})
-    q = batch.simulator.outcome(batch.state, action)
+    """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
+    m, (first, *rest) = 4000, task.latents
+    low, high = first.grid(9)[[0, -1]]
+    near = high if first.distribution == "categorical" else low + 0.03 * (high - low)
+    batch, action = BatchEnv(task, 2), np.repeat(actions(task, 1, 1)[0], 2, 0)
+    batch.reset([0, 0], {"theta": [[value, *(lat.low for lat in rest)] for value in (low, near)]})
+    p, q = np.split(batch.simulator.outcome(batch.state, action), 2)
     if (p == q).all():  # theta has no effect here: use another action's outcome
-        q = batch.simulator.outcome(batch.state, 0.8 * action)
+        q = batch.simulator.outcome(batch.state, 0.8 * action)[1:]
     if isinstance(task, MujocoTask):  # at most one standard deviation off, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])
     drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
-    _density_ratio(
-        f"log_prob of {task.name}", task.log_prob(drawn, p) - task.log_prob(drawn, q), "outcomes that differ"
-    )
+    ratio = task.log_prob(drawn, p) - task.log_prob(drawn, q)
+    _density_ratio(f"log_prob of {task.name}", ratio, "outcomes that differ")
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
         fall = task.log_prob(p, p) - task.log_prob(drawn, p)
         right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
