@@ -130,7 +130,9 @@ def run(
         prepare(folder, described, args.resume)
         know_guests(folder / "jobs")
         jobs = [
-            kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track)
+            kind(
+                task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track=track
+            )
             for method in methods
             for guest in [catalogue.guest(method)]
         ]

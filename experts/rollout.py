@@ -1,23 +1,28 @@
 """Roll-outs: trials, the data that imitators learn from; agents, which act in them; and the loop that runs them."""
 
+from __future__ import annotations  # as what only type checkers import is no name at run time
+
 import hashlib
 import io
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs import BatchEnv, InputError, Task
-from deconfounded.envs.batch import generators
-from deconfounded.envs.streams import Array, Mask, Obs, Streams, unseeded
+from deconfounded.envs.streams import Array, Mask, Obs, Streams, generators, unseeded
+from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
-from deconfounded.envs.task import action_sizes
-from deconfounded.experts.policy import Expert
+from deconfounded.envs.support.spaces import action_sizes
+
+if TYPE_CHECKING:
+    from deconfounded.envs.batch import BatchEnv
+    from deconfounded.envs.task import Task
+    from deconfounded.experts.policy import Expert
 
 
 @dataclass(frozen=True)
@@ -71,7 +76,7 @@ class Trials:
         return digest.hexdigest()
 
     @staticmethod
-    def from_minari(source: Path | str) -> "Trials":
+    def from_minari(source: Path | str) -> Trials:
         """The trials of a Minari data set's folder, without their thetas; see `experts.datasets.read`."""
         from deconfounded.experts import datasets
 
@@ -84,7 +89,7 @@ class Trials:
         write_atomically(file, buffer.getvalue())
 
     @staticmethod
-    def load(file: Path, made_of: str | None = None) -> "Trials":
+    def load(file: Path, made_of: str | None = None) -> Trials:
         """Read what `save` wrote. Raises InputError if the file is missing or damaged, or its `made_of` differs."""
         try:
             with np.load(file, allow_pickle=False) as data:
@@ -129,7 +134,7 @@ class Agent(ABC):
         raise InputError(f"{type(self).__name__} cannot be saved; give it `state` and `from_state`")
 
     @classmethod
-    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> "Agent":
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Agent:
         """The agent whose `state` this is."""
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 from collections.abc import Sequence
 from typing import Any
 
@@ -108,18 +109,21 @@ class BenchmarkJob(Job):
 
     def run(self) -> str:
         monitor = CurveMonitor(self, 0.8)
-        context = self.context(monitor)
+        training, evaluation = self.salts or (secrets.token_hex(8), "") if self.guest else ("", "")
+        context = self.context(monitor, training)
         with contextlib.ExitStack() as guests:
             if self.guest is None:
                 agents = deployed(self.method, fit(context, self.method))
             else:
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {"": guests.enter_context(contextlib.closing(guest))}
+                evaluation = evaluation or secrets.token_hex(8)  # drawn now that its agent cannot change any more
             trained, filmed = monitor.worked(), self.method in CLIPPED and 0 in self.seeds
             ways = {label(self.method, way): way for way in agents}
             agents = {name: agents[way] for name, way in ways.items()}
+            learned, salt = self.about.learned, self.salt + evaluation
             found = {
-                name: evaluate(context, agent, self.about.learned, self.salt, filmed and name == self.method)
+                name: evaluate(context, agent, learned, salt, filmed and name == self.method)
                 for name, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
@@ -127,6 +131,8 @@ class BenchmarkJob(Job):
                 self._keep(name, agent) for name, agent in agents.items()
             ]  # first: a seed's file says it is finished
             meta = {"agents": ways, "curve": monitor.kept, "tier": self.about.tier}
+            if self.guest is not None:
+                meta["salts"] = [training, evaluation]
             for i, seed in enumerate(self.seeds):
                 rows = context.rows(i)
                 arrays: dict[str, Any] = {}

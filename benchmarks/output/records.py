@@ -38,6 +38,7 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     for name, deployment in meta["agents"].items():
         returns = data[f"{name}/returns"]
         curve = {"curve": thinned(meta["curve"])} if meta["curve"] else {}
+        curve |= {"salts": meta["salts"]} if "salts" in meta else {}
         found.append(
             {
                 "schema": 3,
