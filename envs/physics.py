@@ -107,6 +107,7 @@ class MujocoTask(Task):
 
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     substeps: ClassVar[int] = 2  # physics steps a control step
+    controls: ClassVar[tuple[Any, Any]] = (0.0, 1.0)  # middle and swing of MuJoCo's ctrl, numbers or [nu]
     # joint -> std of (position, velocity) a control step; of ball and free joints see envs/noise.py. A coordinate
     # without noise counts as no evidence: theta must not move it, or nothing observed may depend on it.
     process_noise: ClassVar[dict[str, tuple[float, ...]]]
@@ -117,8 +118,9 @@ class MujocoTask(Task):
         """Set theta [L] in a model."""
 
     def control(self, action: Array) -> Array:
-        """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default one to one."""
-        return action
+        """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default middle + swing * action, of `controls`."""
+        middle, swing = self.controls
+        return middle + swing * action
 
     def observe(self, state: Array) -> Array:
         """By default positions, then velocities, of the joints of `process_noise`, in its order."""

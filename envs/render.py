@@ -33,11 +33,11 @@ def backend() -> str:
 _GL_PROCESSES: set[int] = set()  # that created a GL context: this process, and those that it was forked from
 
 
-def _create(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+def _create(model: mujoco.MjModel) -> mujoco.Renderer:
     if _GL_PROCESSES - {os.getpid()}:  # the GL library would wait for threads of the parent process
         raise InputError("pictures cannot be made in a fork of a process that has made some; start it by `spawn`")
     _GL_PROCESSES.add(os.getpid())
-    return mujoco.Renderer(model, height, width)
+    return mujoco.Renderer(model, height=240, width=320)
 
 
 def _load_triton() -> None:
@@ -115,13 +115,13 @@ def level(model: mujoco.MjModel) -> None:
 class MujocoRenderer:
     """Renderer of a model's states through its camera `view`. Raises InputError where no GL works."""
 
-    def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
+    def __init__(self, model: mujoco.MjModel) -> None:
         _load_triton()
         if (name := backend()) in ("egl", "osmesa"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
-        self._renderer = Handle(partial(_create, model, height, width), _close)
+        self._renderer = Handle(partial(_create, model), _close)
         self._renderer()
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:

@@ -31,14 +31,12 @@ class Curling(MujocoTask):
     latents = (Latent("friction", "", 0.025, 0.1, "loguniform"),)
     horizon = 100
     expert_noise = 0.02
+    controls = (0.5, 0.5)
     process_noise = {"slide": (0.01, 0.04)}
     observation = {"x": (-10, 40), "velocity": (-4, 10)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.tendon_friction("ice", WEIGHT * float(theta[0]))
-
-    def control(self, action: Array) -> Array:
-        return (1 + action) / 2
 
     def init_state(self, rng: Streams) -> Array:
         x, velocity = rng.uniform((START - 0.1, 0.0), (START + 0.1, 0.1))

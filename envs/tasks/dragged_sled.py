@@ -19,7 +19,6 @@ from deconfounded.envs import render
 from deconfounded.envs.physics import Edit, MujocoTask
 from deconfounded.envs.task import Array, Latent, Mask, Streams
 
-MIDDLE, SPEED = 2.0, 3.0  # of the hand, m/s
 LOST = 1.2  # m
 STRETCH = 0.9  # of the cord at the start, whatever the friction, m
 
@@ -31,6 +30,7 @@ class DraggedSled(MujocoTask):
     latents = (Latent("friction", "N", 3.0, 18.0, "loguniform"),)
     horizon = 125
     expert_noise = 0.02
+    controls = (2.0, 3.0)  # of the hand, m/s
     process_noise = {"sled": (0.004, 0.4), "hand": (0.004, 0.05), "target": (0, 0)}
     observation = {
         **{"off_target": (-4, 4), "stretch": (-6, 6)},
@@ -44,9 +44,6 @@ class DraggedSled(MujocoTask):
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.tendon_friction("runners", float(theta[0]))
-
-    def control(self, action: Array) -> Array:
-        return MIDDLE + SPEED * action
 
     def init_state(self, rng: Streams) -> Array:
         pace, off, stretch = rng.uniform((1.5, -0.1, -0.1), (2.5, 0.1, 0.1))

@@ -17,7 +17,6 @@ import numpy as np
 from deconfounded.envs.physics import Edit, MujocoTask
 from deconfounded.envs.task import Array, Latent, Mask, Streams
 
-SPEED = 3.0  # m/s
 LOST = 1.2  # m
 PACE = 2.1  # of the target, rad/s
 STRETCH = 1.7  # of the cable at the start, whatever the load, m
@@ -31,6 +30,7 @@ class HeavyPayload(MujocoTask):
     latents = (Latent("mass", "kg", 1.0, 3.0, "loguniform"),)
     horizon = 150
     expert_noise = 0.02
+    controls = (0.0, 3.0)  # of the hook, m/s
     process_noise = {"load": (0.004, 0.45), "hook": (0.004, 0.05), "target": (0, 0)}
     observation = {
         **{"off_target": (-4, 4), "stretch": (-4, 4), "target": (-2, 2)},
@@ -39,9 +39,6 @@ class HeavyPayload(MujocoTask):
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.body_mass("load", float(theta[0]))  # the MJCF's load has 1 kg
-
-    def control(self, action: Array) -> Array:
-        return SPEED * action
 
     def init_state(self, rng: Streams) -> Array:
         phase, swing, off, stretch = rng.uniform((0, 0.3, -0.1, -0.1), (2 * np.pi, 0.5, 0.1, 0.1))

@@ -26,14 +26,12 @@ class WeakThruster(MujocoTask):
     latents = (Latent("strength", "", 0.8, 2.0, "loguniform"),)
     horizon = 70
     expert_noise = 0.02
+    controls = (0.5, 0.5)
     process_noise = {"height": (0.008, 0.2)}
     observation = {"radar": (-2, RADAR + 0.1), "velocity": (-30, 30)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.actuator_gain("thruster", float(theta[0]))
-
-    def control(self, action: Array) -> Array:
-        return (1 + action) / 2
 
     def init_state(self, rng: Streams) -> Array:
         height, speed = rng.uniform((8, 3), (11, 6))
