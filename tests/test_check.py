@@ -255,7 +255,7 @@ class UnnamedGeom(SlipperyCartpole):
     [
         (WiderNoise, "log_prob_is_the_density_of_the_noise", "log_prob of slippery_cartpole"),
         (NoEffect, "effect", r"thetas .* have the trajectories of "),
-        (NoBump, "effect", r"thetas \[\[1.0\]\] have the trajectories of \[0.0\]"),
+        (NoBump, "effect", r"thetas \[\[1\]\] have the trajectories of \[0\]"),
         (InPlaceOnly, "set_in_place_equals_recompiled", "tendon_frictionloss of models set in place and compiled"),
         (EditsTheNominal, "nominal_model_is_not_touched", "tendon_frictionloss of models of the task"),
         (Leaky, "no_leak", "first observations of theta .* differ"),
