@@ -4,8 +4,6 @@ The suite's tasks are in tasks/; a task of your own stays in your folder: `get("
 package also registers every task with gymnasium, so that `gymnasium.make("deconf/SlipperyCartpole-v1")` works.
 """
 
-from __future__ import annotations
-
 import os
 
 _gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` fails if the backend is missing, which only rendering needs
@@ -19,39 +17,10 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.check import check_task
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.registry import (
-    TASKS,
-    closest,
-    get,
-    make,
-    make_dm,
-    make_registered_vec,
-    make_vec,
-    names,
-    register,
-)
+from deconfounded.envs.registry import TASKS, closest, get, make, make_dm, make_vec, names, register
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 from deconfounded.envs.tasks import SUITE
 
-__all__ = [
-    "SUITE",
-    "TASKS",
-    "BatchEnv",
-    "DmEnv",
-    "GymEnv",
-    "GymVectorEnv",
-    "InputError",
-    "Latent",
-    "MujocoTask",
-    "Task",
-    "check_task",
-    "closest",
-    "get",
-    "make",
-    "make_dm",
-    "make_registered_vec",
-    "make_vec",
-    "names",
-    "register",
-]
+__all__ = ["SUITE", "TASKS", "BatchEnv", "DmEnv", "GymEnv", "GymVectorEnv", "InputError", "Latent"]
+__all__ += ["MujocoTask", "Task", "check_task", "closest", "get", "make", "make_dm", "make_vec", "names", "register"]

@@ -1,7 +1,5 @@
 """Interfaces of a BatchEnv: gymnasium Env and VectorEnv, and dm_env. They hold no maths of any task."""
 
-from __future__ import annotations
-
 import copy
 from typing import Any
 
@@ -14,18 +12,18 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.batch import BatchEnv, Seed
+from deconfounded.envs.streams import Obs
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.numbers import check_number
-from deconfounded.envs.task import Renderer, Task
+from deconfounded.envs.task import Mask, Renderer, Task
+
+Info = dict[str, Any]
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
-    base = task.observation_space
-    if not privileged:
-        return base
-    low, high = np.append(base.low, [-1.0] * task.theta_width), np.append(base.high, [1.0] * task.theta_width)
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32))
+    base, more = task.observation_space, np.ones(task.theta_width if privileged else 0, np.float32)
+    return spaces.Box(np.append(base.low, -more), np.append(base.high, more))
 
 
 def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
@@ -40,15 +38,10 @@ class _Pictures:
 
     def __init__(self, batch: BatchEnv) -> None:
         self._batch = batch
-        self._action = np.zeros((batch.n, batch.task.action_width))
         self._renderers: dict[int, tuple[NDArray[Any], Renderer]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_renderers": {}}  # a copy creates its own
-
-    def act(self, action: NDArray[Any], alive: NDArray[np.bool_]) -> None:
-        """Store the actions [N, A] of the environments that were stepped, `alive` [N], for the next pictures."""
-        self._action = np.where(alive[:, None], action, self._action)
 
     def __call__(self, i: int) -> NDArray[np.uint8]:
         """Environment i -> [H, W, 3]. Raises InputError before the first reset, and where no picture can be made."""
@@ -57,7 +50,7 @@ class _Pictures:
         theta = self._batch.theta[i].copy()
         if i not in self._renderers or (self._renderers[i][0] != theta).any():
             self._renderers[i] = theta, self._batch.task.renderer(theta)
-        return self._renderers[i][1](self._batch.state[i], self._action[i])
+        return self._renderers[i][1](self._batch.state[i], self._batch.action[i])
 
 
 class GymEnv(gym.Env[Any, Any]):
@@ -75,20 +68,14 @@ class GymEnv(gym.Env[Any, Any]):
         self.action_space = copy.deepcopy(task.action_space)
         self._pictures, self._warned = _Pictures(self.batch), False
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
         super().reset(seed=seed)
-        obs = self.batch.reset(seed, options)[0]
         self._warned = False
-        return obs, {}
+        return self.batch.reset(seed, options)[0], {}
 
-    def step(self, action: Any) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        alive, row = self.batch.alive, np.asarray(action)
-        row = np.reshape(row, (1, 1)) if row.size == 1 else row[None]
-        obs, reward, terminated, truncated = self.batch.step(row)
-        if self.render_mode is not None:
-            self._pictures.act(row, alive)
+    def step(self, action: Any) -> tuple[Obs, float, bool, bool, Info]:
+        row, alive = np.asarray(action), self.batch.alive
+        obs, reward, terminated, truncated = self.batch.step(row.reshape(1, 1) if row.size == 1 else row[None])
         if not alive[0] and not self._warned:
             gym.logger.warn(f"step of {self.task.name} was called after the end of an episode; it moves nothing: reset")
             self._warned = True
@@ -119,23 +106,15 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.observation_space = batch_space(self.single_observation_space, n)
         self.action_space = batch_space(task.action_space, n)
 
-    def reset(
-        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Obs, Info]:
         obs = self.batch.reset(seed, options)
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)
         return obs, {}
 
-    def step(
-        self, actions: Any
-    ) -> tuple[NDArray[np.float32], NDArray[Any], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        array = np.asarray(actions)
-        rows = array[:, None] if array.ndim == 1 else array
-        alive = self.batch.alive
-        ended = self.batch.advance(rows)
-        if self.render_mode is not None:
-            self._pictures.act(rows, alive)
+    def step(self, actions: Any) -> tuple[Obs, NDArray[Any], Mask, Mask, Info]:
+        rows, alive = np.asarray(actions), self.batch.alive
+        ended = self.batch.advance(rows[:, None] if rows.ndim == 1 else rows)
         if alive.all():
             return self.batch.observe(), *ended, {}
         keep = self._episode < self.episodes
@@ -156,31 +135,29 @@ class DmEnv(dm_env.Environment):
         self._space, self._pictures = _observation_space(task, privileged), _Pictures(self._batch)
         self._batch.seed(seed)
 
-    def reset(self, options: dict[str, Any] | None = None) -> dm_env.TimeStep:
+    def reset(self, options: Info | None = None) -> dm_env.TimeStep:
         """Start an episode; `options` as in GymEnv.reset."""
         return dm_env.restart(self._batch.reset(options=options)[0])
 
     def step(self, action: Any) -> dm_env.TimeStep:
         if not self._batch.alive[0]:
             return self.reset()
-        alive, row = self._batch.alive, np.reshape(action, (1, -1))
-        obs, reward, terminated, truncated = self._batch.step(row)
-        self._pictures.act(row, alive)
-        if terminated[0]:
-            return dm_env.termination(float(reward[0]), obs[0])
-        end = dm_env.truncation if truncated[0] else dm_env.transition
-        return end(float(reward[0]), obs[0])
+        obs, reward, terminated, truncated = self._batch.step(np.reshape(action, (1, -1)))
+        ended = dm_env.truncation if truncated[0] else dm_env.transition
+        return (dm_env.termination if terminated[0] else ended)(float(reward[0]), obs[0])
 
     def render(self) -> NDArray[np.uint8]:
         """The picture [H, W, 3] of the present state. Raises InputError before the first reset."""
         return self._pictures(0)
 
     def observation_spec(self) -> specs.BoundedArray:
-        space = self._space
-        return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "observation")
+        return _spec(self._space, "observation")
 
     def action_spec(self) -> specs.BoundedArray:
-        space = self.task.action_space
-        if isinstance(space, spaces.Box):
-            return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, "action")
-        return specs.DiscreteArray(self.task.n_actions, name="action")
+        return _spec(self.task.action_space, "action")
+
+
+def _spec(space: spaces.Box | spaces.Discrete, name: str) -> specs.BoundedArray:
+    if isinstance(space, spaces.Discrete):
+        return specs.DiscreteArray(int(space.n), name=name)
+    return specs.BoundedArray(space.shape, space.dtype, space.low, space.high, name)

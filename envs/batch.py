@@ -1,26 +1,25 @@
 """N episodes of a task in lock step: seeding, theta, the time limit. All interfaces in adapters.py are built on it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Array, Streams, generators
+from deconfounded.envs.streams import Array, Obs, Streams, generators
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.numbers import check_number, is_seed
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Mask, Task
 
 MAX_ENVS = 10_000_000
+Seed = int | Sequence[int | None] | None
 
 
 class BatchEnv:
     """N environments of one task; each has its own theta and three random streams (theta, start, noise).
 
-    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `alive` [N], whether the
-    episode goes on. An environment whose episode has ended keeps its row, has reward 0, and waits for `reset`.
+    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `action` [N, A], the last one
+    taken, for pictures; `alive` [N], whether the episode goes on. An environment whose episode has ended keeps its row,
+    has reward 0, and waits for `reset`.
     """
 
     def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
@@ -30,6 +29,7 @@ class BatchEnv:
         self.simulator = task.simulator(n)
         self.alive = np.zeros(n, bool)
         self.state: Array = np.zeros((n, 0))
+        self.action = np.zeros((n, task.action_width))
         self._steps, self._all_rows = np.zeros(n, int), np.arange(n)
         self._noise: Array = np.zeros((n, 0, 0))
         self._streams: list[list[np.random.Generator]] = []
@@ -40,7 +40,7 @@ class BatchEnv:
         """The hidden latents [N, L]."""
         return self.simulator.theta
 
-    def seed(self, seed: int | Sequence[int | None] | None) -> None:
+    def seed(self, seed: Seed) -> None:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
         if seed is None:
             seed = [None] * self.n
@@ -51,12 +51,7 @@ class BatchEnv:
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [generators(value) for value in seed]
 
-    def reset(
-        self,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-        where: NDArray[np.bool_] | None = None,
-    ) -> NDArray[np.float32]:
+    def reset(self, seed: Seed = None, options: dict[str, Any] | None = None, where: Mask | None = None) -> Obs:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
         options: `keep_theta`, True or a mask [N], keeps theta but for its drift, for the next episode of a trial; other
@@ -93,33 +88,30 @@ class BatchEnv:
                 self.simulator.set_theta(i, row)
         start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
         if first:
-            self.state = np.zeros((self.n, start.shape[1]))
-            self._noise = np.zeros((self.n, *noise.shape[1:]))
+            self.state, self._noise = np.zeros((self.n, start.shape[1])), np.zeros((self.n, *noise.shape[1:]))
         self.state[rows], self._noise[rows] = start, noise
         self._steps[rows], self.alive[rows] = 0, True
         return self.observe()
 
-    def _keep_mask(self, keep: object) -> NDArray[np.bool_]:
+    def _keep_mask(self, keep: object) -> Mask:
         """True, False or booleans [N] -> booleans [N]. Raises InputError for anything else."""
         try:
             mask = np.asarray(keep)
         except ValueError:  # rows of many lengths
             mask = np.asarray(keep, object)
         if mask.dtype != bool or mask.shape not in ((), (self.n,)):
-            raise InputError(
-                f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be True, False, or bool of shape"
-                f" ({self.n},), one for each environment"
-            )
+            right = f"True, False, or bool of shape ({self.n},), one for each environment"
+            raise InputError(f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be {right}")
         return np.broadcast_to(mask, self.n)
 
-    def observe(self) -> NDArray[np.float32]:
+    def observe(self) -> Obs:
         """Observations [N, O] of the present states; the privileged view appends the encoded theta."""
         obs = np.clip(self.task.observe(self.state).astype(np.float32), self._space.low, self._space.high)
         if self.privileged:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
 
-    def step(self, action: object) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def step(self, action: object) -> tuple[Obs, Array, Mask, Mask]:
         """Action [N, A] -> observation [N, O], reward [N], terminated [N], truncated [N].
 
         Environments whose episode is over are not stepped, whatever their action. Actions out of [-1, 1] are clipped.
@@ -128,7 +120,7 @@ class BatchEnv:
         ended = self.advance(action)
         return self.observe(), *ended
 
-    def advance(self, action: object) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    def advance(self, action: object) -> tuple[Array, Mask, Mask]:
         """`step` without the observation, for a caller that resets ended episodes before it observes."""
         if not self.state.size:
             raise InputError("step was called before the first reset; reset once")
@@ -137,6 +129,7 @@ class BatchEnv:
         rows = np.flatnonzero(self.alive) if over.any() else None
         on = slice(None) if rows is None else rows
         before, taken, noise = self.state[on], checked[on], self._noise[self._all_rows[on], self._steps[on]]
+        self.action[on] = taken
         after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
         after = task.sense(after, self.theta[on], noise)
         reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)
@@ -147,10 +140,7 @@ class BatchEnv:
         truncated &= ~terminated
         if not np.isfinite(reward).all():
             raise InputError(f"reward of {task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
-        if rows is None:
-            self.state = after
-        else:
-            self.state = self.state.copy()  # agents may hold the array before
-            self.state[rows] = after
+        self.state = self.state.copy()  # agents may hold the array before
+        self.state[on] = after
         self.alive = ~(over | terminated | truncated)
         return reward, terminated, truncated

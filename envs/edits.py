@@ -1,8 +1,6 @@
 """Edits of MuJoCo models by a latent: in a compiled model, and in a specification before compilation."""
 
-from __future__ import annotations
-
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 import mujoco
 import numpy as np
@@ -10,85 +8,74 @@ import numpy as np
 from deconfounded.envs.streams import Array
 
 
-class Edit(Protocol):
-    """Changes that a latent may make to a named element; a value is absolute, a scale multiplies the MJCF's value."""
-
-    def body_tilt(self, name: str, angle: float) -> None:
-        """Set a body's angle about its parent's y axis, in place of the MJCF's; rad."""
-
-    def body_shift(self, name: str, x: float) -> None:
-        """Set a body's x in its parent's frame; m."""
-
-    def body_mass(self, name: str, scale: float) -> None:
-        """Scale a body's mass and inertia."""
-
-    def geom_friction(self, name: str, value: float) -> None:
-        """Sliding friction coefficient of a geom."""
-
-    def joint_damping(self, name: str, value: float) -> None:
-        """Damping of a hinge or slide joint; N m s or N s/m."""
-
-    def slope(self, angle: float) -> None:
-        """Turn gravity about the y axis, so that the world rises along x; rad."""
-
-    def wind(self, x: float, y: float, z: float) -> None:
-        """Velocity of the medium, which the MJCF gives a density or a viscosity; m/s."""
-
-    def joint_stiffness(self, name: str, value: float) -> None:
-        """Spring of a hinge or slide joint; N m/rad or N/m."""
-
-    def actuator_gain(self, name: str, scale: float) -> None:
-        """Scale a motor's gain; -1 reverses it."""
-
-    def tendon_friction(self, name: str, value: float) -> None:
-        """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
-
-
-def _tilt(angle: float) -> list[float]:
-    return [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
-
-
 def _uphill(gravity: Array, angle: float) -> list[float]:
     x, y, z = gravity
     return [x * np.cos(angle) + z * np.sin(angle), y, z * np.cos(angle) - x * np.sin(angle)]
 
 
-class ModelEdit:
+class Edit(ABC):
+    """Changes that a latent may make to a named element; a value is absolute, a scale multiplies the MJCF's value."""
+
+    def __init__(self, target: mujoco.MjModel | mujoco.MjSpec, option: mujoco.MjOption) -> None:
+        self.target, self._option, self._gravity, self._stale = target, option, option.gravity.copy(), False
+
+    def body_tilt(self, name: str, angle: float) -> None:
+        """Set a body's angle about its parent's y axis, in place of the MJCF's; rad."""
+        self._stale = True
+        self.target.body(name).quat[:] = np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0
+
+    def body_shift(self, name: str, x: float) -> None:
+        """Set a body's x in its parent's frame; m."""
+        self._stale = True
+        self.target.body(name).pos[0] = x
+
+    @abstractmethod
+    def body_mass(self, name: str, scale: float) -> None:
+        """Scale a body's mass and inertia."""
+
+    def geom_friction(self, name: str, value: float) -> None:
+        """Sliding friction coefficient of a geom."""
+        self.target.geom(name).friction[0] = value
+
+    def joint_damping(self, name: str, value: float) -> None:
+        """Damping of a hinge or slide joint; N m s or N s/m."""
+        self.target.joint(name).damping[0] = value
+
+    def joint_stiffness(self, name: str, value: float) -> None:
+        """Spring of a hinge or slide joint; N m/rad or N/m."""
+        self.target.joint(name).stiffness[0] = value
+
+    def slope(self, angle: float) -> None:
+        """Turn gravity about the y axis, so that the world rises along x; rad."""
+        self._option.gravity[:] = _uphill(self._gravity, angle)
+
+    def wind(self, x: float, y: float, z: float) -> None:
+        """Velocity of the medium, which the MJCF gives a density or a viscosity; m/s."""
+        self._option.wind[:] = x, y, z
+
+    @abstractmethod
+    def actuator_gain(self, name: str, scale: float) -> None:
+        """Scale a motor's gain; -1 reverses it."""
+
+    @abstractmethod
+    def tendon_friction(self, name: str, value: float) -> None:
+        """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
+
+
+class ModelEdit(Edit):
     """Edits of a compiled model in place. Scales multiply the nominal model's values, so that they never compound.
 
     data: scratch space, which many models may share (an MjData takes megabytes).
     """
 
     def __init__(self, model: mujoco.MjModel, nominal: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self.model, self._nominal, self._data, self._stale = model, nominal, data, False
-
-    def body_tilt(self, name: str, angle: float) -> None:
-        self._stale = True
-        self.model.body(name).quat[:] = _tilt(angle)
-
-    def body_shift(self, name: str, x: float) -> None:
-        self._stale = True
-        self.model.body(name).pos[0] = x
+        super().__init__(model, model.opt)
+        self.model, self._nominal, self._gravity, self._data = model, nominal, nominal.opt.gravity, data
 
     def body_mass(self, name: str, scale: float) -> None:
         self._stale = True
         self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
         self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
-
-    def geom_friction(self, name: str, value: float) -> None:
-        self.model.geom(name).friction[0] = value
-
-    def joint_damping(self, name: str, value: float) -> None:
-        self.model.joint(name).damping[0] = value
-
-    def slope(self, angle: float) -> None:
-        self.model.opt.gravity[:] = _uphill(self._nominal.opt.gravity, angle)
-
-    def wind(self, x: float, y: float, z: float) -> None:
-        self.model.opt.wind[:] = x, y, z
-
-    def joint_stiffness(self, name: str, value: float) -> None:
-        self.model.joint(name).stiffness[0] = value
 
     def actuator_gain(self, name: str, scale: float) -> None:
         self.model.actuator(name).gainprm[0] = self._nominal.actuator(name).gainprm[0] * scale
@@ -103,7 +90,7 @@ class ModelEdit:
             self._stale = False
 
 
-class SpecEdit:
+class SpecEdit(Edit):
     """The same edits before compilation: the reference for tests of ModelEdit.
 
     MJCF states a number in several ways: a mass by density or <inertial>, a position within <frame>s, an angle by
@@ -112,6 +99,7 @@ class SpecEdit:
     """
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
+        super().__init__(spec, spec.option)
         self.spec, model = spec, spec.compile()
         for joint in spec.joints:
             if joint.springdamper.any():
@@ -131,30 +119,9 @@ class SpecEdit:
             for part in ("pos", "quat", "ipos", "iquat", "inertia"):
                 setattr(body, part, getattr(model, f"body_{part}")[i])
 
-    def body_tilt(self, name: str, angle: float) -> None:
-        self.spec.body(name).quat = _tilt(angle)
-
-    def body_shift(self, name: str, x: float) -> None:
-        self.spec.body(name).pos[0] = x
-
     def body_mass(self, name: str, scale: float) -> None:
         self.spec.body(name).mass *= scale
         self.spec.body(name).inertia *= scale
-
-    def geom_friction(self, name: str, value: float) -> None:
-        self.spec.geom(name).friction[0] = value
-
-    def joint_damping(self, name: str, value: float) -> None:
-        self.spec.joint(name).damping[0] = value
-
-    def slope(self, angle: float) -> None:
-        self.spec.option.gravity = _uphill(self.spec.option.gravity, angle)
-
-    def wind(self, x: float, y: float, z: float) -> None:
-        self.spec.option.wind = x, y, z
-
-    def joint_stiffness(self, name: str, value: float) -> None:
-        self.spec.joint(name).stiffness[0] = value
 
     def actuator_gain(self, name: str, scale: float) -> None:
         self.spec.actuator(name).gainprm[0] *= scale

@@ -1,7 +1,5 @@
 """Hidden physical parameters and their distributions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -39,16 +37,14 @@ class Latent:
             "categorical": ("whole numbers low < high", self.low % 1 == 0 == self.high % 1),
         }
         if self.distribution not in rules:
-            raise InputError(
-                f"distribution of {self.name} was {self.distribution!r}; it must be one of {', '.join(rules)}"
-            )
+            right = f"one of {', '.join(rules)}"
+            raise InputError(f"distribution of {self.name} was {self.distribution!r}; it must be {right}")
         right, holds = rules[self.distribution]
         if not (holds and -np.inf < self.low < self.high < np.inf):
             raise InputError(f"{self.name} was {self.low:g} to {self.high:g}, {self.distribution}; it must be {right}")
         if not 0 <= self.drift <= 1 or (self.drift and self.distribution == "categorical"):
-            raise InputError(
-                f"drift of {self.name} was {self.drift:g}; it must be from 0 to 1, and 0 of a categorical latent"
-            )
+            right = "from 0 to 1, and 0 of a categorical latent"
+            raise InputError(f"drift of {self.name} was {self.drift:g}; it must be {right}")
 
     def ppf(self, u: Array) -> Array:
         """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""

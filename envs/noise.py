@@ -1,7 +1,5 @@
 """Process noise: normal on every coordinate of a joint; for rotations, on the tangent space at the outcome."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -24,11 +22,10 @@ class Kind(NamedTuple):
     stds: tuple[str, ...]
 
 
+TURN = ("rotation rad", "angular velocity rad/s")
 KINDS = {
-    mujoco.mjtJoint.mjJNT_FREE: Kind(
-        "free", 7, 6, ("position m", "rotation rad", "velocity m/s", "angular velocity rad/s")
-    ),
-    mujoco.mjtJoint.mjJNT_BALL: Kind("ball", 4, 3, ("rotation rad", "angular velocity rad/s")),
+    mujoco.mjtJoint.mjJNT_FREE: Kind("free", 7, 6, ("position m", *TURN[:1], "velocity m/s", *TURN[1:])),
+    mujoco.mjtJoint.mjJNT_BALL: Kind("ball", 4, 3, TURN),
     mujoco.mjtJoint.mjJNT_SLIDE: Kind("slide", 1, 1, ("position m", "velocity m/s")),
     mujoco.mjtJoint.mjJNT_HINGE: Kind("hinge", 1, 1, ("position rad", "velocity rad/s")),
 }
@@ -55,32 +52,27 @@ class ProcessNoise:
 
     def __init__(self, model: mujoco.MjModel, stds: Mapping[str, tuple[float, ...]]) -> None:
         self.size = 0
-        index: list[int] = []  # of plain coordinates, in the state
-        draws: list[int] = []  # and in the noise
-        sigma: list[float] = []
-        self._rotations: list[tuple[slice, slice, float]] = []  # the same of quaternions
-        for joint, given in stds.items():
-            for part, std in _parts(model, joint, given):
-                if std == 0:
-                    continue
-                width = min(len(part), 3)
-                if len(part) == 4:
-                    rows = slice(part.start, part.stop), slice(self.size, self.size + 3)
-                    self._rotations.append((*rows, std))
-                else:
-                    index += part
-                    draws += range(self.size, self.size + width)
-                    sigma += [std] * width
-                self.size += width
+        plain: list[tuple[int, int, float]] = []  # of each coordinate: its column in the state, that in the noise, std
+        self._rotations: list[tuple[list[int], list[int], float]] = []  # the same of quaternions
+        for part, std in (pair for joint, given in stds.items() for pair in _parts(model, joint, given) if pair[1]):
+            drawn = [*range(self.size, self.size + min(len(part), 3))]
+            if len(part) == 4:
+                self._rotations.append(([*part], drawn, std))
+            else:
+                plain += zip(part, drawn, [std] * len(part), strict=True)
+            self.size += len(drawn)
+        index, draws, sigma = zip(*plain, strict=True) if plain else ((), (), ())
         self._index, self._draws, self._sigma = np.array(index, int), np.array(draws, int), np.array(sigma, float)
-        quaternions = [np.arange(at.start, at.stop) for at, _, _ in self._rotations]
-        self.columns: NDArray[np.int64] = np.sort(np.concatenate([self._index, *quaternions]))
+        self.columns: NDArray[np.int64] = np.sort(np.concatenate([self._index, *(at for at, _, _ in self._rotations)]))
 
     def apply(self, outcome: Array, noise: Array) -> Array:
         """Outcome [N, S] and unit noise [N, Z] -> next state [N, S], in place; quaternions stay of unit length."""
         outcome[:, self._index] += self._sigma * noise[:, self._draws]
         for at, drawn, std in self._rotations:
-            rotated = _product(outcome[:, at], _exp(std * noise[:, drawn]))
+            w = std * noise[:, drawn]  # rad
+            half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
+            turn = np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)  # exp(w / 2)
+            rotated = _product(outcome[:, at], turn)
             outcome[:, at] = rotated / np.linalg.norm(rotated, axis=-1, keepdims=True)
         return outcome
 
@@ -106,17 +98,13 @@ def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[t
     q, v = columns(model, joint)
     parts = {1: [q, v], 4: [q, v], 7: [q[:3], q[3:], v[:3], v[3:]]}[len(q)]
     kind = KINDS[mujoco.mjtJoint(int(model.joint(joint).type[0]))]
+    was = f"process_noise of joint {joint}, a {kind.name} joint, was {stds}; "
     if len(stds) != len(kind.stds):
-        raise InputError(
-            f"process_noise of joint {joint}, a {kind.name} joint, was {stds}; it must be {len(kind.stds)} standard"
-            f" deviations: {', '.join(kind.stds)}"
-        )
+        raise InputError(f"{was}it must be {len(kind.stds)} standard deviations: {', '.join(kind.stds)}")
     if not all(0 <= std < np.inf for std in stds):
-        raise InputError(f"process_noise of joint {joint} was {stds}; it must be standard deviations, from 0 up")
+        raise InputError(f"{was}it must be standard deviations, from 0 up")
     if any(std > MAX_ROTATION_STD for part, std in zip(parts, stds, strict=True) if len(part) == 4):
-        raise InputError(
-            f"process_noise of joint {joint} was {stds}; its rotation's must be at most {MAX_ROTATION_STD} rad"
-        )
+        raise InputError(f"{was}its rotation's must be at most {MAX_ROTATION_STD} rad")
     return list(zip(parts, stds, strict=True))
 
 
@@ -124,18 +112,6 @@ def _product(p: Array, q: Array) -> Array:
     """Product p q [..., 4] of quaternions [..., 4]: q's rotation, then p's."""
     a, b, c, d = np.moveaxis(p, -1, 0)
     e, f, g, h = np.moveaxis(q, -1, 0)
-    return np.stack(
-        [
-            a * e - b * f - c * g - d * h,
-            a * f + b * e + c * h - d * g,
-            a * g - b * h + c * e + d * f,
-            a * h + b * g - c * f + d * e,
-        ],
-        -1,
-    )
-
-
-def _exp(w: Array) -> Array:
-    """Unit quaternions [..., 4] of rotation vectors [..., 3], rad."""
-    half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / np.pi) * w], -1)
+    real, x = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g
+    y, z = a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e
+    return np.stack([real, x, y, z], -1)

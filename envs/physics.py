@@ -1,7 +1,5 @@
 """Batched MuJoCo: a model for each environment, stepped by mujoco.rollout's thread pool. No other file steps MuJoCo."""
 
-from __future__ import annotations
-
 import copy
 import os
 from abc import abstractmethod
@@ -35,7 +33,7 @@ def cores() -> int:
 class Physics(Simulator):
     """Models of n environments, each with its own theta, stepped in a thread pool of `cores()` threads."""
 
-    def __init__(self, task: MujocoTask, n: int) -> None:
+    def __init__(self, task: "MujocoTask", n: int) -> None:
         super().__init__(task, n)
         self._mujoco_task = task
         self.models = [copy.copy(task.model) for _ in range(n)]
@@ -153,6 +151,7 @@ class MujocoTask(Task):
 
     action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
     substeps: ClassVar[int] = 2  # physics steps a control step
+    controls: ClassVar[tuple[Any, Any]] = (0.0, 1.0)  # middle and swing of MuJoCo's ctrl, numbers or [nu]
     # joint -> std of (position, velocity) a control step; of ball and free joints see envs/noise.py. A coordinate
     # without noise counts as no evidence: theta must not move it, or nothing observed may depend on it.
     process_noise: ClassVar[dict[str, tuple[float, ...]]]
@@ -167,8 +166,13 @@ class MujocoTask(Task):
         raise InputError(message)
 
     def control(self, action: Array) -> Array:
-        """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default one to one."""
-        return action
+        """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default middle + swing * action, of `controls`."""
+        middle, swing = self.controls
+        return middle + swing * action
+
+    def observe(self, state: Array) -> Array:
+        """By default positions, then velocities, of the joints of `process_noise`, in its order."""
+        return np.stack([read(state, joint) for read in (self.qpos, self.qvel) for joint in self.process_noise], -1)
 
     def spec(self) -> mujoco.MjSpec:
         """The nominal model, from <name>.xml in `home`. Every environment has a copy, so keep it small."""
@@ -188,18 +192,11 @@ class MujocoTask(Task):
         return float(self.model.opt.timestep) * self.substeps
 
     def qpos(self, state: Array, joint: str) -> Array:
-        """Position [...] of a hinge or slide joint in states [..., S], rad or m.
-
-        Of a ball joint, its quaternion [..., 4]; of a free joint, position (m) and quaternion [..., 7].
-        """
+        """Position [...] of a joint, m or rad; of a ball joint a quaternion [..., 4]; of a free joint both [..., 7]."""
         return state[..., self._address(joint)[0]]
 
     def qvel(self, state: Array, joint: str) -> Array:
-        """Velocity [...] of a hinge or slide joint, rad/s or m/s.
-
-        Of a ball joint, its angular velocity about its own axes [..., 3]; of a free joint, velocity and angular
-        velocity [..., 6].
-        """
+        """Velocity [...] of a joint, rad/s or m/s; of a ball joint [..., 3] in its own axes; of a free one [..., 6]."""
         return state[..., self._address(joint)[1]]
 
     def state(self, **joints: tuple[ArrayLike, ArrayLike]) -> Array:
@@ -220,8 +217,7 @@ class MujocoTask(Task):
     def _address(self, joint: str) -> tuple[int | slice, int | slice]:
         if joint not in self._addresses:
             q, v = columns(self.model, joint)
-            single = len(q) == 1
-            self._addresses[joint] = (q[0], v[0]) if single else (slice(q.start, q.stop), slice(v.start, v.stop))
+            self._addresses[joint] = (q[0], v[0]) if len(q) == 1 else (slice(q[0], q.stop), slice(v[0], v.stop))
         return self._addresses[joint]
 
     @cached_property

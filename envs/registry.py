@@ -1,7 +1,5 @@
 """The registry of tasks: `register`, `names`, `get`, `make`, `make_vec`, `make_dm`."""
 
-from __future__ import annotations
-
 import copyreg
 import difflib
 import re
@@ -12,8 +10,7 @@ import gymnasium
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.support import outside
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import InputError, Task
 
 TASKS: dict[str, type[Task]] = {}
 GROUP = "deconfounded.tasks"  # group of entry points of installed packages: name = "package.module:Class"
@@ -23,9 +20,8 @@ def register(cls: type[Task]) -> type[Task]:
     """Add a task to the registry and to gymnasium; usable as a decorator. Raises InputError for an invalid class."""
     name, where = getattr(cls, "name", None), _where(cls)
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        raise InputError(
-            f"name of {cls.__name__} in {where} was {name!r}; it must be of a-z, 0-9 and _, from a letter on"
-        )
+        right = "it must be of a-z, 0-9 and _, from a letter on"
+        raise InputError(f"name of {cls.__name__} in {where} was {name!r}; {right}")
     if missing := sorted(cls.__abstractmethods__):
         raise InputError(f"task {name} of {where} lacks {', '.join(missing)}")
     for part in ("latents", "horizon", "action_space", "observation"):
@@ -38,15 +34,10 @@ def register(cls: type[Task]) -> type[Task]:
         cls.reference = name if ours else outside.reference(cls) or name
     if outside.is_outside(cls.reference):
         copyreg.pickle(cls, _parts)
-    TASKS[name] = cls
-    gymnasium.registry.pop(cls().gym_id, None)
-    gymnasium.register(
-        cls().gym_id,
-        entry_point="deconfounded.envs:make",
-        vector_entry_point="deconfounded.envs:make_registered_vec",
-        max_episode_steps=cls.horizon,
-        kwargs={"name": cls.reference},
-    )
+    TASKS[name], gym_id = cls, cls().gym_id
+    gymnasium.registry.pop(gym_id, None)
+    one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}
+    gymnasium.register(gym_id, one, max_episode_steps=cls.horizon, vector_entry_point=many, kwargs=arguments)
     return cls
 
 
@@ -80,15 +71,12 @@ def get(name: str) -> Task:
         raise InputError(f"task was {name!r}; it must be a name, or path/file.py:Class")
     if name in TASKS:
         return TASKS[name]()
-    for point in entry_points(group=GROUP):
-        if point.name == name:
-            name = point.value
+    name = {point.name: point.value for point in entry_points(group=GROUP)}.get(name, name)
     if not outside.is_outside(name):
         raise closest("task", name, names(), "; your own is path/file.py:Class")
     reference = outside.absolute(name)
-    for registered in TASKS.values():
-        if registered.reference == reference:
-            return registered()
+    if registered := [task for task in TASKS.values() if task.reference == reference]:
+        return registered[0]()
     cls = outside.find("task", name)
     if not (isinstance(cls, type) and issubclass(cls, Task)):
         raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
@@ -108,17 +96,13 @@ def make_vec(
     return GymVectorEnv(get(name), n, privileged, episodes, render_mode)
 
 
-def make_registered_vec(
-    name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kwargs: Any
-) -> GymVectorEnv:
+def make_registered_vec(name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kw: Any) -> GymVectorEnv:
     """`make_vec` as gymnasium.make_vec calls it. Raises InputError for a time limit other than the registered one."""
     task = get(name)
     if max_episode_steps not in (None, task.horizon):
-        raise InputError(
-            f"max_episode_steps of {task.name} was {max_episode_steps}; it must be {task.horizon} here, or left out:"
-            " vectorization_mode='sync' takes shorter ones"
-        )
-    return make_vec(name, num_envs, **kwargs)
+        right = f"{task.horizon} here, or left out: vectorization_mode='sync' takes shorter ones"
+        raise InputError(f"max_episode_steps of {task.name} was {max_episode_steps}; it must be {right}")
+    return make_vec(name, num_envs, **kw)
 
 
 def make_dm(name: str, privileged: bool = False, seed: int | None = None) -> DmEnv:

@@ -1,7 +1,5 @@
 """Rendering of MuJoCo states without a screen: by EGL, else by OSMesa, else InputError."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess
@@ -32,15 +30,14 @@ def backend() -> str:
     raise InputError(f"no GL for pictures: tried {selected or 'egl and osmesa'}; install libegl1 or libosmesa6")
 
 
-_GL_PROCESSES: set[int] = set()
-"""Ids of processes that have created a GL context: this process, and those that it was forked from."""
+_GL_PROCESSES: set[int] = set()  # that created a GL context: this process, and those that it was forked from
 
 
-def _create(model: mujoco.MjModel, height: int, width: int) -> mujoco.Renderer:
+def _create(model: mujoco.MjModel) -> mujoco.Renderer:
     if _GL_PROCESSES - {os.getpid()}:  # the GL library would wait for threads of the parent process
         raise InputError("pictures cannot be made in a fork of a process that has made some; start it by `spawn`")
     _GL_PROCESSES.add(os.getpid())
-    return mujoco.Renderer(model, height, width)
+    return mujoco.Renderer(model, height=240, width=320)
 
 
 def _load_triton() -> None:
@@ -100,27 +97,31 @@ def chequer(spec: mujoco.MjSpec, material: str) -> None:
     spec.material(material).textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material
 
 
+def gravity_in_view(model: mujoco.MjModel) -> Array:
+    """Gravity [3] as the camera `view` sees it: to the right, up, and towards the camera."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model.opt.gravity @ data.cam_xmat[model.camera("view").id].reshape(3, 3)
+
+
 def level(model: mujoco.MjModel) -> None:
     """Roll the camera `view` until gravity points down in its picture, unless there is none across the view."""
-    view, data = model.camera("view"), mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    right, up, _ = model.opt.gravity @ data.cam_xmat[view.id].reshape(3, 3)
-    if np.hypot(right, up) <= 1e-6 * np.linalg.norm(model.opt.gravity):
-        return
-    roll, before = np.arctan2(right, -up) / 2, view.quat.copy()
-    mujoco.mju_mulQuat(view.quat, before, np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
+    right, up, _ = gravity_in_view(model)
+    if np.hypot(right, up) > 1e-6 * np.linalg.norm(model.opt.gravity):
+        roll, quat = np.arctan2(right, -up) / 2, model.camera("view").quat
+        mujoco.mju_mulQuat(quat, quat.copy(), np.array([np.cos(roll), 0.0, 0.0, np.sin(roll)]))
 
 
 class MujocoRenderer:
     """Renderer of a model's states through its camera `view`. Raises InputError where no GL works."""
 
-    def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320) -> None:
+    def __init__(self, model: mujoco.MjModel) -> None:
         _load_triton()
         if (name := backend()) in ("egl", "osmesa"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
-        self._renderer = Handle(partial(_create, model, height, width), _close)
+        self._renderer = Handle(partial(_create, model), _close)
         self._renderer()
 
     def __call__(self, state: Array, action: Array) -> NDArray[np.uint8]:

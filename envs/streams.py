@@ -1,7 +1,5 @@
 """Random numbers for a batch of rows in groups, with an independent generator for each group."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
+Mask = NDArray[np.bool_]
+Obs = NDArray[np.float32]
 
 
 class Streams:
@@ -18,23 +18,13 @@ class Streams:
         self.rngs = list(rngs)
         self.groups = len(self.rngs)
 
-    def _parts(self, size: tuple[int, ...]) -> tuple[Array, list[Array]]:
-        out = np.empty(size)
-        return out, list(out.reshape(self.groups, -1))
-
     def random(self, size: tuple[int, ...]) -> Array:
         """Draws from U(0, 1) of a given size, whose first axis counts rows."""
-        out, parts = self._parts(size)
-        for rng, part in zip(self.rngs, parts, strict=True):
-            rng.random(out=part)
-        return out
+        return np.concatenate([rng.random((size[0] // self.groups, *size[1:])) for rng in self.rngs])
 
     def standard_normal(self, size: tuple[int, ...]) -> Array:
         """Draws from N(0, 1) of a given size, whose first axis counts rows."""
-        out, parts = self._parts(size)
-        for rng, part in zip(self.rngs, parts, strict=True):
-            rng.standard_normal(out=part)
-        return out
+        return np.concatenate([rng.standard_normal((size[0] // self.groups, *size[1:])) for rng in self.rngs])
 
     def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:
         """Draws from U(low, high) with bounds [K], a row for each generator: K columns [K, groups], to be unpacked."""

@@ -11,10 +11,9 @@ is one integer column, so that actions are always [N, A]. A task holds no state 
 streams are passed in.
 """
 
-from __future__ import annotations
-
 import inspect
 from abc import ABC, abstractmethod
+from functools import reduce
 from pathlib import Path
 from typing import ClassVar, Protocol
 
@@ -23,7 +22,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.spaces import action_sizes
 
@@ -39,7 +38,7 @@ class Renderer(Protocol):
 class Simulator:
     """The noise-free part of p(s'|s, a, theta) for n environments, each with its own theta."""
 
-    def __init__(self, task: Task, n: int) -> None:
+    def __init__(self, task: "Task", n: int) -> None:
         self.task, self.theta = task, np.tile([lat.low for lat in task.latents], (n, 1)).astype(float)
 
     def set_theta(self, i: int, theta: Array) -> None:
@@ -114,7 +113,7 @@ class Task(ABC):
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         """Reward [N] of a step, at most 1. It is for scoring: imitators never see it."""
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         """Whether the episode ends in a state [N, S] -> [N]; by default never."""
         return np.zeros(len(state), bool)
 
@@ -190,10 +189,7 @@ class Task(ABC):
 
     def transition(self, k: int) -> Array:
         """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next episode | theta of this episode)."""
-        matrix: Array = np.ones((1, 1))
-        for lat in self.latents:
-            matrix = np.kron(matrix, lat.transition(self._values_each(k)))
-        return matrix
+        return reduce(np.kron, (lat.transition(self._values_each(k)) for lat in self.latents))
 
     def encode_theta(self, theta: Array) -> Array:
         """Features [..., F] of theta [..., L], of about unit size, for experts and oracles alone."""
@@ -207,23 +203,17 @@ class Task(ABC):
                 raise TypeError
             array = np.broadcast_to(array.astype(float), (n, len(self.latents))).copy()
         except (TypeError, ValueError):
-            raise InputError(
-                f"theta of {self.name} was {theta!r}; it must be {len(self.latents)} number(s), or one row for each"
-                f" of the {n} environment(s)"
-            ) from None
-        for i, lat in enumerate(self.latents):
-            bad = ~((array[:, i] >= lat.low) & (array[:, i] <= lat.high))
-            if lat.distribution == "categorical":
-                bad |= array[:, i] != np.floor(array[:, i])
-            if bad.any():
-                kind = "a whole number" if lat.distribution == "categorical" else "a number"
-                raise InputError(
-                    f"{lat.name} of {self.name} was {array[bad, i][0]:g}; it must be {kind} from {lat.low:g} to"
-                    f" {lat.high:g} {lat.unit}".rstrip()
-                )
+            right = f"{len(self.latents)} number(s), or one row for each of the {n} environment(s)"
+            raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
+        for column, lat in zip(array.T, self.latents, strict=True):
+            whole = lat.distribution == "categorical"
+            bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column % 1 != 0)]
+            if bad.size:
+                right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
+                raise InputError(f"{lat.name} of {self.name} was {bad[0]:g}; it must be {right}")
         return array
 
-    def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
+    def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:
         """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist.
 
         ignored [N]: rows that are not used, and that may hold any number.
@@ -235,8 +225,7 @@ class Task(ABC):
             array = array.astype(float)
         except (TypeError, ValueError):
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
-        if array.shape != (n, self.action_width):
-            right = (n, self.action_width)
+        if array.shape != (right := (n, self.action_width)):
             raise InputError(f"action of {self.name} had shape {array.shape}; it must be {right}")
         if ignored is not None:
             array[ignored] = 0

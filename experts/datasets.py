@@ -1,7 +1,5 @@
 """Trials as Minari data sets: episodes with the number of their trial in their metadata and, for scoring, theta."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Iterator

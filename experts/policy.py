@@ -1,13 +1,11 @@
 """Experts, policies that see theta: the task's closed form if it has one, else a small network in safetensors."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,21 +14,18 @@ from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
 from deconfounded.envs import InputError, Task
-from deconfounded.envs.streams import Array
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
-from deconfounded.envs.task import ASSETS
+from deconfounded.envs.task import ASSETS, Array, Streams
 
-
-class RandomSource(Protocol):
-    """A source of random numbers: a numpy generator, or `envs.streams.Streams` of rows in `groups` equal groups."""
-
-    def random(self, size: tuple[int, ...]) -> Array: ...
-    def standard_normal(self, size: tuple[int, ...]) -> Array: ...
+RandomSource = np.random.Generator | Streams
 
 
 class Expert(ABC):
     """pi_exp(a | s, theta), batched and Markov."""
+
+    def __init__(self, task: Task) -> None:
+        self.task = task
 
     @abstractmethod
     def act(self, obs: Array, theta: Array, rng: RandomSource) -> Array:
@@ -50,9 +45,6 @@ def sample_rows(probs: Array, rng: RandomSource) -> NDArray[np.int64]:
 class DiscreteExpert(Expert):
     """The closed-form expert that a task states as `expert_probs`."""
 
-    def __init__(self, task: Task) -> None:
-        self.task = task
-
     def act(self, obs: Array, theta: Array, rng: RandomSource) -> Array:
         return sample_rows(self._probs(obs, theta), rng)[:, None].astype(float)
 
@@ -67,9 +59,6 @@ class DiscreteExpert(Expert):
 
 class BoxExpert(Expert):
     """A Gaussian expert, clip(mu(s, theta) + sigma eps, -1, 1), with the task's expert noise sigma."""
-
-    def __init__(self, task: Task) -> None:
-        self.task = task
 
     @abstractmethod
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
@@ -120,8 +109,7 @@ class CallableExpert(BoxExpert):
             raise
         except Exception as error:
             raise InputError(f"expert {self.name}: {error_line(error)}") from error
-        shape = (len(obs), self.task.action_width)
-        if given.shape != shape or not np.isfinite(given).all():
+        if given.shape != (shape := (len(obs), self.task.action_width)) or not np.isfinite(given).all():
             what = f"shape {given.shape}" if given.shape != shape else "NaN or infinity"
             raise InputError(f"expert {self.name} gave {what} for {len(obs)} observations; it must be {shape}, finite")
         return np.clip(given, -1, 1)
@@ -133,16 +121,24 @@ def path(task: Task) -> Path:
     return folder / f"{task.name}.safetensors"
 
 
+def _card(file: Path) -> dict[str, Any]:
+    """The card beside a file of weights; {} if there is none, as it is optional, or no object is in it."""
+    try:
+        card = json.loads(file.with_suffix(".json").read_bytes())
+    except (OSError, ValueError):
+        card = None
+    return card if isinstance(card, dict) else {}
+
+
 def names_callable(source: str) -> bool:
     """Whether an expert's source is path/file.py:name or package.module:name, not a file of weights."""
     return outside.is_outside(source) and not source.endswith(".safetensors")
 
 
 def load(task: Task, source: str | Path | None = None) -> Expert:
-    """Load a task's expert: the closed form, the weights that come with the task, or others.
+    """Load a task's expert: the closed form, the weights that come with the task, or those of a .safetensors file.
 
-    source: a .safetensors file, or a callable (`CallableExpert`) as path/file.py:name or package.module:name. Raises
-    InputError if it is missing, damaged, or does not fit the task.
+    source: the file, or the reference of a callable (`CallableExpert`). Raises InputError if it does not fit the task.
     """
     if task.n_actions:
         if source is not None:
@@ -165,11 +161,7 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:
-        recorded = json.loads(file.with_suffix(".json").read_bytes()).get("sha256")
-    except (OSError, ValueError, AttributeError):  # a card is optional
-        recorded = None
-    try:
-        if recorded not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
+        if _card(file).get("sha256") not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
             raise OSError(f"their sha256 is not that of {file.with_suffix('.json').name}")
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
@@ -196,14 +188,8 @@ def fingerprint(task: Task, source: str | Path | None = None) -> str:
 
 
 def version(task: Task, source: str | Path | None = None) -> int:
-    """Version of an expert, raised by hand when its actions change: that in the weights' card, else 0.
-
-    A closed form has its task's version.
-    """
+    """Version of an expert, raised by hand when its actions change: in the weights' card, or a closed form's task's."""
     if task.n_actions:
         return task.version
-    card = (path(task) if source is None else Path(source)).with_suffix(".json")
-    try:
-        return int(json.loads(card.read_bytes()).get("version", 0))
-    except (OSError, ValueError, TypeError, AttributeError):  # a card is optional
-        return 0
+    stated = _card(path(task) if source is None else Path(source)).get("version")
+    return stated if isinstance(stated, int) else 0

@@ -1,6 +1,6 @@
 """Roll-outs: trials, the data that imitators learn from; agents, which act in them; and the loop that runs them."""
 
-from __future__ import annotations
+from __future__ import annotations  # as what only type checkers import is no name at run time
 
 import hashlib
 import io
@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Array, Streams, generators, unseeded
+from deconfounded.envs.streams import Array, Mask, Obs, Streams, generators, unseeded
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.envs.support.numbers import check_number, is_seed
@@ -39,7 +39,7 @@ class Trials:
 
     obs: NDArray[np.float32]
     action: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+    mask: Mask
     actions: int = 0
 
     def __post_init__(self) -> None:
@@ -120,8 +120,7 @@ def joined(parts: Sequence[Trials]) -> Trials:
     return Trials(obs, action, mask, parts[0].actions)
 
 
-State = tuple[dict[str, Any], dict[str, NDArray[Any]]]
-"""Settings that json can hold, and arrays."""
+State = tuple[dict[str, Any], dict[str, NDArray[Any]]]  # settings that json can hold, and arrays
 
 
 class Agent(ABC):
@@ -131,18 +130,13 @@ class Agent(ABC):
         """Start n new trials, each under a theta of its own: reset all memory."""
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:  # noqa: B027 (nor those without random numbers)
-        """Start an episode of the present trials: theta stays, and so may memory.
-
-        rngs: a generator for each of equal groups of trials.
-        """
+        """Start an episode of the present trials under the same theta. rngs: one for each of equal groups of trials."""
 
     @abstractmethod
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         """Observation [N, O] -> action [N, A]."""
 
-    def observe(  # noqa: B027 (agents without memory need nothing here)
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
+    def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:  # noqa: B027 (as begin)
         """Take in a transition of each trial; where `alive` [N] is False, the episode had ended before it."""
 
     def features(self) -> NDArray[np.float32] | None:
@@ -159,35 +153,39 @@ class Agent(ABC):
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 
 
-class ExpertAgent(Agent):
+class _Drawing(Agent):
+    """An agent that draws random numbers."""
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng = Streams(rngs)
+
+
+class ExpertAgent(_Drawing):
     """The expert as an agent. theta [N, L]: what it acts by; None: that of the environment."""
 
     def __init__(self, env: BatchEnv, expert: Expert, theta: Array | None = None) -> None:
         self.env, self.expert, self.theta = env, expert, theta
 
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self._rng = Streams(rngs)
-
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         return self.expert.act(obs, self.env.theta if self.theta is None else self.theta, self._rng)
 
 
-class RandomAgent(Agent):
+class RandomAgent(_Drawing):
     """An agent with uniform actions: the zero of every score."""
 
     def __init__(self, space: spaces.Box | spaces.Discrete) -> None:
         self.space = space
 
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self._rng = Streams(rngs)
-
-    def act(self, obs: NDArray[np.float32]) -> Array:
+    def act(self, obs: Obs) -> Array:
         width, n_actions = action_sizes(self.space)
         draws = self._rng.random((len(obs), width))
         return np.floor(draws * n_actions) if n_actions else 2 * draws - 1
 
 
-def thetas(task: Task, n: int, episodes: int, seed: int | Sequence[int]) -> Array:
+Seeds = int | Sequence[int]  # one for all trials, or one for each of equal groups of them
+
+
+def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
     """Theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
     rng = Streams([generators(env_seed)[0] for env_seed in trial_seeds(n, seed)])
     by_episode = [task.sample_theta(rng)]
@@ -217,9 +215,7 @@ class Rollout(NamedTuple):
     theta: Array
 
 
-def run_trials(
-    env: BatchEnv, agent: Agent, episodes: int, seed: int | Sequence[int], theta: Array | None = None
-) -> Rollout:
+def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: Array | None = None) -> Rollout:
     """Run an agent in N trials of `episodes` episodes each.
 
     seed: of the environments and, independently, of the agent; or a seed for each of equal consecutive groups of
@@ -233,7 +229,7 @@ def run_trials(
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
     hidden = np.zeros((n, episodes, len(task.latents)))
-    action: NDArray[np.float32] | None = None
+    action = np.zeros((n, episodes, task.horizon, task.action_width), np.float32)
     for e in range(episodes):
         if e == 0:
             now = env.reset(each, None if theta is None else {"theta": theta})
@@ -248,8 +244,6 @@ def run_trials(
             chosen = agent.act(now)
             then, reward, _, _ = env.step(chosen)
             agent.observe(now, chosen, then, alive)
-            if action is None:
-                action = np.zeros((n, episodes, task.horizon, chosen.shape[-1]), np.float32)
             obs[:, e, t + 1] = np.where(alive[:, None], then, obs[:, e, t])
             action[:, e, t] = np.where(alive[:, None], chosen, 0)
             mask[:, e, t] = alive
@@ -258,5 +252,4 @@ def run_trials(
             if not env.alive.any():
                 obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
                 break
-    assert action is not None
     return Rollout(Trials(obs, action, mask, task.n_actions), returns, hidden)

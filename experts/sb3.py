@@ -1,8 +1,5 @@
 """Batched environments as a Stable-Baselines3 VecEnv, for fast training of experts."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -55,19 +52,9 @@ class Sb3VecEnv(BatchVecEnv):
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in done]
         for i in np.flatnonzero(done):
-            infos[i] = {
-                "terminal_observation": obs[i].copy(),
-                "TimeLimit.truncated": bool(truncated[i]),
-                "episode": {"r": self._returns[i], "l": self._lengths[i], "t": 0.0},
-            }
+            episode = {"r": self._returns[i], "l": self._lengths[i], "t": 0.0}
+            infos[i] = {"terminal_observation": obs[i], "TimeLimit.truncated": bool(truncated[i]), "episode": episode}
         if done.any():
             self._returns[done], self._lengths[done] = 0, 0
             obs = batch.reset(where=done)
         return obs, reward.astype(np.float32), done, infos
-
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.env, attr_name, None) for _ in self._get_indices(indices)]
-
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        self.env.batch.seed(seed)
-        return [seed] * self.num_envs

@@ -1,7 +1,5 @@
 """Saved agents: folders with agent.json and agent.safetensors, without pickle."""
 
-from __future__ import annotations
-
 import hashlib
 import inspect
 from pathlib import Path
@@ -37,15 +35,12 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
         content = to_bytes(arrays)
-        about["arrays"] = hashlib.sha256(content).hexdigest()
-        described = as_json(file, sealed(about))
+        described = as_json(file, sealed({**about, "arrays": hashlib.sha256(content).hexdigest()}))
     except InputError:
         raise
     except Exception as error:  # any error of the class's own `state`
-        raise InputError(
-            f"{cls.__qualname__} cannot be saved ({error_line(error)}); its state() must return a dictionary for json"
-            " and one of arrays"
-        ) from None
+        right = "its state() must return a dictionary for json and one of arrays"
+        raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
     check_folder(folder)
     if code is not None:
         write_atomically(folder / CODE, code)
@@ -71,8 +66,7 @@ def load(folder: Path | str) -> Agent:
     """
     if not isinstance(folder, str | Path):
         raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
-    folder = Path(folder)
-    about = describe(folder)
+    about = describe(folder := Path(folder))
     try:
         where, _, name = about["class"].rpartition(":")
         cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")

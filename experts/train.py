@@ -1,7 +1,5 @@
 """Training of experts: PPO (Stable-Baselines3) on the privileged view, which has theta."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -14,18 +12,9 @@ from stable_baselines3.common.logger import Logger
 from deconfounded import envs
 from deconfounded.experts.sb3 import Sb3VecEnv
 
-PPO_SETTINGS: dict[str, Any] = {
-    "n_steps": 128,
-    "batch_size": 2048,
-    "n_epochs": 10,
-    "gamma": 0.98,
-    "gae_lambda": 0.95,
-    "learning_rate": 1e-3,  # falling linearly to zero
-}
-
-
-Report = Callable[[int, str], None]
-"""Callback with the number of steps since the last call, and a text about returns."""
+PPO_SETTINGS: dict[str, Any] = {"n_steps": 128, "batch_size": 2048, "n_epochs": 10, "gamma": 0.98, "gae_lambda": 0.95}
+PPO_SETTINGS["learning_rate"] = 1e-3  # falling linearly to zero
+Report = Callable[[int, str], None]  # takes the number of steps since the last call, and a text about returns
 
 
 class _Progress(BaseCallback):
@@ -45,21 +34,11 @@ class _Progress(BaseCallback):
 def train(task: envs.Task, steps: int, seed: int, report: Report, n: int = 64) -> dict[str, np.ndarray]:
     """Train by PPO for `steps` control steps in n environments; returns the weights of the policy's mean by layer."""
     torch.set_num_threads(1)  # the networks are small: more threads are slower
-    rate = PPO_SETTINGS["learning_rate"]
-    schedule: Callable[[float], float] = lambda left: rate * left  # noqa: E731
-    model = PPO(
-        "MlpPolicy",
-        Sb3VecEnv(task, n, seed),
-        **{**PPO_SETTINGS, "learning_rate": schedule},
-        policy_kwargs={"net_arch": [64, 64], "log_std_init": -0.5},
-        seed=seed,
-        device="cpu",
-    )
+    settings = {**PPO_SETTINGS, "learning_rate": lambda left: PPO_SETTINGS["learning_rate"] * left}
+    network = {"net_arch": [64, 64], "log_std_init": -0.5}
+    model = PPO("MlpPolicy", Sb3VecEnv(task, n, seed), policy_kwargs=network, seed=seed, device="cpu", **settings)
     model.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder
     model.learn(steps, callback=_Progress(report))
     layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
-    weights = {}
-    for i, layer in enumerate(layer for layer in layers if isinstance(layer, torch.nn.Linear)):
-        weights[f"{i}.weight"] = layer.weight.detach().numpy()
-        weights[f"{i}.bias"] = layer.bias.detach().numpy()
-    return weights
+    linear = torch.nn.Sequential(*(layer for layer in layers if isinstance(layer, torch.nn.Linear)))
+    return {name: values.numpy() for name, values in linear.state_dict().items()}

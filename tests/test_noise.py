@@ -202,9 +202,13 @@ def test_states_by_joint() -> None:
             "joint brick, a free joint, was .* must be 4 .*: position m, rotation rad, velocity m/s, ",
         ),
         ("ball", (0.1,), "joint ball, a ball joint, was .* must be 2 .*: rotation rad, angular velocity rad/s$"),
-        ("ball", (0.7, 0.1), "joint ball was .* its rotation's must be at most 0.5 rad$"),
-        ("brick", (0.1, -0.2, 0.1, 0.1), "joint brick was .* must be standard deviations, from 0 up$"),
-        ("brick", (0.1, float("inf"), 0.1, 0.1), "joint brick was .* must be standard deviations, from 0 up$"),
+        ("ball", (0.7, 0.1), "joint ball, a ball joint, was .* its rotation's must be at most 0.5 rad$"),
+        ("brick", (0.1, -0.2, 0.1, 0.1), "joint brick, a free joint, was .* must be standard deviations, from 0 up$"),
+        (
+            "brick",
+            (0.1, float("inf"), 0.1, 0.1),
+            "joint brick, a free joint, was .* must be standard deviations, from 0 up$",
+        ),
     ],
 )
 def test_wrong_stds(joint: str, stds: tuple[float, ...], says: str) -> None:

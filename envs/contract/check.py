@@ -1,7 +1,5 @@
 """A quick check of a task, before anything is trained or measured: a slip in a task file is reported in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,9 +7,8 @@ import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs.batch import BatchEnv
-from deconfounded.envs.contract.probe import actions, beyond_bounds
+from deconfounded.envs.contract.probe import actions, beyond_bounds, streams
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Streams
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.task import Task
 
@@ -41,8 +38,7 @@ def check_task(task: Task) -> None:
         _check_model(task)
     with _part(task, "action_space"):
         _check_actions(task)
-    n = 2
-    rng = Streams([np.random.default_rng(seed) for seed in range(n)])
+    n, rng = 2, streams(0, 1)
     action = np.zeros((n, task.action_width))
     with _part(task, "apply_latent"):
         env = BatchEnv(task, n)
@@ -102,15 +98,11 @@ def _check_actions(task: Task) -> None:
         return
     space = task.action_space
     if not isinstance(space, spaces.Box) or len(space.shape) != 1 or (space.low != -1).any() or (space.high != 1).any():
-        given = " ".join(str(space).split())
-        raise InputError(
-            f"action_space of {task.name} was {given}; it must be Box(-1, 1, (A,)), which `control` scales, or Discrete"
-        )
+        given, right = " ".join(str(space).split()), "Box(-1, 1, (A,)), which `control` scales, or Discrete"
+        raise InputError(f"action_space of {task.name} was {given}; it must be {right}")
     if not 0 < task.expert_noise < np.inf:
-        raise InputError(
-            f"expert_noise of {task.name} was {task.expert_noise:g}; it must be above 0, and finite, or the expert's"
-            f" log_prob is NaN"
-        )
+        right = "above 0, and finite, or the expert's log_prob is NaN"
+        raise InputError(f"expert_noise of {task.name} was {task.expert_noise:g}; it must be {right}")
 
 
 def _check_episodes(task: Task) -> None:

@@ -8,8 +8,6 @@ cannot be made here. Checks use the task alone, not the registry. Those of inter
 MuJoCo tasks in physics.py.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from typing import Any
@@ -19,18 +17,19 @@ import numpy as np
 from deconfounded.envs.adapters import GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract import physics, protocols
-from deconfounded.envs.contract.probe import Skipped, actions, far_thetas, refused, require, same, streams
+from deconfounded.envs.contract.probe import Skipped, actions, far_thetas, observations, refused, require, same, streams
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, Task
 
 
 def no_leak(task: Task) -> None:
     """First observations and infos are identical for the same seed under different thetas."""
     env = GymEnv(task)
-    first = [env.reset(seed=3, options={"theta": theta}) for theta in far_thetas(task)]
-    for theta, (obs, info) in zip(far_thetas(task), first, strict=True):
-        same(obs, first[0][0], f"first observations of theta {theta} and {far_thetas(task)[0]}, of the same seed,")
+    thetas = far_thetas(task)
+    first = env.reset(seed=3, options={"theta": thetas[0]})[0]
+    for theta in thetas:
+        obs, info = env.reset(seed=3, options={"theta": theta})
+        same(obs, first, f"first observations of theta {theta} and {thetas[0]}, of the same seed,")
         require(info == {}, f"the info of reset was {info}; it must be empty")
     info = env.step(env.action_space.sample())[4]
     require(info == {}, f"the info of step was {info}; it must be empty")
@@ -43,21 +42,14 @@ def effect(task: Task) -> None:
     """
     plans, thetas = [actions(task, 1, task.horizon)], far_thetas(task)
     if isinstance(task, MujocoTask):
-        axes = np.eye(task.action_width)
-        plans += [np.tile(axis, (task.horizon, 1, 1)) for axis in axes]
-    differs = np.zeros((len(plans), len(thetas) - 1), bool)
-    for i, plan in enumerate(plans):
-        runs = []
-        for theta in thetas:
-            batch = BatchEnv(task, 1)
-            batch.reset(3, {"theta": theta})
-            runs.append(np.array([batch.step(action)[0] for action in plan]))
-        differs[i] = [(runs[0] != run).any() for run in runs[1:]]
+        plans += [np.tile(axis, (task.horizon, 1, 1)) for axis in np.eye(task.action_width)]
+    runs = np.array([[observations(task, plan, 3, theta=theta) for plan in plans] for theta in thetas])
+    alike = (runs[1:] == runs[0]).reshape(len(thetas) - 1, -1).all(1)
     if task.tier is None:
-        require(not differs.any(), "theta changes a trajectory, and the tier is None: nothing must tell of theta")
+        require(alike.all(), "theta changes a trajectory, and the tier is None: nothing must tell of theta")
     else:
-        alike = thetas[1:][np.logical_not(differs.any(0))].tolist()
-        require(not alike, f"thetas {alike} have the trajectories of {thetas[0].tolist()}; theta must have an effect")
+        of = f"thetas {thetas[1:][alike].tolist()} have the trajectories of {thetas[0].tolist()}"
+        require(not alike.any(), f"{of}; theta must have an effect")
 
 
 def privileged_view(task: Task) -> None:
@@ -107,12 +99,10 @@ def theta_follows_its_distribution(task: Task) -> None:
 def any_batch_size(task: Task) -> None:
     """An environment's run depends on its own seed alone, to the bit, whatever the batch size."""
     acts = actions(task, 5, task.horizon)
-    large = BatchEnv(task, 5)
-    seen = [large.reset(11)] + [large.step(action)[0] for action in acts]
+    together = observations(task, acts, 11)
     for i in (0, 4):
-        small = BatchEnv(task, 1)
-        again = [small.reset(11 + i)] + [small.step(action[i : i + 1])[0] for action in acts]
-        same(np.array(seen)[:, i], np.array(again)[:, 0], f"runs of seed {11 + i} among five and alone")
+        alone = observations(task, acts[:, i : i + 1], 11 + i)
+        same(together[:, i], alone[:, 0], f"runs of seed {11 + i} among five and alone")
 
 
 def seed_streams(task: Task) -> None:
@@ -139,23 +129,19 @@ def seed_kinds(task: Task) -> None:
 
 def forced_theta_moves_nothing_else(task: Task) -> None:
     """Start and noise depend on the seed alone: setting the theta that would have been drawn changes no bit."""
-    acts = actions(task, 4, 10)
-    free, forced = BatchEnv(task, 4), BatchEnv(task, 4)
-    seen = [free.reset(2)] + [free.step(action)[0] for action in acts]
-    again = [forced.reset(2, {"theta": free.theta.copy()})] + [forced.step(action)[0] for action in acts]
-    same(np.array(seen), np.array(again), "runs of the same seed with theta drawn and forced")
+    acts, batch = actions(task, 4, 10), BatchEnv(task, 4)
+    batch.reset(2)
+    drawn, forced = observations(task, acts, 2), observations(task, acts, 2, theta=batch.theta)
+    same(drawn, forced, "runs of the same seed with theta drawn and forced")
 
 
 def starts_vary_and_nothing_is_constant(task: Task) -> None:
     """No observation is constant over whole episodes, and MuJoCo tasks have random initial states."""
-    batch = BatchEnv(task, 8)
-    seen = np.array([batch.reset(0)] + [batch.step(action)[0] for action in actions(task, 8, task.horizon)])
+    seen = observations(task, actions(task, 8, task.horizon), 0)
     still = [name for name, ptp in zip(task.observation, np.ptp(seen, (0, 1)), strict=True) if not ptp > 0]
     require(not still, f"observation {', '.join(still)} of {task.name} never moved; it must tell something")
-    if isinstance(task, MujocoTask):
-        require(
-            (seen[0] != seen[0, 0]).any(), "eight episodes started with the same observations; init_state must vary"
-        )
+    varied = not isinstance(task, MujocoTask) or (seen[0] != seen[0, 0]).any()
+    require(varied, "eight episodes started with the same observations; init_state must vary")
 
 
 def observations_share_no_memory(task: Task) -> None:
@@ -184,12 +170,8 @@ def wrong_actions(task: Task) -> None:
     env = GymVectorEnv(task, 2)
     env.reset(seed=0)
     good = actions(task, 2, 1)[0]
-    for what, wrong, says in (
-        ("an action of one row for two environments", good[:1], "shape"),
-        ("an action of NaN", np.full_like(good, np.nan), "NaN"),
-        ("action 'left'", "left", "must be numbers"),
-    ):
-        with refused(what, says):
+    for wrong, says in ((good[:1], "shape"), (np.full_like(good, np.nan), "NaN"), ("left", "must be numbers")):
+        with refused(f"action {wrong!r} of two environments", says):
             env.step(wrong)
 
 
@@ -204,34 +186,34 @@ def reset_options(task: Task) -> None:
         GymEnv(task).step(env.action_space.sample())
 
 
-def log_prob_is_the_density_of_the_noise(task: Task) -> None:
-    """Log_prob is normalised, and is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q.
+def _noise(task: Task, m: int) -> Array:
+    return np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
 
-    The expectation is over 4,000 draws of importance sampling.
-    """
-    m = 4000
-    low, high = task.latents[0].grid(9)[[0, -1]]
-    near = high if task.latents[0].distribution == "categorical" else low + 0.03 * (high - low)
-    rest = [lat.low for lat in task.latents[1:]]
-    batch = BatchEnv(task, 1)
-    batch.reset(0, {"theta": [low, *rest]})
-    action = actions(task, 1, 1)[0]
-    p = batch.simulator.outcome(batch.state, action)
-    batch.reset(0, {"theta": [near, *rest]})
-    q = batch.simulator.outcome(batch.state, action)
+
+def _density_ratio(what: str, fall: Array, pair: str) -> None:
+    """Densities q / p = exp(-fall) at draws from p have mean 1, and are not all the same. what, pair: for messages."""
+    ratio = np.exp(-fall)
+    off, error = abs(ratio.mean() - 1), ratio.std() / np.sqrt(len(ratio))
+    require(off < 4 * error + 1e-9, f"{what}: the mean ratio of densities is {ratio.mean():.4f}, not 1")
+    require(error > 0, f"{what} is the same for two {pair}")
+
+
+def log_prob_is_the_density_of_the_noise(task: Task) -> None:
+    """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
+    m, (first, *rest) = 4000, task.latents
+    low, high = first.grid(9)[[0, -1]]
+    near = high if first.distribution == "categorical" else low + 0.03 * (high - low)
+    batch, action = BatchEnv(task, 2), np.repeat(actions(task, 1, 1)[0], 2, 0)
+    batch.reset([0, 0], {"theta": [[value, *(lat.low for lat in rest)] for value in (low, near)]})
+    p, q = np.split(batch.simulator.outcome(batch.state, action), 2)
     if (p == q).all():  # theta has no effect here: use another action's outcome
-        q = batch.simulator.outcome(batch.state, 0.8 * action)
+        q = batch.simulator.outcome(batch.state, 0.8 * action)[1:]
     if isinstance(task, MujocoTask):  # at most one standard deviation off, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])
-    noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
-    drawn = task.apply_noise(np.repeat(p, m, 0), noise)
-    ratio = np.exp(task.log_prob(drawn, q) - task.log_prob(drawn, p))
-    off, error = abs(ratio.mean() - 1), ratio.std() / np.sqrt(m)
-    require(
-        off < 4 * error + 1e-9, f"log_prob of {task.name}: the mean ratio of densities is {ratio.mean():.4f}, not 1"
-    )
-    require(ratio.std() > 0, f"log_prob of {task.name} is the same for two outcomes that differ")
+    drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
+    ratio = task.log_prob(drawn, p) - task.log_prob(drawn, q)
+    _density_ratio(f"log_prob of {task.name}", ratio, "outcomes that differ")
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
         fall = task.log_prob(p, p) - task.log_prob(drawn, p)
         right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
@@ -251,13 +233,11 @@ def log_sense_is_the_density_of_the_readings(task: Task) -> None:
     outcomes = task.outcome(np.repeat(batch.state[:1], 2, 0), np.repeat(action, 2, 0), thetas)
     if not task.moves_state:
         same(outcomes[1], outcomes[0], f"outcomes of thetas {thetas.tolist()}, which is said to move no state,")
-    seen: list[Array] = []
+    state = np.zeros((0, batch.state.shape[1]))
     for action in actions(task, batch.n, m // batch.n):
         batch.step(action)
-        seen.append(batch.state)
-    state = np.concatenate(seen)
-    noise = np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
-    drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), noise)
+        state = np.concatenate([state, batch.state])
+    drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), _noise(task, m))
     if (drawn == state).all():
         require(task.moves_state, f"theta of {task.name} moves no state, and its sensors read nothing")
         raise Skipped("this task has no sensors of theta")
@@ -267,9 +247,7 @@ def log_sense_is_the_density_of_the_readings(task: Task) -> None:
         if fall.mean() < 0.3:
             break
         near = thetas[0] + (near - thetas[0]) / 2
-    off, error = abs(np.exp(-fall).mean() - 1), np.exp(-fall).std() / np.sqrt(m)
-    require(off < 4 * error + 1e-9, f"log_sense of {task.name}: the mean ratio of densities is {1 + off:.4f}, not 1")
-    require(fall.std() > 0, f"log_sense of {task.name} is the same for two thetas")
+    _density_ratio(f"log_sense of {task.name}", fall, "thetas")
 
 
 CONTRACT: dict[str, Callable[[Task], None]] = {

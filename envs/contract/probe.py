@@ -1,19 +1,17 @@
 """Helpers of checks: actions, thetas and generators to test a task with, and assertions with a message."""
 
-from __future__ import annotations
-
 import re
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.task import Array, InputError, Streams, Task
 
 
 class Skipped(Exception):  # noqa: N818 (nothing is wrong)
@@ -33,9 +31,8 @@ def same(left: object, right: object, what: str) -> None:
     places = np.argwhere((a != b) & ((a == a) | (b == b)))
     if len(places):
         at = tuple(places[0].tolist())
-        raise AssertionError(
-            f"{what} differ: {a[at]} and {b[at]} at {list(at)}, the first of {len(places)} such places"
-        )
+        first = f"{a[at]} and {b[at]} at {list(at)}, the first of {len(places)} such places"
+        raise AssertionError(f"{what} differ: {first}")
 
 
 @contextmanager
@@ -51,18 +48,13 @@ def refused(what: str, says: str) -> Iterator[None]:
 
 @contextmanager
 def reported_by(checker: str) -> Iterator[None]:
-    """Context that turns any error of another library's checker into an AssertionError that names the checker."""
+    """Context that turns any error or warning of another library's checker into an AssertionError that names it."""
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            yield
     except Exception as error:
         raise AssertionError(f"{checker}: {' '.join(str(error).split())} ({type(error).__name__})") from error
-
-
-def physics(task: Task) -> MujocoTask:
-    """The task, if it is a MujocoTask. Raises Skipped otherwise."""
-    if not isinstance(task, MujocoTask):
-        raise Skipped("this check is for MuJoCo tasks")
-    return task
 
 
 def actions(task: Task, n: int, steps: int) -> Array:
@@ -72,9 +64,16 @@ def actions(task: Task, n: int, steps: int) -> Array:
     return rng.integers(task.n_actions, size=shape).astype(float) if task.n_actions else rng.uniform(-1, 1, shape)
 
 
+def observations(task: Task, acts: Array, seed: int, **options: Any) -> Array:
+    """Observations [T + 1, N, O] of environments that are reset with a seed and options, and take actions [T, N, A]."""
+    batch = BatchEnv(task, acts.shape[1])
+    return np.array([batch.reset(seed, options)] + [batch.step(action)[0] for action in acts])
+
+
 def far_thetas(task: Task) -> Array:
     """Thetas [J, L] that span the range of every latent."""
-    return np.array(list(product(*(lat.grid(5)[::2] for lat in task.latents))))
+    grids = [lat.grid(5) for lat in task.latents]
+    return np.array(list(product(*(grid[:: max(1, (len(grid) - 1) // 2)] for grid in grids))))
 
 
 def streams(*seeds: int) -> Streams:
@@ -93,13 +92,9 @@ def gl_works() -> bool:
 
 def beyond_bounds(task: Task, state: Array) -> str:
     """A message about an observation of states [N, S] that is out of its bounds by more than 1e-3, or ""."""
-    if not len(state):
-        return ""
-    seen = task.observe(state)
-    for i, (name, (low, high)) in enumerate(task.observation.items()):
-        if (bad := ~((seen[:, i] >= low - 1e-3) & (seen[:, i] <= high + 1e-3))).any():
-            return (
-                f"observation {name} of {task.name} was {seen[bad, i][0]:g}; its bounds, {low:g} to {high:g}, must be"
-                f" wide enough never to clip"
-            )
+    for seen, (name, (low, high)) in zip(task.observe(state).T, task.observation.items(), strict=True):
+        bad = seen[~((seen >= low - 1e-3) & (seen <= high + 1e-3))]
+        if bad.size:
+            right = f"its bounds, {low:g} to {high:g}, must be wide enough never to clip"
+            return f"observation {name} of {task.name} was {bad[0]:g}; {right}"
     return ""

@@ -1,7 +1,5 @@
 """The error for bad input, and how other errors are reported in one line."""
 
-from __future__ import annotations
-
 import traceback
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Output folders, atomic writes, and JSON files with a checksum."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Handles of C++ resources (thread pools, GL contexts), each of which belongs to one process and one object in it."""
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import os
@@ -37,22 +35,19 @@ class Handle(Generic[T]):
     def __reduce__(self) -> tuple[Any, ...]:
         return Handle, (self._make, self._close)
 
-    def _abandon(self) -> None:
-        """Drop the parent process's resource undestroyed: its destructor would wait for threads that a fork lacks."""
-        if self._end is not None:
-            self._end.detach()
-        for made in self._made:
-            ctypes.pythonapi.Py_IncRef(ctypes.py_object(made))  # so that it is never destroyed, not even at exit
-        self._made.clear()
+    @staticmethod
+    def abandon_all() -> None:
+        """Drop the parent process's resources undestroyed: a destructor would wait for threads that a fork lacks."""
+        for handle in list(_HANDLES):
+            if handle._end is not None:
+                handle._end.detach()
+            for made in handle._made:
+                ctypes.pythonapi.Py_IncRef(ctypes.py_object(made))  # so that it is never destroyed, not even at exit
+            handle._made.clear()
 
 
 _HANDLES: weakref.WeakSet[Handle[Any]] = weakref.WeakSet()
 
 
-def _abandon_all() -> None:
-    for handle in list(_HANDLES):
-        handle._abandon()
-
-
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_abandon_all)
+    os.register_at_fork(after_in_child=Handle.abandon_all)

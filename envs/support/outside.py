@@ -1,7 +1,5 @@
 """Plug-ins: tasks, methods, experts and agents from outside, by `path/file.py:name` or `package.module:name`."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """What is asked of spaces of actions."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from gymnasium import spaces

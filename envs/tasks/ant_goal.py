@@ -18,23 +18,17 @@ have noise of std .1. With goals as near as here, so little noise would reveal t
 without memory scored .91.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Renderer
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Renderer, Streams
 from deconfounded.envs.tasks import gymnasium_body
 
 FAR = 1.0  # of goals, m
 STIFF, DAMPED = 150.0, 20.0  # of joints, N m/rad and N m s/rad
-CENTRES, SWINGS = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([0.5, 0.35] * 4)  # rad
 BLUR = 1.6  # of bearings
 ANKLES = (1, -1, -1, 1)  # bent by, standing, rad
 LEGS = {f"{part}_{i + 1}": angle for i, bent in enumerate(ANKLES) for part, angle in (("hip", 0), ("ankle", bent))}
@@ -52,6 +46,7 @@ class AntGoal(MujocoTask):
     readings = 3
     moves_state = False
     expert_noise = 0.05
+    controls = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([0.5, 0.35] * 4)  # rad; fourth leg first
     process_noise = {"root": (0, 0, 0.05, 0.15), **{joint: (0, 0.5) for joint in LEGS}}
     action_space = spaces.Box(-1.0, 1.0, (8,), np.float32)
     observation = {
@@ -69,10 +64,6 @@ class AntGoal(MujocoTask):
             actuator.gear[0], actuator.ctrllimited = 1, False
         spec.worldbody.add_camera(name="view", pos=[0, -3, 3], quat=[0.9239, 0.3827, 0, 0])
         return spec
-
-    def control(self, action: Array) -> Array:
-        """Target angles of the joints, rad; the MJCF has the fourth leg first."""
-        return CENTRES + SWINGS * action
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         """No change: theta affects no state."""

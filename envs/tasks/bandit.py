@@ -4,15 +4,11 @@ Tier 2. State and observation: the last pay-out (0 at the start). The reward cou
 score; the pay-out is in the observation.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Renderer, Task
+from deconfounded.envs.task import Array, Latent, Renderer, Streams, Task
 
 ARMS = 5
 

@@ -1,12 +1,9 @@
 """The body of the cartpole tasks: a cart has to stay at a mark on its rail with its pole upright."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Array, Mask, Streams
 
 FALLEN = 1.2  # rad
 
@@ -38,6 +35,6 @@ class Cartpole(MujocoTask):
         at_mark = np.exp(-0.5 * (self.qpos(next_state, "slider") / 0.25) ** 2)
         return upright * (0.3 + 0.7 * at_mark)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         """Whether the pole has fallen. Otherwise experts would spin it, and theta would hardly matter."""
         return np.abs(self.qpos(state, "hinge")) > FALLEN

@@ -16,8 +16,6 @@ The authors' version (Vuorio et al., TMLR 2024) has another engine, trials of a 
 reward -|v - theta| - .05 |a|^2, with the same optimum; its indicator starts at -1 and has the opposite sign.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces
@@ -25,11 +23,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Renderer
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Renderer, Streams
 from deconfounded.envs.tasks import gymnasium_body
 
 WRONG = 0.2  # probability

@@ -13,15 +13,10 @@ past the hog line, which ends the episode; 0 for one that is not there after 100
 .001, by the square of the push.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 START, TEE = -3.0, 7.0  # m from the hog line
 HOUSE = 1.7  # m
@@ -36,27 +31,22 @@ class Curling(MujocoTask):
     latents = (Latent("friction", "", 0.025, 0.1, "loguniform"),)
     horizon = 100
     expert_noise = 0.02
+    controls = (0.5, 0.5)
     process_noise = {"slide": (0.01, 0.04)}
     observation = {"x": (-10, 40), "velocity": (-4, 10)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.tendon_friction("ice", WEIGHT * float(theta[0]))
 
-    def control(self, action: Array) -> Array:
-        return (1 + action) / 2
-
     def init_state(self, rng: Streams) -> Array:
         x, velocity = rng.uniform((START - 0.1, 0.0), (START + 0.1, 0.1))
         return self.state(slide=(x, velocity))
-
-    def observe(self, state: Array) -> Array:
-        return np.stack([self.qpos(state, "slide"), self.qvel(state, "slide")], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = self.qpos(next_state, "slide") - TEE
         landed = np.exp(-0.5 * (off / HOUSE) ** 2) * self.terminated(next_state)
         return landed - EFFORT * np.square(self.control(action)[:, 0])
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         """Whether the stone is past the hog line and at rest."""
         return (self.qpos(state, "slide") > 0) & (self.qvel(state, "slide") <= 0)

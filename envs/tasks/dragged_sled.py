@@ -12,19 +12,13 @@ Action: the hand's speed, in units of 3 m/s around 2 m/s. Reward: .8 exp(-12.5 d
 which goes at 1.5 to 2.5 m/s. An episode is 5 s, and ends with the sled 1.2 m off the target.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
-MIDDLE, SPEED = 2.0, 3.0  # of the hand, m/s
 LOST = 1.2  # m
 STRETCH = 0.9  # of the cord at the start, whatever the friction, m
 
@@ -36,6 +30,7 @@ class DraggedSled(MujocoTask):
     latents = (Latent("friction", "N", 3.0, 18.0, "loguniform"),)
     horizon = 125
     expert_noise = 0.02
+    controls = (2.0, 3.0)  # of the hand, m/s
     process_noise = {"sled": (0.004, 0.4), "hand": (0.004, 0.05), "target": (0, 0)}
     observation = {
         **{"off_target": (-4, 4), "stretch": (-6, 6)},
@@ -49,9 +44,6 @@ class DraggedSled(MujocoTask):
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.tendon_friction("runners", float(theta[0]))
-
-    def control(self, action: Array) -> Array:
-        return MIDDLE + SPEED * action
 
     def init_state(self, rng: Streams) -> Array:
         pace, off, stretch = rng.uniform((1.5, -0.1, -0.1), (2.5, 0.1, 0.1))
@@ -70,5 +62,5 @@ class DraggedSled(MujocoTask):
         off = self._off(next_state)
         return 0.8 * np.exp(-0.5 * (off / 0.2) ** 2) + 0.2 * np.exp(-off)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self._off(state) > LOST

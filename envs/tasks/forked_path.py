@@ -8,13 +8,10 @@ can query the expert there (`dagger`) learns to use it.
 Latent: side, 0 is left and 1 is right. Noise and reward as in `Puck`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent
 from deconfounded.envs.tasks.puck import Puck
 
 

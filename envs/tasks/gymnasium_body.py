@@ -1,7 +1,5 @@
 """Gymnasium's MuJoCo bodies, read from the installed package."""
 
-from __future__ import annotations
-
 from importlib.resources import files
 
 import mujoco

@@ -12,17 +12,11 @@ Action: the hook's speed, in units of 3 m/s. Reward: .8 exp(-12.5 d^2) + .2 exp(
 with a load dropped or thrown, 1.2 m off the target.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
-SPEED = 3.0  # m/s
 LOST = 1.2  # m
 PACE = 2.1  # of the target, rad/s
 STRETCH = 1.7  # of the cable at the start, whatever the load, m
@@ -36,6 +30,7 @@ class HeavyPayload(MujocoTask):
     latents = (Latent("mass", "kg", 1.0, 3.0, "loguniform"),)
     horizon = 150
     expert_noise = 0.02
+    controls = (0.0, 3.0)  # of the hook, m/s
     process_noise = {"load": (0.004, 0.45), "hook": (0.004, 0.05), "target": (0, 0)}
     observation = {
         **{"off_target": (-4, 4), "stretch": (-4, 4), "target": (-2, 2)},
@@ -44,9 +39,6 @@ class HeavyPayload(MujocoTask):
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.body_mass("load", float(theta[0]))  # the MJCF's load has 1 kg
-
-    def control(self, action: Array) -> Array:
-        return SPEED * action
 
     def init_state(self, rng: Streams) -> Array:
         phase, swing, off, stretch = rng.uniform((0, 0.3, -0.1, -0.1), (2 * np.pi, 0.5, 0.1, 0.1))
@@ -66,5 +58,5 @@ class HeavyPayload(MujocoTask):
         off = self._off(next_state)
         return 0.8 * np.exp(-0.5 * (off / 0.2) ** 2) + 0.2 * np.exp(-off)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self._off(state) > LOST

@@ -5,13 +5,10 @@ policy never learns theta, and a naive clone follows its own first steps. A meth
 theta. Latent: direction, rad from straight ahead, uniform. Noise and reward as in `Puck`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent
 from deconfounded.envs.tasks.puck import Puck
 
 

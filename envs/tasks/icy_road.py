@@ -15,18 +15,13 @@ Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m.
 m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
 """
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 AMPLITUDE, WAVE, HALF_WIDTH = 1.0, 8.0, 0.35  # m; the centreline is y = AMPLITUDE sin(2 pi x / WAVE)
 STEERING, TORQUE = 0.5, 0.03  # rad; N m
@@ -115,5 +110,5 @@ class IcyRoad(MujocoTask):
         speed = (x * np.cos(direction) + y * np.sin(direction)) / self.control_dt
         return np.clip((speed - CRAWL) / 4, 0, 1)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return np.abs(self._lane(state)[0]) > HALF_WIDTH

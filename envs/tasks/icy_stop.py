@@ -12,15 +12,10 @@ Action: the speed of the wheel's rim, from 0 (at -1) to 6 m/s (at 1): there is n
 .9 exp(-8 d^2) + .1 exp(-|d| / 3). An episode is 5 s, and ends .5 m beyond the line.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 SPEED = 3.0  # m/s
 RADIUS = 0.1  # of the wheel, m
@@ -61,5 +56,5 @@ class IcyStop(MujocoTask):
         off = np.abs(self._to_line(next_state))
         return 0.9 * np.exp(-0.5 * (off / 0.25) ** 2) + 0.1 * np.exp(-off / 3)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self._to_line(state) < -WALL

@@ -1,14 +1,12 @@
 """The body of the puck tasks: a puck on a plane, pushed along x and y, has to reach a hidden goal."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 
 import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Array, Streams
 
 
 class Puck(MujocoTask):
@@ -31,11 +29,6 @@ class Puck(MujocoTask):
     def init_state(self, rng: Streams) -> Array:
         x, y = rng.uniform([-0.03, -0.03], 0.03)
         return self.state(x=(x, 0), y=(y, 0))
-
-    def observe(self, state: Array) -> Array:
-        joints = ("x", "y")
-        positions, velocities = ([read(state, joint) for joint in joints] for read in (self.qpos, self.qvel))
-        return np.stack([*positions, *velocities], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = self.observe(next_state)[:, :2] - self.goal(theta)

@@ -8,9 +8,7 @@ Latent: list, rad, uniform; from episode to episode its quantile walks by N(0, .
 reward and end as in `Cartpole`.
 """
 
-from __future__ import annotations
-
-from deconfounded.envs.latent import Latent
+from deconfounded.envs.task import Latent
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 
 

@@ -10,13 +10,10 @@ nothing, and has no noise. Velocities of the pole and of the axle have noise of 
 reward are as in `Cartpole`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent, Streams
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 SPIN = 10.0  # rad/s

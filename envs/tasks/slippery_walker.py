@@ -16,22 +16,16 @@ d = x / .06 m and a = (pitch - slope) / .08 rad, less .1 times the mean square o
 ends with the torso below 1 m or pitched by more than .6 rad.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 from importlib.util import find_spec
 
 import mujoco
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, InputError, Latent, Mask, Streams
 
 HEIGHT = 1.3  # of the torso's centre, standing, m
 DAMPING = 4.0  # of joints: N m for each of v, v |v| and v^3, v in rad/s
@@ -106,6 +100,6 @@ class SlipperyWalker(MujocoTask):
         after[0] += self.control_dt
         self.qpos(after, "rootz")[...] = -HEIGHT
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         fallen = HEIGHT + self.qpos(state, "rootz") < 1.0
         return fallen | (np.abs(self.qpos(state, "rooty")) > 0.6)

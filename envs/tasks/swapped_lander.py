@@ -19,16 +19,11 @@ less .05 times the mean square of both thrusts, in units of the largest. An epis
 than .8 rad, near the ground at more than 1 m/s, or 5 m off.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 JOINTS = ("x", "z", "pitch")
 MAIN = 5.0  # N
@@ -60,16 +55,13 @@ class SwappedLander(MujocoTask):
         x, z, pitch, *velocities = rng.uniform(-spread, spread)
         return self.state(**dict(zip(JOINTS, zip((x, 3.5 + z, pitch), velocities, strict=True), strict=True)))
 
-    def observe(self, state: Array) -> Array:
-        return np.stack([read(state, joint) for read in (self.qpos, self.qvel) for joint in JOINTS], -1)
-
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         off = np.hypot(self.qpos(next_state, "x"), self.qpos(next_state, "z"))
         upright = (1 + np.cos(self.qpos(next_state, "pitch"))) / 2
         thrust = np.square(self.control(action) / (MAIN, 1)).mean(-1)
         return upright * (0.2 * np.exp(-off / 2) + 0.8 * np.exp(-0.5 * (off / 0.5) ** 2)) - 0.05 * thrust
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         x, z, pitch = (self.qpos(state, joint) for joint in JOINTS)
         hard = (z < LOW) & (self.qvel(state, "z") < -SPEED)
         return hard | (np.abs(pitch) > TILT) | (np.hypot(x, z) > FAR)

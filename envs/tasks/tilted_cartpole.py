@@ -7,11 +7,8 @@ through process noise.
 Latent: tilt, rad, uniform. Noise per control step: see `process_noise`. Reward: upright * (.3 + .7 at the mark).
 """
 
-from __future__ import annotations
-
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.streams import Array
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent
 from deconfounded.envs.tasks.cartpole import Cartpole
 
 

@@ -10,15 +10,10 @@ Action: throttle, from -1 for none to 1 for all; the lander weighs 9.81 N. Rewar
 + .1 exp(-|d| / 3). An episode is 3.5 s, and ends .5 m below the mark.
 """
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 RADAR = 2.0  # m, as far as it reaches
 GROUND = -0.5  # m
@@ -31,14 +26,12 @@ class WeakThruster(MujocoTask):
     latents = (Latent("strength", "", 0.8, 2.0, "loguniform"),)
     horizon = 70
     expert_noise = 0.02
+    controls = (0.5, 0.5)
     process_noise = {"height": (0.008, 0.2)}
     observation = {"radar": (-2, RADAR + 0.1), "velocity": (-30, 30)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         edit.actuator_gain("thruster", float(theta[0]))
-
-    def control(self, action: Array) -> Array:
-        return (1 + action) / 2
 
     def init_state(self, rng: Streams) -> Array:
         height, speed = rng.uniform((8, 3), (11, 6))
@@ -52,5 +45,5 @@ class WeakThruster(MujocoTask):
         off = np.abs(self.qpos(next_state, "height"))
         return 0.9 * np.exp(-0.5 * (off / 0.25) ** 2) + 0.1 * np.exp(-off / 3)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         return self.qpos(state, "height") < GROUND

@@ -14,16 +14,11 @@ They are spread over four rotors of 0 to 6 N. Reward: .7 exp(-(d / .25)^2 / 2) +
 episode is 125 steps of .04 s, and ends 1.5 m off, or tilted by more than a right angle.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from deconfounded.envs.edits import Edit
-from deconfounded.envs.latent import Latent
-from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.physics import Edit, MujocoTask
+from deconfounded.envs.task import Array, Latent, Mask, Streams
 
 HEIGHT = 1.5  # of the mark, m
 LOST = 1.5  # m
@@ -81,6 +76,6 @@ class WindyDrone(MujocoTask):
         off = self._off(next_state)
         return 0.7 * np.exp(-0.5 * (off / 0.25) ** 2) + 0.3 * np.exp(-off)
 
-    def terminated(self, state: Array) -> NDArray[np.bool_]:
+    def terminated(self, state: Array) -> Mask:
         upward = rotated(self.qpos(state, "flight")[..., 3:])[..., 5]
         return (self._off(state) > LOST) | (upward < 0)
