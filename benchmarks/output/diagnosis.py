@@ -83,7 +83,7 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
             f"Memory of a trial predicts the expert's action {memory} nats a step better than the present observation"
             f" alone; {LITTLE} is nothing. {whence}",
             lambda axes: _bars(axes, predictors, "nats a step over the present observation", LITTLE),
-        ),
+        )
     ]
     if "explored" in figure:
         met, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))

@@ -107,10 +107,7 @@ def power(by: dict[int, float]) -> float:
 def growth(args: argparse.Namespace) -> None:
     """By the steps of a trial, and by the values of the grid."""
     measured: dict[str, dict[str, dict[int, float]]] = {}
-    for what, sizes, measure in (
-        ("steps of a trial", STEPS, by_steps),
-        ("values of the grid", VALUES, by_values),
-    ):
+    for what, sizes, measure in (("steps of a trial", STEPS, by_steps), ("values of the grid", VALUES, by_values)):
         rows = {n: measure(n) for n in sizes}
         measured[what] = {name: {n: row[name] for n, row in rows.items()} for name in rows[sizes[0]]}
         for name, by in measured[what].items():
