@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
-
-from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
+from deconfounded.benchmarks.output.pictures import colour, encoded, panels
 from deconfounded.deconf.diagnosis.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
 
@@ -25,46 +17,45 @@ Rows = dict[str, tuple[Figure, str]]
 WIDE = 30  # times the threshold: what is further off goes on a logarithmic axis
 
 
-def write(found: Diagnosis, about: dict[str, Any], folder: Path) -> str:
+def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     """Both files; returns what to print."""
-    code = _code(found, about)
+    code = _code(diagnosis, about)
     made = {
-        "verdict": found.verdict,
-        "tier": found.tier,
-        "reasons": list(found.reasons),
-        "next": {"advice": found.next.advice, "code": code},
-        "found": {key: figure._asdict() for key, figure in found.found.items()},
+        "verdict": diagnosis.verdict,
+        "tier": diagnosis.tier,
+        "reasons": list(diagnosis.reasons),
+        "next": {"advice": diagnosis.next.advice, "code": code},
+        "found": {key: figure._asdict() for key, figure in diagnosis.found.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
-    findings = [(title, text, _encoded(draw)) for title, text, draw in _findings(found)]
-    page = template("diagnosis.html.jinja").render(diagnosis=found, findings=findings, code=code, about=about)
+    findings = _findings(diagnosis.found)
+    page = template("diagnosis.html.jinja").render(diagnosis=diagnosis, findings=findings, code=code, about=about)
     write_atomically(folder / "index.html", page + "\n")
-    reasons = "\n".join(found.reasons)
     how = f"\n\n{code}" if code else ""
-    return f"{found.verdict.upper()}\n{reasons}\nNext: {found.next.advice}{how}\n-> {folder / 'index.html'}"
+    text = "\n".join([diagnosis.verdict.upper(), *diagnosis.reasons, f"Next: {diagnosis.next.advice}{how}"])
+    return f"{text}\n-> {folder / 'index.html'}"
 
 
-def _code(found: Diagnosis, about: dict[str, Any]) -> str:
+def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     """Lines of Python that do what is to be done next, if a method does it."""
-    if not found.next.fit:
+    if not diagnosis.next.fit:
         return ""
     source = about["trials"]["from"]
     read = f"Trials.{'from_minari' if Path(source).is_dir() else 'load'}(Path({source!r}))"
-    method = found.next.fit.partition(".")[0]
+    method = diagnosis.next.fit.partition(".")[0]
     return f"""from pathlib import Path
 import numpy as np
 from deconfounded.deconf.methods import {method}
 from deconfounded.experts.rollout import Trials
 
 trials = {read}
-agent = {found.next.fit}
+agent = {diagnosis.next.fit}
 agent.save("agent")
 """
 
 
-def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
-    """Title, two sentences, and what to draw."""
-    figure = found.found
+def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
+    """Title, two sentences, and a picture."""
     memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
     stakes, strayed = figure["stakes"], figure["strayed"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
@@ -77,30 +68,30 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
             " observation does). What is left memory reads off the expert's past actions, for the most part, and a"
             " clone that acts by itself learns nothing from its own."
         )
-    sections: list[tuple[str, str, Callable[[Axes], None]]] = [
+    sections = [
         (
             "Is there a hidden context, and where does it show?",
             f"Memory of a trial predicts the expert's action {memory} nats a step better than the present observation"
             f" alone; {LITTLE} is nothing. {whence}",
-            lambda axes: _bars(axes, predictors, "nats a step over the present observation", LITTLE),
+            _bars(predictors, "nats a step over the present observation", LITTLE),
         )
     ]
     if "explored" in figure:
-        met, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
-        told: Rows = {
-            "world, in exploration": (met, colour("interventional")),
-            "world, where the expert went": (shown, colour("expert")),
+        explored, expert, acted = (figure[key] for key in ("explored", "shown", "acted"))
+        evidence: Rows = {
+            "world, in exploration": (explored, colour("interventional")),
+            "world, where the expert went": (expert, colour("expert")),
             "the expert's actions": (acted, colour("naive_rnn")),
         }
         sections.append(
             (
                 "Does the world tell it?",
-                f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
-                f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
-                f" below {LITTLE}, and explains next to none of the actions, expert trials do not say which latent was"
-                f" theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so"
-                " sure is a clone that takes its own actions for the expert's.",
-                lambda axes: _bars(axes, told, "nats a step", LITTLE),
+                f"A trial's own latent makes what the world answers {explored} nats a step more likely than another"
+                f" trial's in exploration, whose actions are blind to it, and {expert} where the expert went. If the"
+                f" latter is below {LITTLE}, and explains next to none of the actions, expert trials do not say which"
+                f" latent was theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as"
+                " much: so sure is a clone that takes its own actions for the expert's.",
+                _bars(evidence, "nats a step", LITTLE),
             )
         )
     ways: Rows = {
@@ -113,7 +104,7 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
             f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange, among"
             f" those of experts who know theirs, as by chance, and {strayed} times as far from those of the expert who"
             f" knows it; below {STAKES} that may be chance. Dreams are {figure['unlike']} times as strange as data.",
-            lambda axes: _bars(axes, ways, "ways of the mistaken one, times chance", STAKES),
+            _bars(ways, "ways of the mistaken one, times chance", STAKES),
         )
     )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
@@ -125,32 +116,24 @@ def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]
             f"Between one who acts on another latent, 0, and the expert who knows it, 1, a naive clone scores {naive}"
             f" by where it goes, and one that infers the latent from the world {latent}. Eq. (1) is the same by what"
             " they do, as that expert judges it.",
-            lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
+            _bars(scores, "predicted score, last episode", FINE),
         )
     )
     return sections
 
 
-def _bars(axes: Axes, rows: Rows, label: str, threshold: float) -> None:
-    """A bar a row, its range over refits, and the threshold that decides."""
-    for i, (value, hue) in enumerate(rows.values()):
-        axes.barh(i, value.value, color=hue, height=0.55, alpha=0.85)
-        axes.plot([value.low, value.high], [i, i], color="0.15", lw=1.5)
-    axes.axvline(0, color="0.4", lw=0.8)
-    axes.axvline(threshold, color="0.4", lw=1, ls=":")
-    if max(abs(value.value) for value, _ in rows.values()) > WIDE * threshold:
-        axes.set_xscale("symlog", linthresh=threshold)
-    axes.set_yticks(range(len(rows)), list(rows))
-    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
-    axes.set(xlabel=label)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _encoded(draw: Callable[[Axes], None]) -> str:
-    """A picture, for a page."""
-    figure, axes = plt.subplots(figsize=(7, 1.9), layout="constrained")
-    draw(axes)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110)
-    plt.close(figure)
-    return base64.b64encode(buffer.getvalue()).decode()
+def _bars(rows: Rows, label: str, threshold: float) -> str:
+    """A picture for the page: a bar a row, its range over refits, and the threshold that decides."""
+    with panels(picture := io.BytesIO(), size=(7, 1.9)) as [[axes]]:
+        for i, (value, hue) in enumerate(rows.values()):
+            axes.barh(i, value.value, color=hue, height=0.55, alpha=0.85)
+            axes.plot([value.low, value.high], [i, i], color="0.15", lw=1.5)
+        axes.axvline(0, color="0.4", lw=0.8)
+        axes.axvline(threshold, color="0.4", lw=1, ls=":")
+        if max(abs(value.value) for value, _ in rows.values()) > WIDE * threshold:
+            axes.set_xscale("symlog", linthresh=threshold)
+        axes.set_yticks(range(len(rows)), list(rows))
+        axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
+        axes.set(xlabel=label)
+        axes.spines[["top", "right"]].set_visible(False)
+    return encoded(picture)

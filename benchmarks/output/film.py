@@ -17,6 +17,8 @@ WIDTH, HEIGHT, HEAD, STRIP = 320, 240, 30, 80  # of a pane, px; a strip for each
 FRAMES = 240  # of a whole film, at most
 INK, GREY, TRUTH, BELIEF, RIGHT = (25, 25, 30), (150, 150, 155), (30, 150, 70), (205, 60, 40), (40, 90, 200)
 NAMES = {"expert": "expert, sees theta", "naive_rnn": "naive clone", "deconfounded": "deconfounded"}
+Clips = dict[str, dict[str, NDArray[Any]]]
+"""By agent, see Pane."""
 
 
 def frame_rate(task: envs.Task) -> int:
@@ -99,7 +101,7 @@ class Pane:
         draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
 
 
-def frames(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]]) -> list[NDArray[np.uint8]]:
+def frames(task: envs.Task, clips: Clips) -> list[Any]:
     """Pictures of the first and the last episode of a trial, all agents side by side.
 
     Raises InputError where no GL works.
@@ -112,9 +114,8 @@ def frames(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]]) -> list[N
     found = []
     for e in shown:
         truth = panes[0].clip["theta"][e]
-        named = ", ".join(
-            f"{lat.name} {x:.3g} {lat.unit}".strip() for lat, x in zip(task.latents, truth.tolist(), strict=True)
-        )
+        pairs = zip(task.latents, truth.tolist(), strict=True)
+        named = ", ".join(f"{lat.name} {value:.3g} {lat.unit}".strip() for lat, value in pairs)
         for t in range(0, longest[e] + 1, stride):
             parts = [pane.picture(e, t) for pane in panes]
             whole = Image.new("RGB", (sum(part.width for part in parts), HEAD + parts[0].height), "white")
@@ -126,13 +127,9 @@ def frames(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]]) -> list[N
     return found
 
 
-def write(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]], file: Path) -> None:
+def write(task: envs.Task, clips: Clips, file: Path) -> None:
     """The film as .mp4. Raises InputError where no GL works."""
-    made = frames(task, clips)
-    writer: Any
-    with imageio.get_writer(file, fps=frame_rate(task), quality=7, macro_block_size=2) as writer:
-        for frame in made:
-            writer.append_data(frame)
+    imageio.mimsave(file, frames(task, clips), fps=frame_rate(task), quality=7, macro_block_size=2)
 
 
 def decoded(task: envs.Task, features: Array) -> Array:

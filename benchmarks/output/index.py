@@ -15,7 +15,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import score, statistics
 from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
-from deconfounded.benchmarks.output.colours import colour
+from deconfounded.benchmarks.output.pictures import colour
 
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
 COMPARED = (PEER, *EXACT[::-1])  # in paired differences

@@ -30,6 +30,7 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.studies import runs, stepping
 from deconfounded.envs.physics import cores
 from deconfounded.envs.support.files import check_folder, write_json
@@ -114,8 +115,8 @@ def growth(args: argparse.Namespace) -> None:
             costs = ", ".join(f"{n}: {1000 * seconds:,.0f}" for n, seconds in by.items())
             print(f"{name}, by {what}: ms {costs}; grows as n^{power(by):.2f}")
     write_json(args.out / "growth.json", measured)
-    with stepping.panels(args.out / "growth.png", 1, 2, (10, 4)) as panels:
-        for axes, (what, curves) in zip(panels, measured.items(), strict=True):
+    with panels(args.out / "growth.png", 1, 2, size=(10, 4)) as [row]:
+        for axes, (what, curves) in zip(row, measured.items(), strict=True):
             for name, by in curves.items():
                 axes.plot(list(by), list(by.values()), "o-", label=f"{name}: n^{power(by):.2f}")
                 axes.set(xscale="log", yscale="log", xlabel=what, ylabel="CPU seconds")
@@ -198,15 +199,15 @@ def cost(args: argparse.Namespace) -> None:
                 measured.setdefault(method, {})[f"{share:g}"] = point
                 print(f"{task.name}, {method:22} {share:5g} of the updates: {point['cpu_s']:6.1f} CPU s, {last[0]:.3f}")
         write_json(args.out / f"cost-{task.name}.json", {"task": task.name, "seeds": 1, "methods": measured})
-        with stepping.panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), (13, 6)) as panels:
-            for axes, (method, points) in zip(panels, measured.items(), strict=False):
+        with panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), size=(13, 6)) as grid:
+            for axes, (method, points) in zip(grid.flat, measured.items(), strict=False):
                 cpu, scores = [[point[key] for point in points.values()] for key in ("cpu_s", "scores")]
                 axes.plot(cpu, scores, "o-", color="tab:blue", label="1/4, 1/2 and all of the updates")
                 axes.set(title=method, xlabel="CPU seconds a seed", xlim=(0, None), ylim=(-0.05, 1.1))
-            for axes in panels[len(measured) :]:
+            for axes in grid.flat[len(measured) :]:
                 axes.axis("off")
-            panels[0].set_ylabel(f"score on {task.name}, last episode")
-            panels[0].legend(frameon=False, fontsize=8)
+            grid[0, 0].set_ylabel(f"score on {task.name}, last episode")
+            grid[0, 0].legend(frameon=False, fontsize=8)
 
 
 PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "cost": cost}

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.output.colours import colour
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table, nats
 
@@ -57,43 +56,27 @@ def table(points: list[Point]) -> str:
 
 def picture(points: list[Point], file: Path, mark: str = "") -> None:
     """A column for each task and kind of noise: scores above, evidence below."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     columns = _columns(points)
-    figure, panels = plt.subplots(
-        2,
-        len(columns),
-        sharex=True,
-        sharey="row",
-        height_ratios=(3, 2),
-        figsize=(4.1 * len(columns), 6.2),
-        layout="constrained",
-        squeeze=False,
-    )
-    for (task, kind, of), (above, below) in zip(columns, panels.T, strict=True):
-        factors = [point["factor"] for point in of]
-        for method in (*EXACT, *LEARNED):
-            scores = [np.array(point["scores"][method]) for point in of]
-            hue, style = colour(method), "--" if method in EXACT else "o-"
-            above.plot(factors, [x.mean() for x in scores], style, color=hue, label=method)
-            above.vlines(factors, [x.min() for x in scores], [x.max() for x in scores], color=hue, alpha=0.4)
-        for point in of:
-            passed = point["certificate"]["verdict"] == "passed"
-            ends = (point["factor"] / 1.2, point["factor"] * 1.2)
-            above.axvspan(*ends, color="tab:green" if passed else "0.5", alpha=0.09, lw=0)
-        for source, hue in (("dynamics", "tab:green"), ("actions", "tab:red")):
-            told = [point["certificate"]["evidence_nats_per_step"][source] for point in of]
-            below.plot(factors, told, "s-", color=hue, label=f"of {source}")
-        above.set(title=f"{task}\n{kind}", xscale="log")
-        below.set(yscale="log", xlabel="times that of the suite")
-        below.set_xticks(factors, [f"{factor:g}" for factor in factors])
-        below.minorticks_off()
-    panels[0, 0].set(ylabel="score, last episode", ylim=(0, None))
-    panels[1, 0].set_ylabel("evidence of theta, nats a step")
-    panels[0, 0].legend(frameon=False, fontsize=8)
-    panels[1, 0].legend(frameon=False, fontsize=8)
-    save_figure(figure, file, 100, mark)
-    plt.close(figure)
+    shared: dict[str, Any] = {"sharex": True, "sharey": "row", "height_ratios": (3, 2)}
+    with panels(file, 2, len(columns), size=(4.1 * len(columns), 6.2), dpi=100, mark=mark, **shared) as grid:
+        for (task, kind, of), (above, below) in zip(columns, grid.T, strict=True):
+            factors = [point["factor"] for point in of]
+            for method in (*EXACT, *LEARNED):
+                scores = [np.array(point["scores"][method]) for point in of]
+                hue, style = colour(method), "--" if method in EXACT else "o-"
+                above.plot(factors, [x.mean() for x in scores], style, color=hue, label=method)
+                above.vlines(factors, [x.min() for x in scores], [x.max() for x in scores], color=hue, alpha=0.4)
+            for point in of:
+                hue = "tab:green" if point["certificate"]["verdict"] == "passed" else "0.5"
+                above.axvspan(point["factor"] / 1.2, point["factor"] * 1.2, color=hue, alpha=0.09, lw=0)
+            for source, hue in (("dynamics", "tab:green"), ("actions", "tab:red")):
+                evidence = [point["certificate"]["evidence_nats_per_step"][source] for point in of]
+                below.plot(factors, evidence, "s-", color=hue, label=f"of {source}")
+            above.set(title=f"{task}\n{kind}", xscale="log")
+            below.set(yscale="log", xlabel="times that of the suite")
+            below.set_xticks(factors, [f"{factor:g}" for factor in factors])
+            below.minorticks_off()
+        grid[0, 0].set(ylabel="score, last episode", ylim=(0, None))
+        grid[1, 0].set_ylabel("evidence of theta, nats a step")
+        grid[0, 0].legend(frameon=False, fontsize=8)
+        grid[1, 0].legend(frameon=False, fontsize=8)

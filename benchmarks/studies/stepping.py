@@ -9,8 +9,7 @@ on their own model.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +22,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.envs.physics import Physics, cores
 
 SIZES = (1, 16, 64, 256, 1024, 4096)  # environments
@@ -43,40 +42,17 @@ def seconds(
     return {name: float(np.median(each[1:])) for name, each in times.items()}
 
 
-@contextmanager
-def panels(file: Path, rows: int, columns: int, size: tuple[float, float]) -> Iterator[Any]:
-    """Panels to draw in, which make up a picture."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
-    yield axes.flat
-    save_figure(figure, file, 110)
-    plt.close(figure)
-
-
 def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
     """So many physics steps of one environment in one thread, from its start, without control."""
     data = mujoco.MjData(model)
 
-    def run() -> None:
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_step(model, data, nstep=steps)
-
-    return run
+    return lambda: (mujoco.mj_resetData(model, data), mujoco.mj_step(model, data, nstep=steps))
 
 
 def closed_loop(env: Any, actions: Any) -> Callable[[], object]:
     """Those actions one after another in a vector env."""
     env.reset(seed=0)
-
-    def run() -> None:
-        for action in actions:
-            env.step(action)
-
-    return run
+    return lambda: [env.step(action) for action in actions]
 
 
 def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
@@ -115,9 +91,9 @@ def against_envpool(n: int = 64) -> dict[str, Any] | None:
     except ImportError:
         return None
     theirs = envpool.make("CartpoleBalance-v1", env_type="gymnasium", num_envs=n, num_threads=cores())
+    theirs.reset()
     task = envs.get("tilted_cartpole")
     assert isinstance(task, envs.MujocoTask)
-    theirs.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (200, n, 1))
     runs = {
         "ours": closed_loop(envs.make_vec(task.name, n), actions),
@@ -155,7 +131,7 @@ def picture(measured: dict[str, dict[str, dict[str, float]]], file: Path) -> Non
     """Closed loop as a share of open loop, and microseconds a step of one environment, by number of environments."""
     import matplotlib
 
-    with panels(file, 1, 2, (11, 4)) as (left, right):
+    with panels(file, 1, 2, size=(11, 4)) as [[left, right]]:
         for axes in (left, right):
             axes.set_prop_cycle(color=matplotlib.color_sequences["tab20"])
         for name, by_size in measured.items():
