@@ -27,7 +27,7 @@ from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
 from deconfounded.benchmarks.output.pictures import save_figure
-from deconfounded.benchmarks.studies import publish, results, site
+from deconfounded.benchmarks.studies import publish, results
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
@@ -294,7 +294,7 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
     [
         (("-m", "deconfounded", "--help"), 141),
         (("benchmarks/run.py", "--list"), 141),
-        (("benchmarks/studies/site.py", "--help"), 0),  # argparse thinks nothing of it
+        (("benchmarks/studies/cards.py", "--help"), 0),  # argparse thinks nothing of it
     ],
 )
 def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered: str) -> None:
@@ -496,8 +496,8 @@ def test_records_are_few_and_small() -> None:
 
 
 def test_pages_are_up_to_date() -> None:
-    """What site.py writes of tasks, certificates and results; README has a row for each of the latter two."""
-    for file, text in site.texts(results.published()).items():
+    """What publish.py writes of tasks, certificates and results; README has a row for each of the latter two."""
+    for file, text in publish.texts(results.published()).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import measure
 from deconfounded.benchmarks.engine.catalogue import label
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import store
-from deconfounded.experts.rollout import Agent, run_trials
+from deconfounded.experts.policy import Expert
+from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 
@@ -170,14 +171,46 @@ def evaluate(
     streams = [stream(EVALUATION, seed, salt) for seed in seeds]
     trials, returns, theta = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    objective = measure.objective(context.expert, trials, theta)
     encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    probes = [[probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
     clip = {key: np.array(value) for key, value in recorder.clip.items()}
     if filmed:
         clip["trial"] = np.array(recorder.trial)
     if "known" in clip:  # theta, as it can be read off at the end of the last episode
         clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
     r2 = np.array([[score for score, _ in each] for each in probes])
-    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip
+    return {"theta": theta, "returns": returns, "objective": objective(context.expert, trials, theta)}, r2, clip
+
+
+def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
+    """Eq. (1) [B, E]: how likely the expert that sees theta [B, E, L] finds the imitator's own actions, by episode."""
+    b, e, t = trials.mask.shape
+    obs, action = (x.reshape(b * e * t, -1) for x in (trials.obs[:, :, :-1], trials.action))
+    log_expert = expert.log_prob(obs, action, np.repeat(theta.reshape(b * e, -1), t, 0)).reshape(b, e, t)
+    return imitation_objective(log_expert, trials.mask)
+
+
+def probe(features: Array, theta: Array) -> tuple[float, Callable[[Array], Array]]:
+    """Held-out R^2 of a linear probe for encoded theta [N, F'] in features [N, F], and the probe: [M, F] -> [M, F'].
+
+    It is fitted to the first half. 1: theta can be read off; 0 or less: no better than its mean. The probe is ridge
+    regression, and its penalty is chosen on the first half, by leave-one-out: with one for all, features as many as
+    trials would only be memorised. It does not extrapolate: where a feature hardly varies in the first half, the second
+    may be far outside.
+    """
+    # Here, since most commands that import this module probe nothing:
+    from sklearn.linear_model import RidgeCV
+    from sklearn.metrics import r2_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    half = len(features) // 2
+    shown = features[:half].astype(float)
+    reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 4, 9))).fit(shown, theta[:half])
+    low, high = shown.min(0), shown.max(0)
+
+    def read(given: Array) -> Array:
+        return reader.predict(given.clip(low, high)).reshape(len(given), theta.shape[1])
+
+    return float(r2_score(theta[half:], read(features[half:]), multioutput="variance_weighted")), read

@@ -10,7 +10,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, score
-from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
+from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
 
