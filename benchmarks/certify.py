@@ -212,17 +212,14 @@ def picture(result: dict[str, Any], file: Path) -> None:
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
-    parser.add_argument("--out", type=place, help="output folder; default: results/certificates")
+    parser = Parser(__doc__, "--task", "--expert")
+    folder = Path("results") / "certificates"
+    parser.add_argument("--out", type=place, default=folder, help=f"output folder; default: {folder}")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
     expert = policy.load(task, args.expert)
-    folder = args.out or Path("results") / "certificates"
-    check_folder(folder)
+    check_folder(folder := args.out)
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
     result = certify(task, expert, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()

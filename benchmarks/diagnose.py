@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
@@ -129,15 +129,12 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="of the expert")
     parser.add_argument("--explore", type=place, metavar="FILE", help="theta-blind exploration of the same world")
-    parser.add_argument("--seed", type=int, default=0, help="of the splits and of training")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the splits and of training")
     parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
     args = parser.parse_args()
-    if args.seed < 0:
-        raise envs.InputError(f"--seed was {args.seed}; it must be from 0 up")
     asked = " ".join(["deconf diagnose", *sys.argv[1:]])
     print(run(args.trials, args.explore, args.seed, args.out, asked)[1])
 

@@ -74,7 +74,10 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
             ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
             "output folder /proc/none cannot be written",
         ),
-        (("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"), "and from 0 up"),
+        (
+            ("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"),
+            "it must be a whole number from 0 to",
+        ),
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=0"), "--set seeds was '0'; it must be like 5"),
         (("benchmarks/run.py", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
         (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
@@ -87,7 +90,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/report.py", "nowhere"), "nowhere holds no settings.json of a run"),
         (
             ("benchmarks/data.py", "--task", "bandit", "--out", "x", "--trials", "0"),
-            "they must be from 1 and from 0 up",
+            "argument --trials: it was '0'; it must be a whole number from 1 to 100,000",
         ),
         (("benchmarks/check.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),

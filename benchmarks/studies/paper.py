@@ -208,7 +208,6 @@ def write(
 
 
 def main() -> None:
-    """The command line."""
     args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10).parse_args()
     methods = commands.check(args, LEARNERS, SHOWN)
     task = envs.get("bandit")

@@ -214,12 +214,10 @@ PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "cost": cost}
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
+    parser = Parser(__doc__, "--device")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     named = f"of speed and cost; default: all with physics, and {', '.join(COST)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=(), help=named)
-    parser.add_argument("--device", default="cpu", help="torch device of seeds and cost, e.g. cuda")
     parser.add_argument("--out", type=place, default=Path("results") / "performance", help="output folder")
     args = parser.parse_args()
     check_names("part", args.parts, list(PARTS))

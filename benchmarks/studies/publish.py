@@ -188,7 +188,6 @@ def browser(width: int, height: int, dark: bool = False) -> Iterator[Page]:
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("run", type=Path, nargs="?", help="output folder of a finished run")
     parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")

@@ -113,7 +113,6 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
 
 
 def main() -> None:
-    """The command line."""
     parser = commands.parser(__doc__, f"some of {', '.join(LEARNED)}; default: all", seeds=3)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(noise.BASES), help="default: both")
     args = parser.parse_args()

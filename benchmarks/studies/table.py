@@ -49,7 +49,6 @@ def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
 
 
 def main() -> None:
-    """The command line."""
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
     parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")

@@ -95,7 +95,6 @@ def keep(row: dict[str, Any], file: Path) -> None:
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--methods", nargs="+", metavar="NAME", help=f"some of {', '.join(TRIED)}; default: all")
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")

@@ -174,7 +174,6 @@ def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help="some of the cases; default: all")
     parser.add_argument("--out", type=place, default=Path("results") / "validation", help="output folder")
