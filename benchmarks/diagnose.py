@@ -65,7 +65,7 @@ class Refit:
         """Where its findings are."""
         return self.folder / f"refit-{self.index}.json"
 
-    def found(self) -> Findings | None:
+    def findings(self) -> Findings | None:
         """What was measured, if it was of the same."""
         from deconfounded.deconf.diagnosis.measures import Findings
 
@@ -82,17 +82,17 @@ class Refit:
         from deconfounded.benchmarks.engine import progress
         from deconfounded.deconf.diagnosis.measures import measure
 
-        start, told = time.time(), 0
+        start, ticked = time.time(), 0
 
         def tell(share: float) -> None:
-            nonlocal told
-            progress.tick(int(share * self.ticks) - told)
-            told = int(share * self.ticks)
+            nonlocal ticked
+            progress.tick(int(share * self.ticks) - ticked)
+            ticked = int(share * self.ticks)
 
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
         explore = None if self.explore is None else trials_of(self.explore)
-        found = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
-        write_json(self.file, {"made_of": self.made_of, "found": found._asdict()})
+        findings = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
+        write_json(self.file, {"made_of": self.made_of, "found": findings._asdict()})
         return f"measured in {time.time() - start:.0f} s"
 
 
@@ -119,13 +119,13 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
         "versions": identity.versions(),
         "version": VERSION,
     }
-    known = (seed, config.refits, json.dumps(about), folder)
-    refits = [Refit(source, exploration, config.amounts, i, *known) for i in range(config.refits)]
+    shared = (seed, config.refits, json.dumps(about), folder)
+    refits = [Refit(source, exploration, config.amounts, i, *shared) for i in range(config.refits)]
     with commands.locked(folder), Local() as engine:
-        run_jobs([one for one in refits if one.found() is None], "diagnosis", engine.run)
-    found = judge([each for one in refits if (each := one.found()) is not None])
+        run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run)
+    diagnosis = judge([findings for refit in refits if (findings := refit.findings()) is not None])
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
-    return found, page.write(found, about, folder)
+    return diagnosis, page.write(diagnosis, about, folder)
 
 
 def main() -> None:

@@ -169,8 +169,8 @@ def of_method(name: str) -> Numbers:
                 recorder.note()
                 where = f"{label(name, way)} on {task.name}"
                 numbers |= {f"actions of {where}": sums(trials.action), f"returns of {where}": sums(returns)}
-                if recorder.known:
-                    numbers[f"memory of {where}"] = sums(np.stack(recorder.known))
+                if recorder.features_after:
+                    numbers[f"memory of {where}"] = sums(np.stack(recorder.features_after))
     return numbers
 
 

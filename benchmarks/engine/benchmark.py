@@ -39,14 +39,14 @@ class Recorder(Agent):
 
     def begin(self, n: int) -> None:
         self.agent.begin(n)
-        self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
+        self.features_after: list[NDArray[np.float32]] = []  # [N, F] of each episode
         self.episode = 0
         self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
         """An episode is over."""
-        if (known := self.agent.features()) is not None:
-            self.known.append(known.copy())
+        if (features := self.agent.features()) is not None:
+            self.features_after.append(features.copy())
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         if self.episode == 0:
@@ -62,8 +62,8 @@ class Recorder(Agent):
         if not self.filmed or self.episode > self.env.task.episodes:
             return
         row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
-        if (known := self.agent.features()) is not None:
-            row["known"] = known[self.trial].copy()
+        if (features := self.agent.features()) is not None:
+            row["known"] = features[self.trial].copy()
         for kind, value in row.items():
             self.clip.setdefault(kind, []).append(value)
 
@@ -117,42 +117,42 @@ class BenchmarkJob(Job):
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {"": guests.enter_context(contextlib.closing(guest))}
             trained, filmed = monitor.worked(), self.method in CLIPPED and 0 in self.seeds
-            ways = {label(self.method, way): way for way in agents}
-            agents = {name: agents[way] for name, way in ways.items()}
-            found = {
-                name: evaluate(context, agent, self.about.learned, self.salt, filmed and name == self.method)
-                for name, agent in agents.items()
+            names = {way: label(self.method, way) for way in agents}
+            scored = {
+                names[way]: evaluate(context, agent, self.about.learned, self.salt, filmed and not way)
+                for way, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
             notes = [
-                self._keep(name, agent) for name, agent in agents.items()
-            ]  # first: a seed's file says it is finished
-            meta = {"agents": ways, "curve": monitor.kept, "tier": self.about.tier}
+                self._keep(names[way], agent) for way, agent in agents.items()
+            ]  # before the files that say it is done
+            meta = {
+                "agents": {name: way for way, name in names.items()},
+                "curve": monitor.kept,
+                "tier": self.about.tier,
+            }
             for i, seed in enumerate(self.seeds):
-                rows = context.rows(i)
                 arrays: dict[str, Any] = {}
-                for name, (per_trial, probes, clip) in found.items():
-                    arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
-                    arrays[f"{name}/probe"] = probes[i]
-                    if seed == 0:
-                        arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+                for name, (per_trial, probes, clip) in scored.items():
+                    own = {key: value[context.rows(i)] for key, value in per_trial.items()} | {"probe": probes[i]}
+                    arrays |= {f"{name}/{key}": value for key, value in (own | (clip if seed == 0 else {})).items()}
                 self.save(seed, arrays, monitor, meta)
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
 
     def _keep(self, name: str, agent: Agent) -> str:
         """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
-        told = ""
+        note = ""
         for i, seed in enumerate(self.seeds):
             folder = self.folder.parent / "agents" / f"{name}-{seed}"
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
             try:
                 if isinstance(agent, Guest):
-                    told = agent.keep(folder, about)
+                    note = agent.keep(folder, about)
                 elif isinstance(agent, LearnedAgent):
                     store.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
-                told = f"its agent is not kept: {error_line(error)}"
-        return told
+                note = f"its agent is not kept: {error_line(error)}"
+        return note
 
 
 def spaces(task: envs.Task) -> dict[str, int]:
@@ -173,7 +173,7 @@ def evaluate(
     recorder.note()
     encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = [[probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    probes = [[probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.features_after)] for rows in groups]
     clip = {key: np.array(value) for key, value in recorder.clip.items()}
     if filmed:
         clip["trial"] = np.array(recorder.trial)
@@ -206,9 +206,9 @@ def probe(features: Array, theta: Array) -> tuple[float, Callable[[Array], Array
     from sklearn.preprocessing import StandardScaler
 
     half = len(features) // 2
-    shown = features[:half].astype(float)
-    reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 4, 9))).fit(shown, theta[:half])
-    low, high = shown.min(0), shown.max(0)
+    first = features[:half].astype(float)
+    reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 4, 9))).fit(first, theta[:half])
+    low, high = first.min(0), first.max(0)
 
     def read(given: Array) -> Array:
         return reader.predict(given.clip(low, high)).reshape(len(given), theta.shape[1])

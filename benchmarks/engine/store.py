@@ -16,12 +16,8 @@ META: dict[str, Any] = {  # what a file says of itself, and of what types
     **{"identity": dict, "seed": int, "budget": dict, "spans": list, "cpu_s": (int, float), "arrays": list},
     **{"machine": str, "commit": (str, type(None))},
 }
-
-
+SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what a file of run.py says beside that
 OF_AGENT = ("returns", "objective", "probe")
-
-
-SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
 
 
 def broken(found: dict[str, Any]) -> str:
@@ -72,27 +68,22 @@ def know_guests(folder: Path) -> None:
 
 def left_in(folder: Path) -> Finished:
     """What jobs left in a folder, whatever code made it: each file is what it says it is."""
-    found = []
+    finished = []
     for file in sorted(folder.glob("*-*.npz")):
-        data = read(file)
-        if data is None or "agents" not in data["meta"]:
+        if (data := read(file)) is None or "agents" not in (meta := data["meta"]):
             continue
-        why, meta = broken(data), data["meta"]
-        if not why and file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
-            why = f"it is of {name}"
-        if why:
+        if why := broken(data):
             print(f"{file.name} is left out: {why}")
+        elif file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
+            print(f"{file.name} is left out: it is of {name}")
         else:
-            found.append((meta["identity"]["method"], meta["seed"], data))
-    return found
+            finished.append((meta["identity"]["method"], meta["seed"], data))
+    return finished
 
 
 def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
     """What the jobs of each method wrote, by seed."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for method, _, data in finished:
-        found.setdefault(method, []).append(data)
-    return found
+    return {name: [data for method, _, data in finished if method == name] for name, *_ in finished}
 
 
 def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
@@ -107,10 +98,6 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         write_sealed(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
-    else:
-        before = read_sealed(file)
-        now = json.loads(json.dumps(settings))
-        if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
-            raise envs.InputError(
-                f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it"
-            )
+    before, now = read_sealed(file), json.loads(json.dumps(settings))
+    if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
+        raise envs.InputError(f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it")

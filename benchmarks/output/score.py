@@ -189,8 +189,8 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     return lines
 
 
-def table(results: dict[str, Any]) -> str:
-    """The results as a plain table."""
-    lines = [COLUMNS, *rows(results["methods"])]
+def plain_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells under a head, in columns as wide as they must be."""
+    lines = [head, *rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)

@@ -29,7 +29,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
-from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.studies import runs, stepping
 from deconfounded.envs.physics import cores
@@ -92,10 +92,8 @@ def by_values(values: int) -> dict[str, float]:
     from deconfounded.experts.rollout import run_trials
 
     env = envs.BatchEnv(envs.get(GRID), 32)
-    agents = {
-        name: ExactAgent(env, policy.load(env.task), name == "conditional", values)
-        for name in ("interventional", "conditional")
-    }
+    expert = policy.load(env.task)
+    agents = {name: ExactAgent(env, expert, name == "conditional", values) for name in EXACT[::-1]}
     timed = {f"exact {name}": partial(run_trials, env, agent, 2, 0) for name, agent in agents.items()}
     return stepping.seconds(timed, time.process_time, 1)
 
@@ -183,7 +181,8 @@ def scaled(config: dict[str, Any], share: float) -> dict[str, Any]:
 def cost(args: argparse.Namespace) -> None:
     """Of some tasks: one seed of each learned method, with each share of its updates."""
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records, score
+    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output.index import last_scores
 
     for task in args.tasks or map(envs.get, COST):
         full, measured = preset("default", task, args.device), dict[str, Any]()
@@ -192,12 +191,14 @@ def cost(args: argparse.Namespace) -> None:
             own = args.out / f"cost-{task.name}" / f"{share:g}"
             made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own, device=args.device)
             results = records.gather(made)["methods"]
-            zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
+            last = last_scores(results)
             for method in LEARNED:
-                last = score.normalise(np.array(results[method]["return"])[:, -1], zero, one)
-                point = {"cpu_s": results[method]["cpu_s"], "scores": last.round(4).tolist()}
+                scores = [round(score, 4) for score in last[method].values()]
+                point = {"cpu_s": results[method]["cpu_s"], "scores": scores}
                 measured.setdefault(method, {})[f"{share:g}"] = point
-                print(f"{task.name}, {method:22} {share:5g} of the updates: {point['cpu_s']:6.1f} CPU s, {last[0]:.3f}")
+                print(
+                    f"{task.name}, {method:22} {share:5g} of the updates: {point['cpu_s']:6.1f} CPU s, {scores[0]:.3f}"
+                )
         write_json(args.out / f"cost-{task.name}.json", {"task": task.name, "seeds": 1, "methods": measured})
         with panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), size=(13, 6)) as grid:
             for axes, (method, points) in zip(grid.flat, measured.items(), strict=False):

@@ -59,13 +59,14 @@ def copy(source: Path, file: Path) -> None:
 def check_certificate(file: Path, task: envs.Task) -> None:
     """Raises InputError for a file that is no certificate of the task, as pages show it."""
     try:
-        found = json.loads(file.read_bytes())
-        numbers = [check["measured"] for check in found["checks"].values()] + found["conditional"]["score"]
-        numbers += [found["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
-        whole = np.isfinite(np.array(numbers, float)).all() and found["verdict"] in ("passed", "failed")
+        made = json.loads(file.read_bytes())
+        numbers = [check["measured"] for check in made["checks"].values()] + made["conditional"]["score"]
+        numbers += [made["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
+        whole = np.isfinite(np.array(numbers, float)).all() and made["verdict"] in ("passed", "failed")
+        right = whole and (made["task"], made["task_version"]) == (task.name, task.version)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        whole = False
-    if not whole or (found["task"], found["task_version"]) != (task.name, task.version):
+        right = False
+    if not right:
         raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
 
 
@@ -76,12 +77,11 @@ def keep(run: Path) -> None:
         raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
     if len(files) != 1 or not (run / "adaptation.png").is_file():
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
-    found = records.read(files[0])
-    results = records.gather(found, list(METHODS))
+    made = records.read(files[0])
+    results = records.gather(made, list(METHODS))
     if results["preset"] != "default" or {"set", "salt"} & set(results):
-        raise envs.InputError(
-            f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
-        )
+        wrong = f"of preset {results['preset']}, or changed"
+        raise envs.InputError(f"{run} is {wrong}; pages show the default preset alone")
     if results["task"] not in envs.SUITE:
         raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
     task = envs.get(results["task"])
@@ -100,7 +100,7 @@ def keep(run: Path) -> None:
                 shutil.copy(kept, small) if mark_of(kept) == looks else clip(run / "video.mp4", small, looks)
             except Exception as error:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
-        records.write(DOCS / "records", found)
+        records.write(DOCS / "records", made)
         copy(run / "adaptation.png", DOCS / f"{task.name}.png")
         if small.exists():
             copy(small, DOCS / f"{task.name}.webp")

@@ -40,12 +40,9 @@ def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
     from deconfounded.benchmarks.output import records
 
     today = identity(job)
-    there = {
-        record["seed"]
-        for record in kept
-        if (record["method"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
-    }
-    return tuple(seed for seed in job.seeds if seed not in there)
+    same = [record for record in kept if (record["method"], record["preset"]) == (job.method, preset)]
+    fresh = {record["seed"] for record in same if not records.stale(record, today)}
+    return tuple(seed for seed in job.seeds if seed not in fresh)
 
 
 def main() -> None:
@@ -63,20 +60,15 @@ def main() -> None:
 
     folder = args.out or Path("results") / "table"
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
+    settings = {task.name: changed(preset(args.preset, task, args.device), args.set) for task in tasks}
     jobs = [
-        BenchmarkJob(
-            task.reference,
-            changed(preset(args.preset, task, args.device), args.set),
-            method,
-            seeds_of(method, least, most),
-            folder / task.name / "jobs",
-        )
+        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs")
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods
+        if (seeds := seeds_of(method, least, most))
     ]
-    files = {task.reference: kept / records.place(task.name) for task in tasks}
-    there = {name: records.read(file) if file.exists() else [] for name, file in files.items()}
+    there = {task.reference: records.held(kept / records.place(task.name)) for task in tasks}
     left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}
     if args.list:
         for job, seeds in left.items():
