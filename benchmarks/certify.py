@@ -175,14 +175,14 @@ def certify(
 
 def inferability(task: envs.Task, belief: Array, grid: Array, truth: Array) -> dict[str, float]:
     """How well the exact posterior of expert trials [N, K] knows theta: R^2 of its mean, or accuracy if categorical."""
-    found = {}
+    inferable = {}
     for i, latent in enumerate(task.latents):
         if latent.distribution == "categorical":
-            found[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
+            inferable[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
         else:
             residual = belief @ grid[:, i] - truth[:, i]
-            found[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
-    return found
+            inferable[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
+    return inferable
 
 
 def picture(result: dict[str, Any], file: Path) -> None:
@@ -227,11 +227,8 @@ def main() -> None:
     picture(result, folder / f"{task.name}.png")
     for name, check in result["checks"].items():
         print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {check['measured']:.3f} (required {check['required']})")
-    evidence = result["evidence_nats_per_step"]
-    print(
-        f"evidence a step: dynamics {evidence['dynamics']:.3g} nats, actions {evidence['actions']:.3g} nats;"
-        f" theta from expert trials: {result['inferability'][-1]}"
-    )
+    nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
+    print(f"evidence a step: {nats}; theta from expert trials: {result['inferability'][-1]}")
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
     if result["verdict"] == "failed":
         raise SystemExit(1)

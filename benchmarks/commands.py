@@ -38,16 +38,17 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    made.set_defaults(expert=None, salt="", track=None)  # of run.py alone
     return made
 
 
-def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
+def check(args: argparse.Namespace, allowed: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
     """The methods asked for; guests: from outside too. Raises InputError for anything that cannot be run."""
-    methods = [name for asked in args.methods or default for name in (known if asked == "all" else [asked])]
+    methods = [name for asked in args.methods or default for name in (allowed if asked == "all" else [asked])]
     if guests:
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
-        known = [*known, *METHODS.outside]
-    catalogue.check(args.preset, methods, args.seeds, known)
+        allowed = [*allowed, *METHODS.outside]
+    catalogue.check(args.preset, methods, args.seeds, allowed)
     if args.cluster is None:
         check_device(args.device)
     elif args.device not in ("cpu", "cuda"):
@@ -103,17 +104,18 @@ def run(
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
-    catalogue.check(args.preset, None, seeds, ())
-    expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
-    track = getattr(args, "track", None) is not None
-    described = about(kind, task, args.preset, settings, args.set, expert, salt)
+    catalogue.check(args.preset, (), seeds, ())
+    own = args.expert, args.salt
+    described = about(kind, task, args.preset, settings, args.set, *own)
     with locked(folder):
         prepare(folder, described, args.resume)
         know_guests(folder / "jobs")
+        track = args.track is not None
         jobs = [
-            kind(task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track)
-            for method in methods
-            for guest in [catalogue.guest(method)]
+            kind(
+                task.reference, settings, name, tuple(range(seeds)), folder / "jobs", *own, catalogue.guest(name), track
+            )
+            for name in methods
         ]
         with engine(args.cluster) as where:
             finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)

@@ -57,12 +57,10 @@ class Refit:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Which one it is."""
         return (self.index,)
 
     @property
     def file(self) -> Path:
-        """Where its findings are."""
         return self.folder / f"refit-{self.index}.json"
 
     def findings(self) -> Findings | None:

@@ -32,9 +32,9 @@ def main() -> None:
     parser.add_argument("--track", choices=["tensorboard"], help="show losses as they come, in the run's folder")
     parser.add_argument("--salt", default="", help="draw other thetas in evaluation, that nobody can have seen")
     args = parser.parse_args()
-    if args.list and args.task is not None:
-        raise envs.InputError(f"--list was given with --task {args.task}; it lists all, and goes by itself")
     if args.list:
+        if args.task is not None:
+            raise envs.InputError(f"--list was given with --task {args.task}; it lists all, and goes by itself")
         for name in envs.names():
             try:
                 task = envs.get(name)

@@ -24,18 +24,19 @@ from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
+QUANTILE = 0.85  # of the first latent, in the trial of the video
 
 
 class Recorder(Agent):
     """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
     The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
-    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
-    an action, and each step after it; with what the agent knows then.
+    nearest that QUANTILE: the same trial for every method, as seeds are shared. Its rows are an episode's start,
+    without an action, and each step after it; with what the agent knows then.
     """
 
-    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
-        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
+    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False) -> None:
+        self.agent, self.env, self.filmed = agent, env, filmed
 
     def begin(self, n: int) -> None:
         self.agent.begin(n)
@@ -44,14 +45,14 @@ class Recorder(Agent):
         self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
-        """An episode is over."""
+        """Keep what the agent knows now that an episode is over."""
         if (features := self.agent.features()) is not None:
             self.features_after.append(features.copy())
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         if self.episode == 0:
             theta = self.env.theta[: self.env.n // len(rngs), 0]
-            self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
+            self.trial = int(np.abs(theta - np.quantile(theta, QUANTILE)).argmin())
         else:
             self.note()
         self.agent.reset(rngs)

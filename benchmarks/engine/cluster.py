@@ -129,7 +129,6 @@ class Mailbox:
         self.mail.append((number, ticks, files))
 
     def take(self) -> list[tuple[int, int, Files]]:
-        """All that came."""
         mail, self.mail = self.mail, []
         return mail
 

@@ -20,22 +20,22 @@ SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what a file of run.
 OF_AGENT = ("returns", "objective", "probe")
 
 
-def broken(found: dict[str, Any]) -> str:
+def broken(data: dict[str, Any]) -> str:
     """Why what a file holds cannot be what a job wrote; empty if it can."""
-    meta = found["meta"]
+    meta = data["meta"]
     wanted = META | (SCORED if "agents" in meta else {})
     right = all(isinstance(meta.get(key, ...), kind) for key, kind in wanted.items())
     if not right or not isinstance(meta["identity"].get("method"), str):
         return "it does not say what it was made of"
     if not all(isinstance(amount, int) for amount in meta["budget"].values()):
         return "it does not say what data it used"
-    if lost := {"meta", *meta["arrays"]} ^ set(found):
+    if lost := {"meta", *meta["arrays"]} ^ set(data):
         return f"it lacks {', '.join(sorted(lost))}"
     for name in meta.get("agents", ()):
-        returns, objective, probe = (found.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
+        returns, objective, probe = (data.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
         if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
             return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
-    for key, value in found.items():
+    for key, value in data.items():
         if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
             return f"{key} holds NaN or infinity"
     return ""
@@ -59,7 +59,7 @@ Finished = list[tuple[str, int, dict[str, Any]]]
 def know_guests(folder: Path) -> None:
     """Make the methods from outside known whose results are in a folder, so that they stay in its tables."""
     for file in sorted(folder.glob("*-*.npz")):
-        if (found := read(file)) and (reference := found["meta"].get("reference")):
+        if (data := read(file)) and (reference := data["meta"].get("reference")):
             try:
                 catalogue.add(str(reference))
             except envs.InputError as error:

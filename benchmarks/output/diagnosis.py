@@ -94,10 +94,8 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
                 _bars(evidence, "nats a step", LITTLE),
             )
         )
-    ways: Rows = {
-        "among those who know": (stakes, colour("expert")),
-        "from that very expert's": (strayed, colour("expert")),
-    }
+    hue = colour("expert")
+    ways: Rows = {"among those who know": (stakes, hue), "from that very expert's": (strayed, hue)}
     sections.append(
         (
             "What is at stake?",

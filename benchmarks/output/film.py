@@ -60,8 +60,8 @@ class Pane:
         draw = ImageDraw.Draw(pane)
         draw.text((8, 6), NAMES.get(self.name, self.name), fill=INK, font_size=17)
         digits = 0 if np.abs(self.earned).max() >= 10 else 2
-        said = f"earned {round(self.earned[row], digits) + 0.0:.{digits}f}" + (" - over" if over else "")
-        draw.text((WIDTH - 8, 8), said, fill=INK, font_size=14, anchor="ra")
+        earned = f"earned {self.earned[row]:z.{digits}f}" + " - over" * over
+        draw.text((WIDTH - 8, 8), earned, fill=INK, font_size=14, anchor="ra")
         for i in range(len(latents)):
             self._strip(draw, i, HEAD + HEIGHT + STRIP * i, episode, t)
         return pane
@@ -108,11 +108,10 @@ def frames(task: envs.Task, clips: Clips) -> list[Any]:
     """
     panes = [Pane(task, name, clip) for name, clip in clips.items()]
     episodes = min(len(pane.starts) for pane in panes)
-    shown = sorted({0, episodes - 1})
-    longest = {e: max(pane.row(e, task.horizon)[0] - pane.starts[e] for pane in panes) for e in shown}
+    longest = {e: max(pane.row(e, task.horizon)[0] - pane.starts[e] for pane in panes) for e in (0, episodes - 1)}
     stride = max(1, -(-sum(longest.values()) // FRAMES))
-    found = []
-    for e in shown:
+    pictures = []
+    for e in longest:
         truth = panes[0].clip["theta"][e]
         pairs = zip(task.latents, truth.tolist(), strict=True)
         named = ", ".join(f"{lat.name} {value:.3g} {lat.unit}".strip() for lat, value in pairs)
@@ -123,8 +122,8 @@ def frames(task: envs.Task, clips: Clips) -> list[Any]:
                 whole.paste(part, (k * WIDTH, HEAD))
             head = f"{task.name}: hidden {named}, episode {e + 1} of {episodes}"
             ImageDraw.Draw(whole).text((8, 7), head, fill=INK, font_size=18)
-            found.append(np.asarray(whole))
-    return found
+            pictures.append(np.asarray(whole))
+    return pictures
 
 
 def write(task: envs.Task, clips: Clips, file: Path) -> None:
@@ -134,14 +133,13 @@ def write(task: envs.Task, clips: Clips, file: Path) -> None:
 
 def decoded(task: envs.Task, features: Array) -> Array:
     """Encoded thetas [M, F], as a probe reads them -> theta [M, L]; of more than two categories the likeliest."""
-    found, at = [], 0
-    for latent in task.latents:
-        part = features[:, at : at + latent.features]
-        at += latent.features
+    theta = []
+    parts = np.split(features, np.cumsum([latent.features for latent in task.latents])[:-1], -1)
+    for latent, part in zip(task.latents, parts, strict=True):
         if latent.distribution != "categorical":
-            found.append(latent.ppf(np.clip((part[:, 0] + 1) / 2, 0, 1)))
+            theta.append(latent.ppf(np.clip((part[:, 0] + 1) / 2, 0, 1)))
         elif latent.features == 2:
-            found.append(latent.low + np.clip((1 + part[:, 1] - part[:, 0]) / 2, 0, 1))
+            theta.append(latent.low + np.clip((1 + part[:, 1] - part[:, 0]) / 2, 0, 1))
         else:
-            found.append(latent.low + part.argmax(-1))
-    return np.stack(found, -1)
+            theta.append(latent.low + part.argmax(-1))
+    return np.stack(theta, -1)

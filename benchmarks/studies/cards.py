@@ -21,9 +21,9 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, ("---",) * len(head), *rows))
 
 
-def kept(folder: Path, name: str) -> dict[str, Any] | None:
-    """What the folder's file of a task holds, if there is one."""
-    file = folder / f"{name}.json"
+def kept(name: str) -> Any:
+    """What the .json file of that name in docs/ holds, if there is one."""
+    file = DOCS / f"{name}.json"
     return json.loads(file.read_bytes()) if file.is_file() else None
 
 
@@ -35,7 +35,7 @@ def nats(certificate: dict[str, Any]) -> list[str]:
 
 def certified() -> dict[str, dict[str, Any]]:
     """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
-    return {name: certificate for name in envs.SUITE if (certificate := kept(DOCS / "certificates", name))}
+    return {name: certificate for name in envs.SUITE if (certificate := kept(f"certificates/{name}"))}
 
 
 def certificates(held: dict[str, Any]) -> str:
@@ -49,7 +49,7 @@ def certificates(held: dict[str, Any]) -> str:
 
 
 def _certificate(task: envs.Task) -> str:
-    certificate = kept(DOCS / "certificates", task.name)
+    certificate = kept(f"certificates/{task.name}")
     if certificate is None:
         return "No certificate."
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in certificate["checks"].items())
@@ -109,7 +109,7 @@ def card(task: envs.Task) -> str:
     parts.append(
         f"Tier {TIERS[task.tier]}. Trials of {trial} of at most {task.horizon} steps{more}. {_certificate(task)}"
     )
-    if digests := (kept(DOCS, "data") or {}).get(f"{task.name}-v{task.version}"):
+    if digests := (kept("data") or {}).get(f"{task.name}-v{task.version}"):
         sets = ", ".join(f"`{sha[:16]}` ({kind})" for kind, sha in digests.items())
         parts.append(
             f"Standard sets, 256 trials of seed 0, by the sha256 of their contents: {sets}, whole in"

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
 
 from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.studies import spectrum, validate
-from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
+from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
 UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
 BUDGET = 4  # settings of each opponent
@@ -20,7 +19,7 @@ def rates() -> str:
     """The table of docs/speed.md: control steps a second, as `deconf performance speed` measured them."""
     sizes = ("64", "256", "4096")
     rows = []
-    for name, by_size in json.loads((DOCS / "speed" / "speed.json").read_bytes())["tasks"].items():
+    for name, by_size in kept("speed/speed")["tasks"].items():
         few, middle, many = (by_size[n] for n in sizes)
         closed = (f"{by_size[n]['closed_loop']:,.0f}" for n in sizes)
         shares = (score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
@@ -40,14 +39,14 @@ def _origins(made: list[dict[str, Any]]) -> str:
 
 def validated() -> str:
     """The table of docs/diagnose.md: what `deconf validate` measured where the truth is known."""
-    rows = validate.diagnosed()
+    rows = kept(validate.KEPT)
     parts = [f"{validate.summary(rows)} ({_origins(rows)})", validate.table(rows)]
     return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"])
 
 
 def noises() -> str:
     """The table of docs/spectrum.md: scores and certificates under more and less noise."""
-    measured = spectrum.kept()
+    measured = kept("spectrum")
     points = measured["points"]
     about = f"Means over {measured['seeds']} seeds; {_origins(points)}."
     return "\n\n".join([spectrum.foretold(points), spectrum.table(points), about])
@@ -64,7 +63,7 @@ def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def tuning() -> str:
     """The table of docs/opponents.md: what `deconf tune` tried of each opponent, and what was best."""
-    tried, rows = json.loads((DOCS / "tuning.json").read_bytes())["rows"], []
+    tried, rows = kept("tuning")["rows"], []
     tasks = list(tried[0]["scores"])
     for method in dict.fromkeys(row["method"] for row in tried):
         of = [row for row in tried if row["method"] == method]

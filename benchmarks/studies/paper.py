@@ -97,13 +97,13 @@ class FigureMonitor(JobMonitor):
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         super().update(done, total, losses, agent)
-        seen = self.kept
-        due = not seen["at"] or done == total or done * POINTS // total > seen["at"][-1] * POINTS // total
+        kept = self.kept
+        due = not kept["at"] or done == total or done * POINTS // total > kept["at"][-1] * POINTS // total
         if due and isinstance(agent, RecurrentAgent | DeconfoundedAgent):
             pulls = online(self.context, agent, self.trials)[1]
-            seen["at"].append(done)
-            seen["pulls"].append(pulls.reshape(len(self.context.seeds), -1).mean(1).tolist())
-            seen["loss"].append(agent.held_out_loss(self.held_out).tolist())
+            kept["at"].append(done)
+            kept["pulls"].append(pulls.reshape(len(self.context.seeds), -1).mean(1).tolist())
+            kept["loss"].append(agent.held_out_loss(self.held_out).tolist())
 
 
 class FigureJob(Job):
@@ -123,12 +123,12 @@ class FigureJob(Job):
         onlooker = Onlooker(agent, ExpertAgent(context.env, context.expert))
         run_trials(context.env, onlooker, 1, [stream(EVALUATION, seed) for seed in self.seeds])
         would = np.concatenate(onlooker.would, -1) == context.env.theta
-        meta = {"train_s": trained}
+        kept = {key: np.array(values) for key, values in monitor.kept.items()}
         for i, seed in enumerate(self.seeds):
-            rows, seen = context.rows(i), monitor.kept
+            rows = context.rows(i)
             arrays = {"online": best[rows].mean(0), "on_expert": would[rows].mean(0), "pulls": pulls[rows].mean()}
-            arrays |= {f"{key}_curve": np.array(seen[key])[:, i] for key in ("loss", "pulls")}
-            self.save(seed, {"at": np.array(seen["at"]), **arrays}, monitor, meta)
+            curves = {f"{key}_curve": kept[key][:, i] for key in ("loss", "pulls")}
+            self.save(seed, {"at": kept["at"], **arrays, **curves}, monitor, {"train_s": trained})
         return f"{pulls.mean():.1f} best-arm pulls, trained in {trained:.0f} s, all in {monitor.close():.0f} s"
 
 
@@ -139,11 +139,11 @@ def online(context: Context, agent: Agent, n: int) -> tuple[NDArray[np.bool_], A
     return trials.action[:, 0, :, 0] == env.theta, returns[:, 0]
 
 
-def exact(task: envs.Task, n: int = 40_000) -> dict[str, dict[str, Any]]:
+def exact(task: envs.Task) -> dict[str, dict[str, Any]]:
     """Expert and exact policies: P(best arm) online and on expert trajectories [T], pulls, imitation loss."""
     expert, measured = policy.load(task), {}
     for name in EXACT[::-1]:
-        env = envs.BatchEnv(task, n)
+        env = envs.BatchEnv(task, 40_000)
         agent = ExactPolicyRecorder(env, expert, name == "conditional")
         returns = run_trials(env, agent, 1, seed=0).returns
         measured[name] = {"online": np.mean(agent.best, 1), "pulls": float(returns.mean())}
@@ -185,13 +185,10 @@ def table(methods: dict[str, Any]) -> str:
     """One row a method."""
     rows = []
     for name, entry in methods.items():
-        error = "" if entry["pulls_se"] is None else f" +- {entry['pulls_se']:.2f}"
-        numbers = (
-            f"{entry['pulls_mean']:.2f}{error}",
-            f"{entry['target_pulls']:.2f}",
-            f"{entry['max_gap_online']:.3f}",
-        )
-        rows.append((name, *numbers, score.budget(entry["budget"])))
+        pulls = f"{entry['pulls_mean']:.2f}"
+        pulls += "" if entry["pulls_se"] is None else f" +- {entry['pulls_se']:.2f}"
+        exact, apart = f"{entry['target_pulls']:.2f}", f"{entry['max_gap_online']:.3f}"
+        rows.append((name, pulls, exact, apart, score.budget(entry["budget"])))
     return score.plain_table(("method", "best-arm pulls", "exact", "max gap online", "budget (a seed)"), rows)
 
 
@@ -220,10 +217,10 @@ def smoothed(curves: Array) -> Array:
     return (total[:, end] - total[:, start]) / (end - start)
 
 
-def figure_2(task: envs.Task, file: Path, rolled: int = 5) -> None:
+def figure_2(task: envs.Task, file: Path) -> None:
     """Roll-outs as rows of colours: green is the best arm."""
     expert = policy.load(task)
-    env = envs.BatchEnv(task, rolled)
+    env = envs.BatchEnv(task, 5)
     agents: dict[str, Agent] = {"expert": ExpertAgent(env, expert)}
     agents |= {name: ExactAgent(env, expert, name == "conditional") for name in EXACT}
     colours = ListedColormap(COLOURS_OF_ARMS)

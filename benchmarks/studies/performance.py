@@ -125,8 +125,7 @@ def growth(args: argparse.Namespace) -> None:
 
 def few(full: Preset) -> Preset:
     """The preset's networks and batches, on little data and for few updates."""
-    small: dict[str, Any] = {"rounds": 1, "final_updates": 0}
-    small |= {"inference_updates": UPDATES, "imitation_updates": UPDATES}
+    small = {"rounds": 1, "final_updates": 0, "inference_updates": UPDATES, "imitation_updates": UPDATES}
     little = replace(full, expert_trials=128, explore_trials=128, eval_trials=1, fresh=0)
     little = little.configured("deconfounded", **small).configured("deconfounded_discrete", **small)
     return little.configured("naive_rnn", updates=UPDATES, chunk=min(full.configs["naive_rnn"]["chunk"], 50))
@@ -189,16 +188,15 @@ def cost(args: argparse.Namespace) -> None:
         for share in SHARES:
             settings = replace(full, configs={name: scaled(config, share) for name, config in full.configs.items()})
             own = args.out / f"cost-{task.name}" / f"{share:g}"
-            made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own, device=args.device)
+            made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own)
             results = records.gather(made)["methods"]
             last = last_scores(results)
             for method in LEARNED:
                 scores = [round(score, 4) for score in last[method].values()]
                 point = {"cpu_s": results[method]["cpu_s"], "scores": scores}
                 measured.setdefault(method, {})[f"{share:g}"] = point
-                print(
-                    f"{task.name}, {method:22} {share:5g} of the updates: {point['cpu_s']:6.1f} CPU s, {scores[0]:.3f}"
-                )
+                costs = f"{point['cpu_s']:6.1f} CPU s, {scores[0]:.3f}"
+                print(f"{task.name}, {method:22} {share:5g} of the updates: {costs}")
         write_json(args.out / f"cost-{task.name}.json", {"task": task.name, "seeds": 1, "methods": measured})
         with panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), size=(13, 6)) as grid:
             for axes, (method, points) in zip(grid.flat, measured.items(), strict=False):

@@ -152,8 +152,8 @@ def write() -> str:
         if file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
     redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
-    redraw(DOCS / "diagnose" / "validation.png", validate.picture, validate.diagnosed())
-    redraw(DOCS / "spectrum.png", spectrum.picture, spectrum.kept()["points"])
+    redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
+    redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
     return results.summary(found)
 
 

@@ -12,7 +12,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES, check_na
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies import noise, runs
-from deconfounded.benchmarks.studies.cards import DOCS, markdown_table, nats
+from deconfounded.benchmarks.studies.cards import markdown_table, nats
 from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
@@ -41,12 +40,6 @@ def variants(base: str) -> list[tuple[str, str, float, str]]:
     """The task, the kinds of its noise, times which factor each, and the task with that."""
     points = [(kind, factor) for kind in KINDS for factor in noise.FACTORS[kind]]
     return [(base, *one, f"{noise.__name__}:{noise.title(base, *one)}") for one in points]
-
-
-def kept() -> dict[str, Any]:
-    """What was measured and is published."""
-    measured: dict[str, Any] = json.loads((DOCS / "spectrum.json").read_bytes())
-    return measured
 
 
 def _columns(points: list[Point]) -> list[tuple[str, str, list[Point]]]:
@@ -123,7 +116,7 @@ def main() -> None:
     from deconfounded.benchmarks.output.index import last_scores
 
     folder, points = args.out or Path("results") / "spectrum", list[Point]()
-    options = {"preset": args.preset, "changes": args.set, "device": args.device, "cluster": args.cluster}
+    options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster}
     for base, kind, factor, name in chain(*map(variants, args.tasks)):
         task, weights = envs.get(name), str(ASSETS / "experts" / f"{base}.safetensors")
         settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name

@@ -52,18 +52,23 @@ def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
 def closed_loop(env: Any, actions: Any) -> Callable[[], object]:
     """Those actions one after another in a vector env."""
     env.reset(seed=0)
-    return lambda: [env.step(action) for action in actions]
+
+    def run() -> None:
+        for action in actions:
+            env.step(action)
+
+    return run
 
 
 def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
     """Control steps a second, by way of stepping; KiB an environment. The same actions and the same thetas for all."""
     steps = max(8, min(task.horizon, 20_000 // n))
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, *task.action_space.shape)).astype(np.float32)
-    process = psutil.Process()
-    before = process.memory_info().rss
+    memory = psutil.Process().memory_info
+    before = memory().rss
     ours = envs.make_vec(task.name, n)
     loop = closed_loop(ours, actions)
-    memory = (process.memory_info().rss - before) / 1024 / n
+    kib = (memory().rss - before) / 1024 / n
     start, simulator = ours.batch.state.copy(), ours.batch.simulator
     assert isinstance(simulator, Physics)
     controls = np.ascontiguousarray(actions.transpose(1, 0, 2), float)
@@ -79,10 +84,10 @@ def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
         runs["sync_vector_env"] = closed_loop(SyncVectorEnv([lambda: envs.make(task.name) for _ in range(n)]), few)
         counts["sync_vector_env"] = n * len(few)
     rates = {name: counts[name] / each for name, each in seconds(runs).items()}
-    return {**rates, "kib": memory}
+    return {**rates, "kib": kib}
 
 
-def against_envpool(n: int = 64) -> dict[str, Any] | None:
+def against_envpool() -> dict[str, Any] | None:
     """Physics steps a second in closed loop over raw mj_step times threads, of ours and of envpool's cartpole."""
     try:
         import envpool  # type: ignore[import-not-found]
@@ -90,6 +95,7 @@ def against_envpool(n: int = 64) -> dict[str, Any] | None:
         cartpole = files("dm_control") / "suite" / "cartpole.xml"  # what suite.load makes of it fails under MuJoCo 4
     except ImportError:
         return None
+    n = 64
     theirs = envpool.make("CartpoleBalance-v1", env_type="gymnasium", num_envs=n, num_threads=cores())
     theirs.reset()
     task = envs.get("tilted_cartpole")

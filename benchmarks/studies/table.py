@@ -74,7 +74,7 @@ def main() -> None:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
         return
-    options = {"preset": args.preset, "changes": args.set, "device": args.device, "cluster": args.cluster}
+    options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster}
     for job, seeds in left.items():
         made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
         records.write(kept, made)

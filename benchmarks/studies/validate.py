@@ -13,7 +13,6 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -47,7 +46,7 @@ CASES: dict[str, str | None] = {
 
 TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
-KEPT = DOCS / "diagnose" / "validation.json"
+KEPT = "diagnose/validation"
 FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # of the table
 
 
@@ -98,7 +97,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
 
 def point(task: envs.Task) -> dict[str, Any] | None:
     """What `spectrum.py` found of a task of noise.py; None of others."""
-    points = spectrum.kept()["points"]
+    points = kept("spectrum")["points"]
     titles = (noise.title(*(point[key] for key in ("task", "kind", "factor"))) for point in points)
     return dict(zip(titles, points, strict=True)).get(type(task).__name__)
 
@@ -121,18 +120,12 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
 def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     """Whether it is passed: docs/ says so of the suite and of its variants; of others it is made here."""
     if task.name in envs.SUITE:
-        made = kept(DOCS / "certificates", task.name)
+        made = kept(f"certificates/{task.name}")
     elif of := point(task):
         made = of["certificate"]
     else:
         made = runs.certificate(task, source, folder)
     return made is not None and bool(made["verdict"] == "passed")
-
-
-def diagnosed() -> list[dict[str, Any]]:
-    """A row a case."""
-    rows: list[dict[str, Any]] = json.loads(KEPT.read_bytes())
-    return rows
 
 
 def _unseen(row: dict[str, Any]) -> bool:
@@ -167,10 +160,12 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
     """A dot a case: red where the certificate is passed, hollow where the thresholds were set without it."""
-    names = [row["task"].replace("_process_", " x").replace("x0_", "x.").replace("0_", ".") for row in rows]
-    points = [(name, row["predicted"], row["measured"]) for name, row in zip(names, rows, strict=True)]
-    hues = ["tab:red" if row["certified"] else "tab:green" for row in rows]
-    gap.picture(points, file, "the diagnosis", hues, [_unseen(row) for row in rows], mark)
+    points = []
+    for row in rows:
+        name = row["task"].replace("_process_", " x").replace("x0_", "x.").replace("0_", ".")
+        style = "tab:red" if row["certified"] else "tab:green", "none" if _unseen(row) else "full"
+        points.append((name, row["predicted"], row["measured"], *style))
+    gap.picture(points, file, "the diagnosis", mark)
 
 
 def main() -> None:
@@ -202,11 +197,11 @@ def main() -> None:
             "found": {key: figure._asdict() for key, figure in diagnosis.found.items()},
             **about,
         }
-        rows = {row["case"]: row for row in diagnosed()} | {name: row}
-        write_json(KEPT, [rows[case] for case in cases if case in rows])
+        rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}
+        write_json(DOCS / f"{KEPT}.json", [rows[case] for case in cases if case in rows])
         print(f"{task.name}: {diagnosis.verdict}, {'right' if row['right'] else 'WRONG'}")
-    picture(diagnosed(), KEPT.with_suffix(".png"))
-    print(f"{summary(diagnosed())} -> {KEPT.parent}")
+    picture(kept(KEPT), DOCS / f"{KEPT}.png")
+    print(f"{summary(kept(KEPT))} -> {DOCS / KEPT}.png")
 
 
 if __name__ == "__main__":
