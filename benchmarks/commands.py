@@ -113,7 +113,9 @@ def run(
         track = args.track is not None
         jobs = [
             kind(
-                task.reference, settings, name, tuple(range(seeds)), folder / "jobs", *own, catalogue.guest(name), track
+                *(task.reference, settings, name, tuple(range(seeds)), folder / "jobs", *own),
+                guest=catalogue.guest(name),
+                track=track,
             )
             for name in methods
         ]

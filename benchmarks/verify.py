@@ -50,11 +50,12 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     from deconfounded.benchmarks.engine.scheduler import run_all
 
     settings = changed(preset(record["preset"], task, device, [method]), record["set"])
-    guest = catalogue.guest(method)
+    guest, salts = catalogue.guest(method), tuple(record["salts"]) if "salts" in record else None
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "jobs"
         folder.mkdir()
-        job = BenchmarkJob(task.reference, settings, method, (record["seed"],), folder, expert, record["salt"], guest)
+        what, of = (task.reference, settings, method, (record["seed"],)), (expert, record["salt"], guest)
+        job = BenchmarkJob(*what, folder, *of, salts=salts)
         with Local() as engine:
             finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
         for again in records.of_run(finished, record["preset"], record["set"], task.episodes):

@@ -15,11 +15,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from deconfounded.envs.streams import Array
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.core.agents import Monitor
+    from deconfounded.deconf.core.monitor import Monitor
 
 FloatArray = NDArray[np.float32]
 

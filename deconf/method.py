@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from deconfounded.deconf.core.sizes import MANY, WIDE
 from deconfounded.envs.support.errors import InputError
-from deconfounded.envs.task import Task
 from deconfounded.experts.rollout import Agent
 
 if TYPE_CHECKING:
     from deconfounded.deconf.given import Given
+    from deconfounded.envs.task import Task
 
 USES = {
     "demonstrations": "expert trials, without theta",
@@ -54,7 +54,7 @@ class Method:
     @property
     def learned(self) -> bool:
         """Whether it is trained, on data."""
-        return bool(self.uses) and ENVIRONMENT not in self.uses
+        return bool(self.uses or self.reference) and ENVIRONMENT not in self.uses
 
     @property
     def tier(self) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Streams, generators
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 
@@ -25,11 +25,6 @@ def check_number(what: str, given: object, most: float = np.inf) -> None:
 
 def _is_seed(given: object) -> bool:
     return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(given >= 0)
-
-
-def generators(seed: int | None) -> list[np.random.Generator]:
-    """Three generators of one environment: for theta, start and noise. None: fresh entropy."""
-    return [np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(3)]
 
 
 class BatchEnv:

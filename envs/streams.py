@@ -47,3 +47,8 @@ def unseeded(rng: np.random.Generator) -> np.random.Generator:
     copy = np.random.Generator(type(rng.bit_generator)(0))
     copy.bit_generator.state = rng.bit_generator.state
     return copy
+
+
+def generators(seed: int | None) -> list[np.random.Generator]:
+    """Three generators of one environment: for theta, start and noise. None: fresh entropy."""
+    return [np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(3)]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from gymnasium import spaces
@@ -25,13 +25,9 @@ from numpy.typing import NDArray
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.spaces import action_sizes
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
-
-
-def action_sizes(space: spaces.Space[Any]) -> tuple[int, int]:
-    """A, the width of an action (1 if discrete), and the number of discrete actions (0 if continuous)."""
-    return (space.shape or (1,))[0], int(space.n) if isinstance(space, spaces.Discrete) else 0
 
 
 class Renderer(Protocol):

@@ -14,7 +14,7 @@ import numpy as np
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
-from deconfounded.envs.task import action_sizes
+from deconfounded.envs.support.spaces import action_sizes
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before

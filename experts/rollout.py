@@ -8,18 +8,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from deconfounded.envs import BatchEnv, InputError, Task
-from deconfounded.envs.batch import generators
-from deconfounded.envs.streams import Array, Streams, unseeded
+from deconfounded.envs.streams import Array, Streams, generators, unseeded
+from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
-from deconfounded.envs.task import action_sizes
-from deconfounded.experts.policy import Expert
+from deconfounded.envs.support.spaces import action_sizes
+
+if TYPE_CHECKING:
+    from deconfounded.envs.batch import BatchEnv
+    from deconfounded.envs.task import Task
+    from deconfounded.experts.policy import Expert
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
 from deconfounded import __version__
-from deconfounded.envs import InputError
 from deconfounded.envs.support import outside
-from deconfounded.envs.support.errors import error_line
+from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import as_json, check_folder, read_sealed, sealed, write_atomically
 from deconfounded.experts.rollout import Agent
 

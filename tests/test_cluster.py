@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine import catalogue, identity, jobs, progress, 
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.local import Local
-from deconfounded.deconf.core.agents import Training
+from deconfounded.deconf.core.monitor import Training
 from deconfounded.envs.support import outside
 from tests.tools import processes, tiny_preset
 

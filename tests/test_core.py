@@ -18,10 +18,10 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Embedding, Linear, Scaler, scalers
 from deconfounded.deconf.equations import (
     belief_update,

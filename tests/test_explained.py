@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.diagnosis import latent, measures
 from deconfounded.deconf.diagnosis.diagnose import SILENT
 from deconfounded.deconf.diagnosis.measures import Amounts, split

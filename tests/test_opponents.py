@@ -18,9 +18,10 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import Provider, Vector, fit
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor, Training
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import Adam, Scaler, scalers
 from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma

@@ -5,15 +5,12 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
-import multiprocessing
-import multiprocessing.forkserver
 import os
 import queue
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from multiprocessing.context import BaseContext
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -259,22 +256,6 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
     return context, Guest(context, "mine", f"{folder}/mine.py:fit", uses)
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[BaseContext]:
-    """A process that has imported what a guest's does, and from which guests are then forked."""
-    made = multiprocessing.get_context("forkserver")
-    made.set_forkserver_preload(["deconfounded.benchmarks.engine.guest", "deconfounded.deconf.given"])
-    yield made
-    multiprocessing.forkserver._forkserver._stop()  # type: ignore[attr-defined]
-
-
-@pytest.fixture
-def forked(server: BaseContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Guests begin as forks of the server, without seconds of imports each; in other tests, as they do in a run."""
-    monkeypatch.setattr(multiprocessing, "get_context", lambda method: server)
-
-
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -295,7 +276,6 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.usefixtures("forked")
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -328,7 +308,7 @@ def test_a_stubborn_guest_goes(tmp_path: Path) -> None:
     text += "    threading.Thread(target=threading.Event().wait).start()\n    return Still()"
     _, agent = guest(tmp_path, text)
     agent.close()
-    assert not agent.process.is_alive()
+    assert agent.process.poll() is not None
 
 
 class TestWire:

@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, report, score, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
-from deconfounded.benchmarks.studies import findings, gap, publish, results, tune
+from deconfounded.benchmarks.studies import cards, findings, gap, publish, results, tune
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -50,7 +50,7 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
-    monkeypatch.setattr(findings, "DOCS", tmp_path)
+    monkeypatch.setattr(cards, "DOCS", tmp_path)
     lines = findings.tuning().splitlines()
     words = [line.split(" | ")[-1].strip(" |") for line in lines[2:11]]
     assert words == ["kept", "", "", "", "", "", "", "chosen", ""], "palr is not through"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -110,28 +111,27 @@ class BenchmarkJob(Job):
 
     def run(self) -> str:
         monitor = CurveMonitor(self, 0.8)
-        context = self.context(monitor)
+        training, evaluation = self.salts or (secrets.token_hex(8), "") if self.guest else ("", "")
+        context = self.context(monitor, training)
         with contextlib.ExitStack() as guests:
             if self.guest is None:
                 agents = deployed(self.method, fit(context, self.method))
             else:
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {"": guests.enter_context(contextlib.closing(guest))}
+                evaluation = evaluation or secrets.token_hex(8)  # drawn now that its agent cannot change any more
             trained, filmed = monitor.worked(), self.method in CLIPPED and 0 in self.seeds
-            names = {way: label(self.method, way) for way in agents}
+            names, salt = {way: label(self.method, way) for way in agents}, self.salt + evaluation
             scored = {
-                names[way]: evaluate(context, agent, self.about.learned, self.salt, filmed and not way)
+                names[way]: evaluate(context, agent, self.about.learned, salt, filmed and not way)
                 for way, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
-            notes = [
-                self._keep(names[way], agent) for way, agent in agents.items()
-            ]  # before the files that say it is done
-            meta = {
-                "agents": {name: way for way, name in names.items()},
-                "curve": monitor.kept,
-                "tier": self.about.tier,
-            }
+            # First, since a seed's file says that it is finished:
+            notes = [self._keep(names[way], agent) for way, agent in agents.items()]
+            meta: dict[str, Any] = {"curve": monitor.kept, "tier": self.about.tier}
+            meta |= {"agents": {name: way for way, name in names.items()}}
+            meta |= {"salts": [training, evaluation]} if self.guest else {}
             for i, seed in enumerate(self.seeds):
                 arrays: dict[str, Any] = {}
                 for name, (per_trial, probes, clip) in scored.items():

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity
-from deconfounded.deconf.core.agents import Monitor
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Rollout, Trials, joined, run_trials, thetas
@@ -43,10 +43,14 @@ class Context:
         monitor: Monitor | None = None,
         folder: Path | None = None,
         expert: str | None = None,
+        salt: str = "",
     ) -> None:
-        """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load."""
+        """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load.
+
+        salt: of demonstrations and exploration, where their thetas are to be nobody's guess.
+        """
         self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
-        self.folder, self.named_expert = folder, expert
+        self.folder, self.named_expert, self.salt = folder, expert, salt
         self.expert = policy.load(task, expert)
 
     @cached_property
@@ -60,7 +64,7 @@ class Context:
 
     def _expert_trials(self, n: int, seeds: Sequence[int]) -> Trials:
         env = envs.BatchEnv(self.task, n * len(seeds))
-        seeds = [stream(DEMOS, seed) for seed in seeds]
+        seeds = [stream(DEMOS, seed, self.salt) for seed in seeds]
         return run_trials(env, ExpertAgent(env, self.expert), self.task.episodes, seeds).trials
 
     def _kept(self, seed: int) -> tuple[Path, str]:
@@ -97,7 +101,7 @@ class Context:
     def demonstrated_theta(self) -> Array:
         """theta [B, E, L] of the demonstrations' episodes, drawn once more from their seeds: for the oracle alone."""
         n = self.preset.expert_trials * len(self.seeds)
-        return thetas(self.task, n, self.task.episodes, [stream(DEMOS, seed) for seed in self.seeds])
+        return thetas(self.task, n, self.task.episodes, [stream(DEMOS, seed, self.salt) for seed in self.seeds])
 
     def demonstrate(self, rngs: Sequence[np.random.Generator]) -> Trials:
         """Fresh expert trials."""
@@ -107,7 +111,7 @@ class Context:
     @property
     def rngs(self) -> list[np.random.Generator]:
         """For initial weights and batches; the same for every method of a seed."""
-        return [np.random.default_rng([seed, 0]) for seed in self.seeds]
+        return [np.random.default_rng([seed, 0, *self.salt.encode()]) for seed in self.seeds]
 
     def _roll_out(self, n: int, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> Rollout:
         env = envs.BatchEnv(self.task, n * len(rngs))

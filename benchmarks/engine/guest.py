@@ -7,29 +7,33 @@ environments in which the method's agent acts.
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 import os
+import queue
+import secrets
 import signal
+import subprocess
 import sys
+import tempfile
 import threading
-import time
 from collections.abc import Sequence
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Listener
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.wire import unpack
-from deconfounded.envs.support import outside
-from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts.rollout import Agent
+
+MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
 
 
 def die_with_parent() -> None:
@@ -45,37 +49,17 @@ def die_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
-    """The guest's process: fit, then be the agent until the channel is closed."""
-    die_with_parent()
-    escape_output()
-    from deconfounded.deconf.channel import ChannelAsk, ChannelMonitor, serve
-    from deconfounded.deconf.given import Given
-    from deconfounded.deconf.method import Method
-    from deconfounded.deconf.wire import pack
-    from deconfounded.experts.store import save
+def _environ(mark: str) -> dict[str, str]:
+    """The environment of a guest: this package is found in any folder, and its processes carry a mark."""
+    return {**os.environ, "PYTHONPATH": str(Path(deconfounded.__file__).parents[1]), MARK: mark}
 
-    def say(*what: Any) -> None:
-        with contextlib.suppress(OSError):  # nobody listens any more
-            channel.send_bytes(pack(list(what)))
 
-    try:
-        fit, ask, rngs = outside.find("method", reference), ChannelAsk(channel), [np.random.default_rng(about["rng"])]
-        config = getattr(fit, "method", Method(())).config(about["config"])
-        agent = fit(Given(ask, about, config, rngs, ChannelMonitor(channel)))
-        ask.close()
-        if not isinstance(agent, Agent):
-            raise envs.InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
-        say("fitted")
-        while True:
-            folder, described = serve(channel, agent)
-            try:
-                save(agent, folder, **described)
-                say("done", "", time.process_time())
-            except Exception as error:
-                say("done", error_line(error), time.process_time())
-    except (Exception, SystemExit) as error:  # or the other end is gone, and nobody hears it
-        say("failed", error_line(error))
+def _kill_marked(mark: str) -> None:
+    """End what processes of a guest are left, in whatever session, where the system lists them."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
+                os.kill(int(folder.name), signal.SIGKILL)
 
 
 class Guest(Agent):
@@ -85,20 +69,40 @@ class Guest(Agent):
         self.context, self.name, self.cpu = context, name, 0.0
         self.provider = Provider(context, uses, context.rngs)
         self.provider.open -= {"acting theta"}
-        here, there = (made := multiprocessing.get_context("spawn")).Pipe()
+        self.mark, self.folder = secrets.token_hex(16), tempfile.TemporaryDirectory(prefix="deconfounded-")
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "deconfounded.deconf.wall"],
+            cwd=self.folder.name,
+            env=_environ(self.mark),
+            stdin=subprocess.PIPE,
+            start_new_session=True,
+        )
         config = context.preset.configs.get(name, {})
-        about = {**self.provider.about(), "config": config, "rng": stream(GUEST, context.seeds[0])}
-        self.channel: Connection = here
-        self.process = made.Process(target=live, args=(reference, there, about), daemon=True)
-        line, sys.argv = sys.argv, sys.argv[:1]  # which a new process gets, and evaluation's salt is in it
-        self.process.start()
-        sys.argv = line
-        there.close()
         try:
+            self.channel = self._connect(reference)
+            rng = stream(GUEST, context.seeds[0], context.salt)
+            self.channel.send({**self.provider.about(), "config": config, "rng": rng})
             self._fit()
         except BaseException:
             self.close()
             raise
+
+    def _connect(self, reference: str) -> Connection:
+        """The guest's end calls here. Raises InputError if its process ends before it does."""
+        key, accepted = secrets.token_bytes(16), queue.SimpleQueue[Connection]()
+        path = [str(Path(entry).resolve()) for entry in sys.path]
+        with Listener(authkey=key) as listener:
+            threading.Thread(target=lambda: accepted.put(listener.accept()), daemon=True).start()
+            begun = {"reference": reference, "address": listener.address, "key": key.hex(), "path": path}
+            assert self.process.stdin is not None
+            with contextlib.suppress(BrokenPipeError):
+                self.process.stdin.write(f"{json.dumps(begun)}\n".encode())
+                self.process.stdin.flush()
+            while True:
+                with contextlib.suppress(queue.Empty):
+                    return accepted.get(timeout=0.2)
+                if self.process.poll() is not None:
+                    raise envs.InputError(f"method {self.name}: its process ended before it began")
 
     def _hear(self) -> list[Any]:
         """What it says next: never unpickled, since that would run its code here."""
@@ -182,13 +186,20 @@ class Guest(Agent):
         return str(self._do("over", (folder, about)))
 
     def close(self) -> None:
-        """Let it go."""
-        self.channel.close()
-        self.process.join(2)
-        self.process.terminate()
-        self.process.join(2)
-        self.process.kill()
-        self.process.join()
+        """Let it go, and all that it started."""
+        if hasattr(self, "channel"):
+            self.channel.close()
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(2)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        with contextlib.suppress(OSError, AttributeError):  # gone already; or a system without process groups
+            os.killpg(self.process.pid, signal.SIGKILL)
+        _kill_marked(self.mark)
+        self.folder.cleanup()
 
 
 def fresh(rngs: Sequence[np.random.Generator]) -> list[int]:

@@ -23,7 +23,7 @@ from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import tick
 from deconfounded.benchmarks.engine.sources import last_edit
-from deconfounded.deconf.core.agents import Monitor, Training
+from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.rollout import Agent
 
@@ -42,6 +42,7 @@ class Job(ABC):
     expert: str | None = None  # another than the task's own
     salt: str = ""  # of evaluation's seeds
     guest: Method | None = None  # a method from outside
+    salts: tuple[str, str] | None = None  # of a guest's training and evaluation; None: drawn
     track: bool = False  # whether losses go to TensorBoard as they come
 
     @property
@@ -49,9 +50,10 @@ class Job(ABC):
         """The method's entry in the catalogue."""
         return self.guest or METHODS[self.method]
 
-    def context(self, monitor: Monitor | None = None) -> Context:
-        """The data and environments of its seeds."""
-        return Context(envs.get(self.task), self.preset, self.seeds, monitor, self.folder, self.expert)
+    def context(self, monitor: Monitor | None = None, salt: str = "") -> Context:
+        """The data and environments of its seeds; salt: of its training, whose data is then kept nowhere."""
+        folder = None if salt else self.folder
+        return Context(envs.get(self.task), self.preset, self.seeds, monitor, folder, self.expert, salt)
 
     @abstractmethod
     def run(self) -> str:

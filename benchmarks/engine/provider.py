@@ -19,7 +19,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EXPLORATION, Context, stream
 from deconfounded.deconf import methods
-from deconfounded.deconf.core.agents import Monitor, Training
+from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import ENVIRONMENT, Method
 from deconfounded.envs.streams import Array, unseeded

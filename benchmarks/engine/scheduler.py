@@ -75,7 +75,8 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         for job, missing in zip(every, left, strict=True)
         for part in groups(job.about, missing, engine.slots(device))
     ]
-    imitated = {seed: job for job in parts if "demonstrations" in job.about.uses for seed in job.seeds}
+    ours = [job for job in parts if "demonstrations" in job.about.uses and job.guest is None]
+    imitated = {seed: job for job in ours for seed in job.seeds}
     first: list[Job] = [
         DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
         for seed, job in sorted(imitated.items())

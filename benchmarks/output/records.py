@@ -39,6 +39,7 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
     seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
     seed |= {"curve": thinned(meta["curve"])} if meta["curve"] else {}
+    seed |= {"salts": meta["salts"]} if "salts" in meta else {}
     records = []
     for name, deployment in meta["agents"].items():
         returns = data[f"{name}/returns"]

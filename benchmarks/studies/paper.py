@@ -139,11 +139,11 @@ def online(context: Context, agent: Agent, n: int) -> tuple[NDArray[np.bool_], A
     return trials.action[:, 0, :, 0] == env.theta, returns[:, 0]
 
 
-def exact(task: envs.Task) -> dict[str, dict[str, Any]]:
+def exact(task: envs.Task, n: int = 40_000) -> dict[str, dict[str, Any]]:
     """Expert and exact policies: P(best arm) online and on expert trajectories [T], pulls, imitation loss."""
     expert, measured = policy.load(task), {}
     for name in EXACT[::-1]:
-        env = envs.BatchEnv(task, 40_000)
+        env = envs.BatchEnv(task, n)
         agent = ExactPolicyRecorder(env, expert, name == "conditional")
         returns = run_trials(env, agent, 1, seed=0).returns
         measured[name] = {"online": np.mean(agent.best, 1), "pulls": float(returns.mean())}

@@ -62,9 +62,9 @@ def speed(args: argparse.Namespace) -> None:
 
 def by_steps(steps: int) -> dict[str, float]:
     """CPU seconds of an update of the evidence belief, and of a pass of the RNN, on 16 trials of so many steps."""
-    from deconfounded.deconf.core.agents import Monitor
     from deconfounded.deconf.core.data import Batch, Draws, Signature
     from deconfounded.deconf.core.models import VariationalModel
+    from deconfounded.deconf.core.monitor import Monitor
     from deconfounded.deconf.core.nets import Adam, scalers
     from deconfounded.deconf.methods.recurrent import Cloner, RecurrentAgent, RecurrentConfig
     from deconfounded.experts.rollout import Trials
@@ -135,7 +135,7 @@ def update_seconds(task: envs.Task, settings: Preset, method: str, seeds: int) -
     """Seconds of an update of so many seeds in one program, by kind of update."""
     from deconfounded.benchmarks.engine.context import Context
     from deconfounded.benchmarks.engine.provider import fit
-    from deconfounded.deconf.core.agents import Monitor
+    from deconfounded.deconf.core.monitor import Monitor
     from deconfounded.experts.rollout import Agent
 
     class Clock(Monitor):

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Monitor, ramp
+from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.diagnosis.learned_env import known_range
 from deconfounded.deconf.equations import masked_mean

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core import termination
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.drift import apart
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.sizes import MANY, SPACIOUS, WIDE
 from deconfounded.deconf.diagnosis import latent
 from deconfounded.deconf.diagnosis.deviation import back, oddest, strange, strayed, ways

@@ -7,8 +7,9 @@ from typing import Protocol, TypeVar
 
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import Adam, Scaler
 from deconfounded.deconf.methods.recurrent import Cloner, RecurrentAgent, RecurrentConfig
 

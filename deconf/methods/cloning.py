@@ -9,11 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
 from deconfounded.deconf.equations import imitation_loss
-from deconfounded.envs.task import Array, InputError
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 

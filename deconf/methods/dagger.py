@@ -23,15 +23,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take, take_steps
 from deconfounded.deconf.core.drift import apart
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Query = Callable[[Agent | None], tuple[Trials, NDArray[np.float32]]]

@@ -17,17 +17,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor, ramp
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
 from deconfounded.deconf.core.drift import apart, choose_kept
 from deconfounded.deconf.core.models import LatentModel, final_belief
 from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Explore = Callable[[Agent | None], Trials]

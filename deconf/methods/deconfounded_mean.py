@@ -14,16 +14,17 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Checkpoint, Monitor
+from deconfounded.deconf.core.agents import Checkpoint
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
 from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explore
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 

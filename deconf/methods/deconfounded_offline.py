@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.agents import Monitor, ramp
+from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, extent, listed, take
 from deconfounded.deconf.core.drift import apart, choose_kept
 from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
 from deconfounded.deconf.core.sizes import SPACIOUS
 from deconfounded.deconf.equations import gaussian_kl, offline_loss

@@ -24,12 +24,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
-from deconfounded.envs.task import InputError
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ paper's belief.
 
 from __future__ import annotations
 
-from deconfounded.deconf.core.agents import Monitor
 from deconfounded.deconf.core.data import Rngs, Source
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.clones import clone_by_chunks

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given

@@ -16,7 +16,7 @@ from stable_baselines3.common.logger import Logger
 from torch import Tensor, nn
 
 from deconfounded.deconf.given import Environments
-from deconfounded.envs.task import action_sizes
+from deconfounded.envs.support.spaces import action_sizes
 from deconfounded.experts.sb3 import BatchVecEnv
 
 if TYPE_CHECKING:

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
 from deconfounded.deconf.equations import imitation_loss
 

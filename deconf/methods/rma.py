@@ -16,16 +16,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Monitor
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import cloning
 from deconfounded.deconf.methods.cloning import CloningConfig
-from deconfounded.envs.task import Array, InputError
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Tell = Callable[[Agent | None], tuple[Trials, Array]]
