@@ -28,7 +28,7 @@ from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
-from deconfounded.deconf.methods import cloning
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -64,7 +64,7 @@ class EvidenceRecorder(ExpertAgent):
         super().reset(rngs)
         if self.dynamics:
             self.beliefs.append(np.exp(self.log_belief))
-            self.log_belief = self.grid.drifted(self.log_belief)
+            self.log_belief = self.grid.predict(self.log_belief)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
@@ -140,7 +140,7 @@ def certify(
 
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, SEED)).trials
-    blind = returns(cloning.train(demos, cloning.CloningConfig(), np.random.default_rng(SEED)))
+    blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(SEED)))
     done(STAGES[4])
 
     curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in policies.items()}

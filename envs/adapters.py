@@ -14,8 +14,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from deconfounded.envs.batch import BatchEnv, check_number
+from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.numbers import check_number
 from deconfounded.envs.task import Renderer, Task
 
 

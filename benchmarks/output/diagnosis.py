@@ -8,7 +8,7 @@ from typing import Any
 
 from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, encoded, panels
-from deconfounded.deconf.diagnosis.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
+from deconfounded.deconf.diagnosis.diagnose import GOOD, NEGLIGIBLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
@@ -25,10 +25,10 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "tier": diagnosis.tier,
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
-        "found": {key: figure._asdict() for key, figure in diagnosis.found.items()},
+        "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
-    findings = _findings(diagnosis.found)
+    findings = _findings(diagnosis.figures)
     page = template("diagnosis.html.jinja").render(diagnosis=diagnosis, findings=findings, code=code, about=about)
     write_atomically(folder / "index.html", page + "\n")
     how = f"\n\n{code}" if code else ""
@@ -59,62 +59,62 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
     memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
     stakes, strayed = figure["stakes"], figure["strayed"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
-    whence = "Exploration would show how much of that the world's answers tell, and how much past actions alone."
+    source = "Exploration would show how much of that is evidence of the dynamics, and how much of past actions alone."
     if "explained" in figure:
-        world = figure["explained"]
-        predictors["the world's answers"] = (world, colour("interventional"))
-        whence = (
-            f"A latent that is read off the world's answers alone tells {world} of it (below 0, less than the present"
-            " observation does). What is left memory reads off the expert's past actions, for the most part, and a"
-            " clone that acts by itself learns nothing from its own."
+        explained = figure["explained"]
+        predictors["latent from dynamics"] = (explained, colour("interventional"))
+        source = (
+            f"A latent that is inferred from the dynamics alone accounts for {explained} of it (below 0: it predicts"
+            " less well than the present observation). The rest is, for the most part, evidence of the expert's past"
+            " actions, and a clone's own actions are no evidence."
         )
     sections = [
         (
-            "Is there a hidden context, and where does it show?",
-            f"Memory of a trial predicts the expert's action {memory} nats a step better than the present observation"
-            f" alone; {LITTLE} is nothing. {whence}",
-            _bars(predictors, "nats a step over the present observation", LITTLE),
+            "Is there a latent, and where is its evidence?",
+            f"A memory of the trial predicts the expert's action {memory} nats a step better than the present"
+            f" observation alone; {NEGLIGIBLE} is negligible. {source}",
+            _bars(predictors, "nats a step over the present observation", NEGLIGIBLE),
         )
     ]
     if "explored" in figure:
-        explored, expert, acted = (figure[key] for key in ("explored", "shown", "acted"))
+        explored, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
         evidence: Rows = {
-            "world, in exploration": (explored, colour("interventional")),
-            "world, where the expert went": (expert, colour("expert")),
+            "dynamics, in exploration": (explored, colour("interventional")),
+            "dynamics, in expert trials": (shown, colour("expert")),
             "the expert's actions": (acted, colour("naive_rnn")),
         }
         sections.append(
             (
-                "Does the world tell it?",
-                f"A trial's own latent makes what the world answers {explored} nats a step more likely than another"
-                f" trial's in exploration, whose actions are blind to it, and {expert} where the expert went. If the"
-                f" latter is below {LITTLE}, and explains next to none of the actions, expert trials do not say which"
-                f" latent was theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as"
-                " much: so sure is a clone that takes its own actions for the expert's.",
-                _bars(evidence, "nats a step", LITTLE),
+                "Are the dynamics evidence of it?",
+                f"A trial's own latent makes next observations {explored} nats a step more likely than another trial's"
+                f" in exploration, whose actions do not depend on it, and {shown} in expert trials. If the latter is"
+                f" below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do not"
+                f" identify it. The expert's actions are evidence of it by {acted} nats a step, {figure['ratio']} times"
+                " as much: this is the false confidence of a clone that takes its own actions for the expert's.",
+                _bars(evidence, "nats a step", NEGLIGIBLE),
             )
         )
     hue = colour("expert")
-    ways: Rows = {"among those who know": (stakes, hue), "from that very expert's": (strayed, hue)}
+    deviations: Rows = {"from all with right latents": (stakes, hue), "paired by latent and start": (strayed, hue)}
     sections.append(
         (
             "What is at stake?",
-            f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange, among"
-            f" those of experts who know theirs, as by chance, and {strayed} times as far from those of the expert who"
-            f" knows it; below {STAKES} that may be chance. Dreams are {figure['unlike']} times as strange as data.",
-            _bars(ways, "ways of the mistaken one, times chance", STAKES),
+            f"In the learned dynamics, trajectories of an expert policy given a wrong latent deviate {stakes} times as"
+            f" much as by chance from those given right latents, and {strayed} times as much when paired by latent and"
+            f" start; below {STAKES} that may be chance. Trajectories in the learned dynamics deviate from the data's"
+            f" {figure['unlike']} times as much as by chance.",
+            _bars(deviations, "deviation under a wrong latent, times chance", STAKES),
         )
     )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
-    scores: Rows = {who: (figure[key], colour(hue)) for who, key, hue in actors}
-    scores |= {f"{who}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for who, key, hue in actors}
+    scores: Rows = {actor: (figure[key], colour(hue)) for actor, key, hue in actors}
+    scores |= {f"{actor}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for actor, key, hue in actors}
     sections.append(
         (
             "What will it cost?",
-            f"Between one who acts on another latent, 0, and the expert who knows it, 1, a naive clone scores {naive}"
-            f" by where it goes, and one that infers the latent from the world {latent}. Eq. (1) is the same by what"
-            " they do, as that expert judges it.",
-            _bars(scores, "predicted score, last episode", FINE),
+            f"From 0 for the expert policy given a wrong latent to 1 for the right one, a naive clone scores {naive} by"
+            f" trajectories, and a policy that infers the latent from the dynamics {latent}. Eq. (1) scores actions.",
+            _bars(scores, "predicted score, last episode", GOOD),
         )
     )
     return sections

@@ -55,21 +55,21 @@ def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
-    from deconfounded.deconf.diagnosis.diagnose import VARY
+    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
     truth = ("confounded", 2) if certified else ("not confounded", 1)
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
         truth = ("confounded", 3)
-    alike = task.name == "nothing_hidden" and diagnosis.next is VARY
+    alike = task.name == "nothing_hidden" and diagnosis.next is VARY_LATENT
     return alike or (diagnosis.verdict, diagnosis.tier) == truth
 
 
 def predicted(diagnosis: Diagnosis) -> float:
     """The gap that Tier 2 could close, in scores; 0 where nothing is confounded, or alike, or queries are needed."""
-    from deconfounded.deconf.diagnosis.diagnose import VARY
+    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
-    nothing = diagnosis.verdict == "not confounded" or diagnosis.tier == 3 or diagnosis.next is VARY
-    return 0.0 if nothing else diagnosis.found["gap"].value
+    nothing = diagnosis.verdict == "not confounded" or diagnosis.tier == 3 or diagnosis.next is VARY_LATENT
+    return 0.0 if nothing else diagnosis.figures["gap"].value
 
 
 def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:
@@ -194,7 +194,7 @@ def main() -> None:
             "right": right(task, certified, diagnosis),
             "predicted": predicted(diagnosis),
             "measured": scores["deconfounded"] - scores["naive_rnn"],
-            "found": {key: figure._asdict() for key, figure in diagnosis.found.items()},
+            "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
         rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}
