@@ -16,10 +16,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +24,7 @@ from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
@@ -39,7 +35,7 @@ from deconfounded.experts import policy
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 
-EPISODES = 5
+EPISODES, SEED = 5, 0
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
 THRESHOLDS = {
@@ -50,7 +46,7 @@ THRESHOLDS = {
 }
 
 
-class Witness(ExpertAgent):
+class EvidenceRecorder(ExpertAgent):
     """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give."""
 
     def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid) -> None:
@@ -85,7 +81,7 @@ class Witness(ExpertAgent):
         self.log_belief = np.where(alive[:, None], belief_update(self.log_belief, log_dynamics), self.log_belief)
 
 
-def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Array, Array, Array]:
+def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, Array]:
     """Levels [J, L]; scores [J, J] of the expert under the row's theta, told the column's; mean returns [J, J].
 
     Each row is scored by its own expert and its own random actions.
@@ -95,8 +91,8 @@ def stakes(task: envs.Task, expert: Expert, trials: int, seed: int) -> tuple[Arr
     true = np.repeat(levels, j * trials, 0)
     told = np.tile(np.repeat(levels, trials, 0), (j, 1))
     env = envs.BatchEnv(task, j * j * trials)
-    returns = run_trials(env, ExpertAgent(env, expert, told), 1, seed, true).returns
-    random = run_trials(env, RandomAgent(task.action_space), 1, seed, true).returns
+    returns = run_trials(env, ExpertAgent(env, expert, told), 1, SEED, true).returns
+    random = run_trials(env, RandomAgent(task.action_space), 1, SEED, true).returns
     matrix = returns.reshape(j, j, trials).mean(-1)
     zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
     one = np.diag(matrix)[:, None]
@@ -116,12 +112,7 @@ def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
 
 
 def certify(
-    task: envs.Task,
-    expert: Expert,
-    trials: int = 64,
-    grid: int = 21,
-    seed: int = 0,
-    done: Callable[[str], None] = lambda stage: None,
+    task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, done: Callable[[str], None] = lambda stage: None
 ) -> dict[str, Any]:
     """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert.
 
@@ -130,120 +121,105 @@ def certify(
     env = envs.BatchEnv(task, trials)
 
     def returns(agent: Agent) -> Array:
-        return run_trials(env, agent, EPISODES, seed).returns.mean(0)
+        return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
 
-    witness = Witness(env, expert, Grid(env, expert, grid))
-    _, shown, truth = run_trials(env, witness, EPISODES, seed)  # thetas are the same in every run: seeds are shared
-    one, zero = shown.mean(), returns(RandomAgent(task.action_space)).mean()
+    recorder = EvidenceRecorder(env, expert, Grid(env, expert, grid))
+    _, best, truth = run_trials(env, recorder, EPISODES, SEED)  # thetas are the same in every run: seeds are shared
+    one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
     if one <= zero:
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
     done(STAGES[0])
-    beliefs = [*witness.beliefs, np.exp(witness.log_belief)]
-    interventional = returns(ExactAgent(env, expert, False, grid))
-    static = returns(ExactAgent(env, expert, False, grid, static=True)) if task.drifts else None
+    beliefs = [*recorder.beliefs, np.exp(recorder.log_belief)]
+    policies = {"interventional": returns(ExactAgent(env, expert, False, grid))}
+    static = {"static": returns(ExactAgent(env, expert, False, grid, static=True))} if task.drifts else {}
     done(STAGES[1])
-    conditional = returns(ExactAgent(env, expert, True, grid))
+    policies |= {"conditional": returns(ExactAgent(env, expert, True, grid)), **static}
     done(STAGES[2])
-    levels, matrix, raw = stakes(task, expert, max(trials // 2, 8), seed)
+    levels, matrix, raw = stakes(task, expert, max(trials // 2, 8))
     done(STAGES[3])
 
     demo_env = envs.BatchEnv(task, 2 * trials)
-    demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed)).trials
-    blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(seed)))
+    demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, SEED)).trials
+    blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(SEED)))
     done(STAGES[4])
 
-    scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}
+    curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in policies.items()}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),
         "told_wrong_theta": float(matrix[far_pairs(task, levels)].mean()),
-        "conditional_last": float(scored["cond"][-1]),
-        "interventional_last": float(scored["int"][-1]),
+        **{f"{name}_last": curves[name]["score"][-1] for name in ("conditional", "interventional")},
     }
     checks = {}
     for name, (relation, bound) in THRESHOLDS.items():
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
-    dynamics, actions = (float(np.concatenate(x).mean()) for x in (witness.dynamics, witness.actions))
+    dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials tell nothing of theta
     return {
         "task": task.name,
         "task_version": task.version,
         "verdict": "passed" if all(check["passed"] for check in checks.values()) else "failed",
         "checks": checks,
-        "return_random": float(zero),
-        "return_expert": float(one),
-        "interventional": {"return": interventional.tolist(), "score": scored["int"].tolist()},
-        "conditional": {"return": conditional.tolist(), "score": scored["cond"].tolist()},
-        **(
-            {}
-            if static is None
-            else {"static": {"return": static.tolist(), "score": normalise(static, zero, one).tolist()}}
-        ),
+        "return_random": zero,
+        "return_expert": one,
+        **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
-        "inferability": [
-            inferability(task, belief, witness.grid.theta, truth[:, i]) for i, belief in enumerate(beliefs)
-        ],
+        "inferability": [inferability(task, x, recorder.grid.theta, truth[:, i]) for i, x in enumerate(beliefs)],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
-        "grid": len(witness.grid.theta),
-        "seed": seed,
+        "grid": len(recorder.grid.theta),
+        "seed": SEED,
         "versions": identity.versions(),
     }
 
 
 def inferability(task: envs.Task, belief: Array, grid: Array, truth: Array) -> dict[str, float]:
     """How well the exact posterior of expert trials [N, K] knows theta: R^2 of its mean, or accuracy if categorical."""
-    found = {}
+    inferable = {}
     for i, latent in enumerate(task.latents):
         if latent.distribution == "categorical":
-            found[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
+            inferable[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
         else:
             residual = belief @ grid[:, i] - truth[:, i]
-            found[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
-    return found
+            inferable[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
+    return inferable
 
 
 def picture(result: dict[str, Any], file: Path) -> None:
     """Stakes, exact policies and evidence on one page."""
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 3.9), layout="constrained")
-    score = np.array(result["stakes"]["score"])
-    image = left.imshow(score, vmin=0, vmax=1, cmap="viridis")
-    for (i, j), value in np.ndenumerate(score):
-        left.text(j, i, f"{value:.2f}", ha="center", va="center", color="white" if value < 0.6 else "black", fontsize=8)
-    ticks = ["\n".join(f"{x:.3g}" for x in level) for level in result["stakes"]["levels"]]
-    left.set(xlabel="theta told", ylabel="true theta", title="score of an expert told another theta")
-    left.set_xticks(range(len(ticks)), ticks)
-    left.set_yticks(range(len(ticks)), ticks)
-    figure.colorbar(image, ax=left)
-    lines = {"interventional": "tab:green", "conditional": "tab:red", "static": "tab:olive"}
-    for name in (name for name in lines if name in result):
-        label = "interventional, theta taken to stand still" if name == "static" else f"exact {name}"
-        middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=lines[name], label=label)
-    middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
-    middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title="exact policies")
-    middle.legend(frameon=False)
-    evidence = result["evidence_nats_per_step"]
-    right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
-    ratio = evidence["delusion_ratio"]
-    told = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
-    right.set(yscale="symlog", ylabel="nats a step", title=told)
-    figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
-    save_figure(figure, file, 110)
-    plt.close(figure)
+    with panels(file, 1, 3, size=(13, 3.9)) as [[left, middle, right]]:
+        for (i, j), value in np.ndenumerate(score := np.array(result["stakes"]["score"])):
+            hue = "white" if value < 0.6 else "black"
+            left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=8)
+        ticks = ["\n".join(f"{x:.3g}" for x in level) for level in result["stakes"]["levels"]]
+        left.set(xlabel="theta told", ylabel="true theta", title="score of an expert told another theta")
+        left.set_xticks(range(len(ticks)), ticks)
+        left.set_yticks(range(len(ticks)), ticks)
+        left.figure.colorbar(left.imshow(score, vmin=0, vmax=1, cmap="viridis"), ax=left)
+        lines = {"interventional": "tab:green", "conditional": "tab:red", "static": "tab:olive"}
+        for name in (name for name in lines if name in result):
+            label = "interventional, theta taken to stand still" if name == "static" else f"exact {name}"
+            middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=lines[name], label=label)
+        middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
+        middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title="exact policies")
+        middle.legend(frameon=False)
+        evidence = result["evidence_nats_per_step"]
+        right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
+        ratio = evidence["delusion_ratio"]
+        title = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
+        right.set(yscale="symlog", ylabel="nats a step", title=title)
+        left.figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
-    parser.add_argument("--out", type=place, help="output folder; default: results/certificates")
+    parser = Parser(__doc__, "--task", "--expert")
+    folder = Path("results") / "certificates"
+    parser.add_argument("--out", type=place, default=folder, help=f"output folder; default: {folder}")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
     expert = policy.load(task, args.expert)
-    folder = args.out or Path("results") / "certificates"
-    check_folder(folder)
+    check_folder(folder := args.out)
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
     result = certify(task, expert, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()
@@ -251,11 +227,8 @@ def main() -> None:
     picture(result, folder / f"{task.name}.png")
     for name, check in result["checks"].items():
         print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {check['measured']:.3f} (required {check['required']})")
-    evidence = result["evidence_nats_per_step"]
-    print(
-        f"evidence a step: dynamics {evidence['dynamics']:.3g} nats, actions {evidence['actions']:.3g} nats;"
-        f" theta from expert trials: {result['inferability'][-1]}"
-    )
+    nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
+    print(f"evidence a step: {nats}; theta from expert trials: {result['inferability'][-1]}")
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
     if result["verdict"] == "failed":
         raise SystemExit(1)

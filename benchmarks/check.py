@@ -20,9 +20,7 @@ from deconfounded.envs.contract.probe import Skipped
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True)
+    parser = Parser(__doc__, "--task")
     task, failed = envs.get(parser.parse_args().task), False
     for name, check in {"check_task": check_task, **CONTRACT}.items():
         try:

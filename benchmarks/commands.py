@@ -28,35 +28,32 @@ KEPT = "what was finished is kept, and --resume goes on"
 
 def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
     """Arguments of a run; methods: help on what they may be; seeds: how many by default, if not the preset's."""
-    made = Parser(description)
-    made.add_argument(
-        "--preset", default="default", help="; ".join(f"{name}: {text}" for name, text in PRESETS.items())
-    )
+    made = Parser(description, "--device")
+    presets = "; ".join(f"{name}: {text}" for name, text in PRESETS.items())
+    made.add_argument("--preset", default="default", help=presets)
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
     made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive_rnn.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
-    made.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
-    made.add_argument(
-        "--cluster", metavar="ADDRESS", help="run on a Ray cluster: HOST:PORT, or auto for this machine's"
-    )
+    cluster = "run on a Ray cluster: HOST:PORT, or auto for this machine's"
+    made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    made.set_defaults(expert=None, salt="", track=None)  # of run.py alone
     return made
 
 
-def check(args: argparse.Namespace, known: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
+def check(args: argparse.Namespace, allowed: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
     """The methods asked for; guests: from outside too. Raises InputError for anything that cannot be run."""
-    asked = args.methods or list(default)
-    methods = [name for one in asked for name in (known if one == "all" else [one])]
+    methods = [name for asked in args.methods or default for name in (allowed if asked == "all" else [asked])]
     if guests:
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
-        known = [*known, *METHODS.outside]
-    catalogue.check(args.preset, methods, args.seeds, known)
+        allowed = [*allowed, *METHODS.outside]
+    catalogue.check(args.preset, methods, args.seeds, allowed)
     if args.cluster is None:
         check_device(args.device)
     elif args.device not in ("cpu", "cuda"):
         raise envs.InputError(
-            f"--device was {args.device}; with --cluster it must be cpu, or cuda: Ray gives a GPU a job"
+            f"--device was {args.device}; with --cluster it must be cpu, or cuda, of which Ray gives one"
         )
     elif not find_spec("ray"):
         raise envs.InputError("--cluster needs Ray; `pip install deconfounded-imitation[cluster]` brings it")
@@ -76,29 +73,14 @@ def check_device(device: str) -> None:
 
 
 def about(
-    kind: type[Job],
-    task: envs.Task,
-    name: str,
-    settings: Preset,
-    changes: Sequence[str],
-    expert: str | None = None,
-    salt: str = "",
+    kind: type[Job], task: envs.Task, name: str, settings: Preset, changes: Sequence[str], expert: str | None, salt: str
 ) -> dict[str, Any]:
-    """What a folder is for: whoever asks for another one is not to write there. What else matters, each job checks."""
+    """What a folder is for: another run is not to write there. What else matters, each job checks."""
     ours = {method: values for method, values in settings.configs.items() if method not in METHODS.outside}
-    return {
-        "kind": kind.__name__,
-        "task": task.name,
-        "task_version": task.version,
-        "reference": task.reference,
-        "preset": name,
-        "set": list(changes),
-        "settings": {**asdict(settings), "configs": ours},
-        "versions": identity.versions(),
-        **identity.expert(task, expert),
-        "salt": salt,
-        "episodes": task.episodes,
-    }
+    made_of = {"task": task.name, "task_version": task.version, "reference": task.reference, "preset": name}
+    made_of |= {"set": list(changes), "settings": {**asdict(settings), "configs": ours}}
+    made_of |= {"versions": identity.versions(), **identity.expert(task, expert)}
+    return {"kind": kind.__name__, **made_of, "salt": salt, "episodes": task.episodes}
 
 
 def engine(cluster: str | None) -> Engine:
@@ -122,19 +104,20 @@ def run(
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
-    catalogue.check(args.preset, None, seeds, ())
-    expert, salt = getattr(args, "expert", None), getattr(args, "salt", "")
-    track = getattr(args, "track", None) is not None
-    described = about(kind, task, args.preset, settings, args.set, expert, salt)
+    catalogue.check(args.preset, (), seeds, ())
+    own = args.expert, args.salt
+    described = about(kind, task, args.preset, settings, args.set, *own)
     with locked(folder):
         prepare(folder, described, args.resume)
         know_guests(folder / "jobs")
+        track = args.track is not None
         jobs = [
             kind(
-                task.reference, settings, method, tuple(range(seeds)), folder / "jobs", expert, salt, guest, track=track
+                *(task.reference, settings, name, tuple(range(seeds)), folder / "jobs", *own),
+                guest=catalogue.guest(name),
+                track=track,
             )
-            for method in methods
-            for guest in [catalogue.guest(method)]
+            for name in methods
         ]
         with engine(args.cluster) as where:
             finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)

@@ -22,25 +22,47 @@ NO_READER = 141  # 128 + SIGPIPE
 ROOT = Path(__file__).resolve().parents[1]
 
 
-class Parser(argparse.ArgumentParser):
-    """A command line, described by its module's docstring, whose errors are one line."""
-
-    def __init__(self, description: str | None) -> None:
-        super().__init__(
-            description=description, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
-        )
-
-    def error(self, message: str) -> NoReturn:
-        from deconfounded.envs.support.errors import InputError
-
-        raise InputError(f"{message}; see --help")
-
-
 def place(text: str) -> Path:
     """An argument that names a file or folder; nothing is no name."""
     if not text.strip():
         raise argparse.ArgumentTypeError("it must be a name")
     return Path(text)
+
+
+def whole(least: int, most: int | None = None) -> Callable[[str], int]:
+    """The type of an argument that is a whole number of that range."""
+
+    def number(text: str) -> int:
+        with contextlib.suppress(ValueError):
+            if least <= (value := int(text)) and (most is None or value <= most):
+                return value
+        reach = "up" if most is None else f"to {most:,}"
+        raise argparse.ArgumentTypeError(f"it was {text!r}; it must be a whole number from {least:,} {reach}")
+
+    return number
+
+
+COMMON: dict[str, dict[str, Any]] = {
+    "--agent": {"type": Path, "required": True, "help": "a folder under a run's agents/"},
+    "--task": {"required": True, "help": "its name, or path/file.py:Class"},
+    "--expert": {"help": "another expert: weights.safetensors, or path/file.py:name of a callable"},
+    "--device": {"default": "cpu", "help": "torch device of training, e.g. cuda"},
+}
+
+
+class Parser(argparse.ArgumentParser):
+    """A command line, described by its module's docstring, whose errors are one line; with some of COMMON."""
+
+    def __init__(self, description: str | None, *common: str) -> None:
+        form = argparse.RawDescriptionHelpFormatter
+        super().__init__(description=description, formatter_class=form, allow_abbrev=False)
+        for name in common:
+            self.add_argument(name, **COMMON[name])
+
+    def error(self, message: str) -> NoReturn:
+        from deconfounded.envs.support.errors import InputError
+
+        raise InputError(f"{message}; see --help")
 
 
 class Stopped(KeyboardInterrupt):
@@ -72,10 +94,8 @@ def escape_output() -> None:
 def need_checkout(name: str) -> None:
     """End a command with one line and exit code 2 where there is no source tree, but an installed package."""
     if not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
-        print(
-            f"error: {name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there",
-            file=sys.stderr,
-        )
+        wrong = f"{name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there"
+        print(f"error: {wrong}", file=sys.stderr)
         sys.exit(2)
 
 
@@ -152,17 +172,17 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
         if isinstance(error, SystemExit):
             if not _from_outside(error):
                 raise
-            told, code = f"error: it was ended by {error_line(error)}", 2
+            line, code = f"error: it was ended by {error_line(error)}", 2
         elif isinstance(error, KeyboardInterrupt) or signals.stopped:  # an import turns it into an error of its own
-            told, code = f"interrupted; {interrupted}", 128 + (signals.stopped or signal.SIGINT)
+            line, code = f"interrupted; {interrupted}", 128 + (signals.stopped or signal.SIGINT)
         elif isinstance(error, InputError):
-            told, code = f"error: {error}", 2
+            line, code = f"error: {error}", 2
         elif isinstance(error, OSError):
-            told, code = f"error: {error.filename or 'file'}: {error.strerror or error}", 2
+            line, code = f"error: {error.filename or 'file'}: {error.strerror or error}", 2
         elif isinstance(error, MemoryError):
-            told, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
+            line, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
         else:
             raise
     with contextlib.suppress(OSError):  # the terminal is gone
-        print(told, file=sys.stderr)
+        print(line, file=sys.stderr)
     sys.exit(code)

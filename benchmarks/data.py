@@ -15,7 +15,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command, whole
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.envs.support.files import check_folder
 from deconfounded.experts import datasets, policy
@@ -23,20 +23,15 @@ from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_tr
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True, help="its name, or path/file.py:Class")
-    parser.add_argument("--trials", type=int, default=256)
+    parser = Parser(__doc__, "--task", "--expert")
+    parser.add_argument("--trials", type=whole(1, 100_000), default=256)
     parser.add_argument("--explore", action="store_true", help="uniformly random actions in place of the expert's")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
+    parser.add_argument("--seed", type=whole(0), default=0)
     parser.add_argument("--out", type=place, required=True, help="a folder of data sets")
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
     expert = policy.load(task, args.expert)
-    if not 1 <= args.trials <= 100_000 or args.seed < 0:
-        raise envs.InputError(f"--trials was {args.trials} and --seed {args.seed}; they must be from 1 and from 0 up")
     if not find_spec("minari"):
         raise envs.InputError("a data set needs Minari; `pip install deconfounded-imitation[data]` brings it")
     check_folder(args.out)

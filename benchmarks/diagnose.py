@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
@@ -57,15 +57,13 @@ class Refit:
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Which one it is."""
         return (self.index,)
 
     @property
     def file(self) -> Path:
-        """Where its findings are."""
         return self.folder / f"refit-{self.index}.json"
 
-    def found(self) -> Findings | None:
+    def findings(self) -> Findings | None:
         """What was measured, if it was of the same."""
         from deconfounded.deconf.diagnosis.measures import Findings
 
@@ -82,17 +80,17 @@ class Refit:
         from deconfounded.benchmarks.engine import progress
         from deconfounded.deconf.diagnosis.measures import measure
 
-        start, told = time.time(), 0
+        start, ticked = time.time(), 0
 
         def tell(share: float) -> None:
-            nonlocal told
-            progress.tick(int(share * self.ticks) - told)
-            told = int(share * self.ticks)
+            nonlocal ticked
+            progress.tick(int(share * self.ticks) - ticked)
+            ticked = int(share * self.ticks)
 
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
         explore = None if self.explore is None else trials_of(self.explore)
-        found = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
-        write_json(self.file, {"made_of": self.made_of, "found": found._asdict()})
+        findings = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
+        write_json(self.file, {"made_of": self.made_of, "found": findings._asdict()})
         return f"measured in {time.time() - start:.0f} s"
 
 
@@ -119,25 +117,22 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
         "versions": identity.versions(),
         "version": VERSION,
     }
-    known = (seed, config.refits, json.dumps(about), folder)
-    refits = [Refit(source, exploration, config.amounts, i, *known) for i in range(config.refits)]
+    shared = (seed, config.refits, json.dumps(about), folder)
+    refits = [Refit(source, exploration, config.amounts, i, *shared) for i in range(config.refits)]
     with commands.locked(folder), Local() as engine:
-        run_jobs([one for one in refits if one.found() is None], "diagnosis", engine.run)
-    found = judge([each for one in refits if (each := one.found()) is not None])
+        run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run)
+    diagnosis = judge([findings for refit in refits if (findings := refit.findings()) is not None])
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
-    return found, page.write(found, about, folder)
+    return diagnosis, page.write(diagnosis, about, folder)
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="of the expert")
     parser.add_argument("--explore", type=place, metavar="FILE", help="theta-blind exploration of the same world")
-    parser.add_argument("--seed", type=int, default=0, help="of the splits and of training")
+    parser.add_argument("--seed", type=whole(0), default=0, help="of the splits and of training")
     parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
     args = parser.parse_args()
-    if args.seed < 0:
-        raise envs.InputError(f"--seed was {args.seed}; it must be from 0 up")
     asked = " ".join(["deconf diagnose", *sys.argv[1:]])
     print(run(args.trials, args.explore, args.seed, args.out, asked)[1])
 

@@ -17,7 +17,7 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser, run_command, whole
 from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.guest import Stranger
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -60,27 +60,20 @@ def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = 
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--agent", type=Path, required=True, help="a folder under a run's agents/")
-    parser.add_argument("--task", required=True)
+    parser = Parser(__doc__, "--agent", "--task")
     parser.add_argument("--theta", type=float, nargs="+", help="forced; default: drawn")
-    parser.add_argument("--episodes", type=int, help="default: those of the task's trials")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=whole(1, 1000), help="default: those of the task's trials")
+    parser.add_argument("--seed", type=whole(0), default=0)
     parser.add_argument("--video", type=Path, help="an .mp4 file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
-    agent, episodes = ready(args.agent, task), task.episodes if args.episodes is None else args.episodes
-    if not 1 <= episodes <= 1000 or args.seed < 0:
-        raise envs.InputError(
-            f"--episodes was {episodes} and --seed {args.seed}; they must be from 1 to 1,000, and from 0 up"
-        )
+    agent = ready(args.agent, task)
     if args.video is not None:
         if args.video.suffix != ".mp4":
             raise envs.InputError(f"--video was {args.video}; it must end in .mp4")
         check_file(args.video)
     env = envs.GymEnv(task, render_mode="rgb_array" if args.video else None)
-    returns, frames = play(agent, env, episodes, args.seed, args.theta)
+    returns, frames = play(agent, env, args.episodes or task.episodes, args.seed, args.theta)
     pairs = zip(task.latents, env.batch.theta[0], strict=True)
     named = (f"{lat.name} {value:g} {lat.unit}".strip() for lat, value in pairs)
     print(f"{task.name}, {', '.join(named)}: returns {' '.join(f'{one:.2f}' for one in returns)}")

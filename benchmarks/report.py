@@ -20,7 +20,6 @@ from deconfounded.envs.support.files import read_sealed
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("run", type=Path, help="output folder of a run")
     folder = parser.parse_args().run

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.console import COMMON, run_command
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.experts import policy
 
@@ -27,14 +27,14 @@ def main() -> None:
     """The experiment on one page."""
     parser = commands.parser(__doc__, "`all`, or some of those that --list names; your own is path/file.py:fit")
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
+    parser.add_argument("--expert", **COMMON["--expert"])
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
-    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
     parser.add_argument("--track", choices=["tensorboard"], help="show losses as they come, in the run's folder")
     parser.add_argument("--salt", default="", help="draw other thetas in evaluation, that nobody can have seen")
     args = parser.parse_args()
-    if args.list and args.task is not None:
-        raise envs.InputError(f"--list was given with --task {args.task}; it lists all, and goes by itself")
     if args.list:
+        if args.task is not None:
+            raise envs.InputError(f"--list was given with --task {args.task}; it lists all, and goes by itself")
         for name in envs.names():
             try:
                 task = envs.get(name)

@@ -12,11 +12,10 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
     stop_at_once()
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command, whole
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
@@ -32,74 +31,57 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
 
     Raises InputError for a latent that there is not, or a range that cannot be.
     """
-    moved = {}
+    latents = {latent.name: latent for latent in task.latents}
     for text in ranges:
         name, _, bounds = text.partition("=")
         try:
             low, high = map(float, bounds.split(":"))
         except ValueError:
             raise envs.InputError(f"--range was {text!r}; it must be like {task.latents[0].name}=0.1:0.2") from None
-        known = {lat.name: lat for lat in task.latents}
-        check_names("latent", [name], list(known))
-        inside = known[name].low <= low <= high <= known[name].high
-        if known[name].distribution == "categorical" and not inside:
-            raise envs.InputError(f"--range was {text!r}; {name} has {known[name].low:g} to {known[name].high:g} alone")
-        moved[name] = replace(known[name], low=low, high=high)
+        check_names("latent", [name], list(latents))
+        latent = latents[name]
+        if latent.distribution == "categorical" and not latent.low <= low <= high <= latent.high:
+            raise envs.InputError(f"--range was {text!r}; {name} has {latent.low:g} to {latent.high:g} alone")
+        latents[name] = replace(latent, low=low, high=high)
     other = type(task)()
-    other.latents = tuple(moved.get(lat.name, lat) for lat in task.latents)  # type: ignore[misc]
+    other.latents = tuple(latents.values())  # type: ignore[misc]
     return other
 
 
 def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
     """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
     env = envs.BatchEnv(where, trials)
-    found = {}
-    for name, one in (
-        ("agent", agent),
-        ("expert", ExpertAgent(env, expert)),
-        ("random", RandomAgent(task.action_space)),
-    ):
-        found[name] = run_trials(env, one, task.episodes, seed).returns
-    best, worst = found["expert"].mean(), found["random"].mean()
-    by_trial = score.normalise(found["agent"], worst, best)
+    agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
+    returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
+    by_trial = score.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
     interval = score.bootstrap(by_trial[:, -1])
     return {
         "score": by_trial.mean(0).round(4).tolist(),
         "ci95_last": None if interval is None else interval.tolist(),
-        "return": {name: returns.mean(0).round(4).tolist() for name, returns in found.items()},
+        "return": {name: of.mean(0).round(4).tolist() for name, of in returns.items()},
     }
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--agent", type=Path, required=True, help="a folder under a run's agents/")
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--trials", type=int, default=128)
-    parser.add_argument("--seed", type=int, default=0, help="0 and no --salt: the thetas of a run's seed 0")
+    parser = Parser(__doc__, "--agent", "--task", "--expert")
+    parser.add_argument("--trials", type=whole(2, 100_000), default=128)
+    parser.add_argument("--seed", type=whole(0), default=0, help="0 and no --salt: the thetas of a run's seed 0")
     parser.add_argument("--salt", default="", help="any text")
     parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from there")
-    parser.add_argument("--expert", help="another expert: weights.safetensors, or path/file.py:name of a callable")
     parser.add_argument("--out", type=place, help="a .json file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
     agent, expert, where = ready(args.agent, task), policy.load(task, args.expert), elsewhere(task, args.range)
-    if not 2 <= args.trials <= 100_000 or args.seed < 0:
-        raise envs.InputError(
-            f"--trials was {args.trials} and --seed {args.seed}; they must be from 2 to 100,000, and from 0 up"
-        )
     if args.out is not None:
         check_file(args.out)
-    found = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
-    low, high = found["ci95_last"]
-    print(
-        f"{task.name}, {args.trials} trials: score of each episode {' '.join(map(score.two_decimals, found['score']))}"
-        f" (0 random, 1 expert; last {low:.2f} to {high:.2f}, 95% over trials)"
-    )
+    scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
+    last = "last {:.2f} to {:.2f}, 95% over trials".format(*scored["ci95_last"])
+    scores = " ".join(map(score.two_decimals, scored["score"]))
+    print(f"{task.name}, {args.trials} trials: score of each episode {scores} (0 random, 1 expert; {last})")
     if args.out is not None:
         asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}
         about = {"task": task.name, "task_version": task.version, "agent": str(args.agent)}
-        write_json(args.out, {**about, **asked, **found})
+        write_json(args.out, {**about, **asked, **scored})
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 from safetensors.numpy import save as to_bytes
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place, run_command, whole
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.files import check_file, write_atomically, write_json
@@ -27,18 +27,16 @@ STEPS = 3_000_000
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
-    parser.add_argument("--task", required=True)
-    parser.add_argument("--steps", type=int, default=STEPS, help=f"control steps of PPO; default: {STEPS:,}")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = Parser(__doc__, "--task")
+    parser.add_argument(
+        "--steps", type=whole(1, 2**40), default=STEPS, help=f"control steps of PPO; default: {STEPS:,}"
+    )
+    parser.add_argument("--seed", type=whole(0, 2**32 - 1), default=0)
     parser.add_argument("--out", type=place, help="weights file; default: <task>.safetensors in this folder")
     args = parser.parse_args()
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
-    if not (1 <= args.steps < 2**40 and 0 <= args.seed < 2**32):
-        raise envs.InputError(f"--steps was {args.steps} and --seed {args.seed}; they must be from 1 and from 0 up")
     file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
@@ -56,8 +54,8 @@ def main() -> None:
     file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
     write_atomically(file, to_bytes(weights))
     env = envs.BatchEnv(task, 256)
-    returns = run_trials(env, ExpertAgent(env, policy.load(task, file)), 1, seed=args.seed).returns
-    random = run_trials(env, RandomAgent(task.action_space), 1, seed=args.seed).returns
+    agents = ExpertAgent(env, policy.load(task, file)), RandomAgent(task.action_space)
+    returns, random = (run_trials(env, agent, 1, seed=args.seed).returns for agent in agents)
     card = {
         "task": task.name,
         "task_version": task.version,
@@ -76,9 +74,8 @@ def main() -> None:
     }
     write_json(file.with_suffix(".json"), card)
     if returns.mean() - random.mean() < 2 * random.std():
-        print(
-            f"warning: the expert of {task.name} is hardly better than random actions: more --steps, or another reward"
-        )
+        remedy = "more --steps, or another reward"
+        print(f"warning: the expert of {task.name} is hardly better than random actions: {remedy}")
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
     if file.resolve() != policy.path(task).resolve():
         print(f"commands take it as --expert {file}; they look for {policy.path(task)} unasked")

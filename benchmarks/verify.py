@@ -35,9 +35,9 @@ def verdict(record: records.Record, again: records.Record) -> tuple[str, list[st
         differs += [f"{name}: {was}, now {now}"] * (was != now)
     if record["bits"] == again["bits"]:
         return "same bits", differs
-    mean, sd = (np.array([one[key] for one in (record, again)]) for key in ("returns", "returns_sd"))
-    if mean.shape[1:] != sd.shape[1:] or len(record["returns"]) != len(again["returns"]):
+    if len(record["returns"]) != len(again["returns"]):
         return "not the same", differs
+    mean, sd = (np.array([record[key], again[key]]) for key in ("returns", "returns_sd"))
     error = np.sqrt((sd**2).sum(0) / record["eval_trials"]) + 1e-9
     return ("inside the interval" if (np.abs(mean[0] - mean[1]) <= 3 * error).all() else "not the same"), differs
 
@@ -58,39 +58,34 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
         job = BenchmarkJob(*what, folder, *of, salts=salts)
         with Local() as engine:
             finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
-        every = records.of_run(finished, record["preset"], record["set"], task.episodes)
-        made = [one for one in every if one["deployment"] == record["deployment"]]
-    if not made:
-        raise envs.InputError(f"{method} left no {records.named(record)} to compare with")
-    return made[0]
+        for again in records.of_run(finished, record["preset"], record["set"], task.episodes):
+            if again["deployment"] == record["deployment"]:
+                return again
+    raise envs.InputError(f"{method} left no {records.named(record)} to compare with")
 
 
 def pick(file: Path, method: str, seed: int) -> records.Record:
     """The record of a method and seed in a file. Raises InputError if there is none, or if there are several."""
     every = records.read(file)
-    fitting = [record for record in every if (records.named(record), record["seed"]) == (method, seed)]
+    ours = [record for record in every if records.named(record) == method]
+    if not ours:
+        raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")
+    fitting = [record for record in ours if record["seed"] == seed]
     if not fitting:
-        methods = dict.fromkeys(map(records.named, every))
-        if method not in methods:
-            raise envs.closest("method", method, list(methods), f" in {file}")
-        seeds = sorted(record["seed"] for record in every if records.named(record) == method)
-        raise envs.InputError(f"seed of {method} was {seed}; {file} has {', '.join(map(str, seeds))}")
+        seeds = ", ".join(map(str, sorted(record["seed"] for record in ours)))
+        raise envs.InputError(f"seed of {method} was {seed}; {file} has {seeds}")
     if len(fitting) > 1:  # of another preset, or other thetas
-        raise envs.InputError(
-            f"{file} has {len(fitting)} records of {method} with seed {seed}; give one with one of them"
-        )
+        several = f"{len(fitting)} records of {method} with seed {seed}"
+        raise envs.InputError(f"{file} has {several}; give one with one of them")
     return fitting[0]
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
+    parser = Parser(__doc__, "--expert", "--device")
     parser.add_argument("task", help="its name, or path/file.py:Class")
     parser.add_argument("method", help="its name, or path/file.py:fit")
     parser.add_argument("seed", type=int)
     parser.add_argument("--records", type=Path, help="folder or file of records; default: docs/records of the checkout")
-    parser.add_argument("--expert", help="the expert, if it is not the task's own")
-    parser.add_argument("--device", default="cpu", help="torch device of training, e.g. cuda")
     args = parser.parse_args()
     task = envs.get(args.task)
     method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
@@ -102,13 +97,12 @@ def main() -> None:
     if record["method"] not in METHODS:
         raise envs.InputError(f"method {record['method']} is not ours; give it as path/file.py:fit")
     if (task.name, task.version) != (record["task"], record["task_version"]):
-        raise envs.InputError(
-            f"the record is of {record['task']} v{record['task_version']}; here is {task.name} v{task.version}"
-        )
+        theirs = f"{record['task']} v{record['task_version']}"
+        raise envs.InputError(f"the record is of {theirs}; here is {task.name} v{task.version}")
     commands.check_device(args.device)
-    said, differs = verdict(record, rerun(record, task, record["method"], args.expert, args.device))
-    print(f"{task.name} {method} {args.seed}: {said}" + "".join(f"\n    {line}" for line in differs))
-    if said == "not the same":
+    outcome, differs = verdict(record, rerun(record, task, record["method"], args.expert, args.device))
+    print(f"{task.name} {method} {args.seed}: {outcome}" + "".join(f"\n    {line}" for line in differs))
+    if outcome == "not the same":
         raise SystemExit(1)
 
 

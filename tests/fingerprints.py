@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import identity, measure
+from deconfounded.benchmarks.engine import benchmark, identity
 from deconfounded.benchmarks.engine.benchmark import Recorder
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
@@ -169,8 +169,8 @@ def of_method(name: str) -> Numbers:
                 recorder.note()
                 where = f"{label(name, way)} on {task.name}"
                 numbers |= {f"actions of {where}": sums(trials.action), f"returns of {where}": sums(returns)}
-                if recorder.known:
-                    numbers[f"memory of {where}"] = sums(np.stack(recorder.known))
+                if recorder.features_after:
+                    numbers[f"memory of {where}"] = sums(np.stack(recorder.features_after))
     return numbers
 
 
@@ -183,14 +183,14 @@ def of_protocol(name: str) -> Numbers:
     trials, returns, _ = run_trials(env, RandomAgent(task.action_space), 2, seeds[:2])
     theta = rng.uniform(-1, 1, (4, 2, 1))
     known = rng.standard_normal((40, 6))
-    r2, _ = measure.probe(known, known[:, :2] + 0.3 * rng.standard_normal((40, 2)))
+    r2, _ = benchmark.probe(known, known[:, :2] + 0.3 * rng.standard_normal((40, 2)))
     return {
         "seeds": sums(np.array(seeds) / 2**31),
         "observations": sums(trials.obs),
         "actions": sums(trials.action),
         "mask": sums(trials.mask),
         "returns": sums(returns),
-        "Eq. (1)": sums(measure.objective(expert, trials, theta)),
+        "Eq. (1)": sums(benchmark.objective(expert, trials, theta)),
         "probe R2": [r2],
     }
 

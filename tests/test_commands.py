@@ -27,7 +27,7 @@ from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.output import records, score
 from deconfounded.benchmarks.output.pictures import save_figure
-from deconfounded.benchmarks.studies import publish, results, site
+from deconfounded.benchmarks.studies import publish, results
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.envs import render
 from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
@@ -74,7 +74,10 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
             ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
             "output folder /proc/none cannot be written",
         ),
-        (("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"), "and from 0 up"),
+        (
+            ("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"),
+            "it must be a whole number from 0 to",
+        ),
         (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=0"), "--set seeds was '0'; it must be like 5"),
         (("benchmarks/run.py", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
         (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
@@ -87,7 +90,7 @@ def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pyte
         (("benchmarks/report.py", "nowhere"), "nowhere holds no settings.json of a run"),
         (
             ("benchmarks/data.py", "--task", "bandit", "--out", "x", "--trials", "0"),
-            "they must be from 1 and from 0 up",
+            "argument --trials: it was '0'; it must be a whole number from 1 to 100,000",
         ),
         (("benchmarks/check.py", "--task", "bandid"), "did you mean 'bandit'?"),
         (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
@@ -294,7 +297,7 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
     [
         (("-m", "deconfounded", "--help"), 141),
         (("benchmarks/run.py", "--list"), 141),
-        (("benchmarks/studies/site.py", "--help"), 0),  # argparse thinks nothing of it
+        (("benchmarks/studies/cards.py", "--help"), 0),  # argparse thinks nothing of it
     ],
 )
 def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered: str) -> None:
@@ -496,8 +499,8 @@ def test_records_are_few_and_small() -> None:
 
 
 def test_pages_are_up_to_date() -> None:
-    """What site.py writes of tasks, certificates and results; README has a row for each of the latter two."""
-    for file, text in site.texts(results.published()).items():
+    """What publish.py writes of tasks, certificates and results; README has a row for each of the latter two."""
+    for file, text in publish.texts(results.published()).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
     rows = re.findall(r"^\| (\w+) \|", readme, re.M)

@@ -14,7 +14,7 @@ from safetensors.numpy import save_file
 from torch import Tensor
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
@@ -437,18 +437,18 @@ class TestExact:
         run_trials(env, agent, 1, seed=0)
         theta = env.task.encode_theta(env.theta)
         assert agent.features().shape == (64, 1)
-        assert measure.probe(agent.features(), theta)[0] > 0.95
-        assert measure.probe(np.random.default_rng(0).standard_normal((64, 1)), theta)[0] < 0.3
+        assert benchmark.probe(agent.features(), theta)[0] > 0.95
+        assert benchmark.probe(np.random.default_rng(0).standard_normal((64, 1)), theta)[0] < 0.3
 
     def test_probe_of_many_features(self) -> None:
         """With as many features as trials: R^2 is near 0 for noise, and near 1 for a few good features among noise."""
         rng = np.random.default_rng(0)
         theta, noise = rng.standard_normal((128, 1)), rng.standard_normal((128, 64))
         good = np.c_[noise[:, 16:], theta + 0.3 * rng.standard_normal((128, 16))]
-        assert -0.2 < measure.probe(noise, theta)[0] < 0.2
-        assert measure.probe(good, theta)[0] > 0.8
+        assert -0.2 < benchmark.probe(noise, theta)[0] < 0.2
+        assert benchmark.probe(good, theta)[0] > 0.8
         rare = np.r_[1e-40 * rng.random((64, 1)), rng.random((64, 1)) < 0.1]  # such as p(k) of a rare k
-        assert measure.probe(np.c_[good, rare], theta)[0] > 0.8
+        assert benchmark.probe(np.c_[good, rare], theta)[0] > 0.8
 
 
 class TestMethods:

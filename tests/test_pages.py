@@ -17,9 +17,9 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, report, score, statistics
-from deconfounded.benchmarks.output.answers import answers
+from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
-from deconfounded.benchmarks.studies import browser, findings, gap, publish, results, site, tune
+from deconfounded.benchmarks.studies import cards, findings, gap, publish, results, tune
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -50,7 +50,7 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         row = {"method": method, "setting": setting, "scores": {"bandit": scores}, "cpu_s": {"bandit": cpu}, **about}
         tune.keep(row, tmp_path / "tuning.json")
-    monkeypatch.setattr(findings, "DOCS", tmp_path)
+    monkeypatch.setattr(cards, "DOCS", tmp_path)
     lines = findings.tuning().splitlines()
     words = [line.split(" | ")[-1].strip(" |") for line in lines[2:11]]
     assert words == ["kept", "", "", "", "", "", "", "chosen", ""], "palr is not through"
@@ -285,11 +285,11 @@ class TestIndex:
 @pytest.fixture(scope="module", params=[(1280, False), (400, True)], ids=["desk", "phone, dark"])
 def seen(request: pytest.FixtureRequest) -> Iterator[Page]:
     """A page of two sizes."""
-    if browser.program() is None:
-        pytest.skip(f"no browser: none of {', '.join(browser.NAMES)} is installed")
+    if publish.chromium() is None:
+        pytest.skip(f"no browser: none of {', '.join(publish.BROWSERS)} is installed")
     pytest.importorskip("playwright", reason="playwright is not installed")
     width, dark = request.param
-    with browser.page(width, 850, dark) as page:
+    with publish.browser(width, 850, dark) as page:
         yield page
 
 
@@ -439,9 +439,9 @@ def test_beliefs_are_drawn(tmp_path: Path) -> None:
 
 
 def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(browser, "NAMES", ("no-such-browser",))
+    monkeypatch.setattr(publish, "BROWSERS", ("no-such-browser",))
     says = r"^no browser was found; install one of no-such-browser$"
-    with pytest.raises(envs.InputError, match=says), browser.page(400, 400):
+    with pytest.raises(envs.InputError, match=says), publish.browser(400, 400):
         pass
 
 
@@ -467,11 +467,11 @@ def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
         gap.picture(data, file, mark=mark)
 
     for data in ([("a", 0.1, 0.2)], [("a", 0.1, 0.2)], [("a", 0.1, 0.3)], [("a", 0.1, 0.3)]):
-        site.redraw(file, draw, data)
+        publish.redraw(file, draw, data)
     assert drawn == [1, 1]
     save_figure(plt.figure(), file, 50)
     assert mark_of(file) == mark_of(tmp_path / "nowhere.png") == ""
-    site.redraw(file, draw, data)
+    publish.redraw(file, draw, data)
     assert drawn == [1, 1, 1]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
-from deconfounded.benchmarks.studies import gap, noise, spectra, spectrum, validate, validation
+from deconfounded.benchmarks.studies import gap, noise, spectrum, validate
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
 
@@ -50,15 +50,15 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
     for base in noise.BASES:
         for _, kind, factor, _ in spectrum.variants(base):
             nats = {"evidence_nats_per_step": {"dynamics": 0.5, "actions": 700.0}, "verdict": "passed"}
-            scores = {name: [factor, factor + 0.2] for name in (*EXACT, *spectra.LEARNED)}
+            scores = {name: [factor, factor + 0.2] for name in (*EXACT, *spectrum.LEARNED)}
             points.append({"task": base, "kind": kind, "factor": factor, "certificate": nats, "scores": scores})
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in spectra.table(points).splitlines()[2:]]
-    head = [[base, kind, times] for base in noise.BASES for kind in spectra.KINDS.values() for times in TIMES]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in spectrum.table(points).splitlines()[2:]]
+    head = [[base, kind, times] for base in noise.BASES for kind in spectrum.KINDS.values() for times in TIMES]
     assert [row[:3] for row in rows] == head
     for row in rows:
         assert row[3:6] == ["0.50", "700", "passed"]
         assert [float(cell) for cell in row[6:]] == pytest.approx([float(row[2]) + 0.1] * 5, abs=0.0051)
-    spectra.picture(points, tmp_path / "spectrum.png")
+    spectrum.picture(points, tmp_path / "spectrum.png")
     assert (tmp_path / "spectrum.png").read_bytes().startswith(PNG)
 
 
@@ -68,9 +68,9 @@ def test_what_the_certificate_foretold() -> None:
         {"certificate": {"verdict": verdict}, "scores": {"deconfounded": [0.8, 1.0], "naive_rnn": [naive, naive + 0.2]}}
         for verdict, naive in (("passed", 0.1), ("passed", 0.4), ("failed", 0.9))
     ]
-    told = spectra.foretold(points)
+    told = spectrum.foretold(points)
     assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10 is" in told
-    assert "failed, on 0, by (none)" in spectra.foretold(points[:2])
+    assert "failed, on 0, by (none)" in spectrum.foretold(points[:2])
 
 
 def test_predicted_and_measured_gap(tmp_path: Path) -> None:
@@ -124,11 +124,11 @@ def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> 
 
     seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
     ranked = "verdicts are right; predicted and measured gaps rank alike by"
-    assert validation.told(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
+    assert validate.summary(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
     other = [row(noise.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
-    assert validation.told([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
-    table = validation.table([*seen, *other]).splitlines()
+    assert validate.summary([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
+    table = validate.table([*seen, *other]).splitlines()
     assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
     assert table[-1].endswith("| 16.00 |  |  | 8.00 | -8.00 |")
-    validation.picture([*seen, *other], tmp_path / "validation.png")
+    validate.picture([*seen, *other], tmp_path / "validation.png")
     assert (tmp_path / "validation.png").read_bytes().startswith(PNG)

@@ -4,54 +4,56 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import measure
 from deconfounded.benchmarks.engine.catalogue import label
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.guest import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import store
-from deconfounded.experts.rollout import Agent, run_trials
+from deconfounded.experts.policy import Expert
+from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
+QUANTILE = 0.85  # of the first latent, in the trial of the video
 
 
 class Recorder(Agent):
     """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
     The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
-    nearest the quantile: the same trial for every method, as seeds are shared. Its rows are an episode's start, without
-    an action, and each step after it; with what the agent knows then.
+    nearest that QUANTILE: the same trial for every method, as seeds are shared. Its rows are an episode's start,
+    without an action, and each step after it; with what the agent knows then.
     """
 
-    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False, quantile: float = 0.85) -> None:
-        self.agent, self.env, self.filmed, self.quantile = agent, env, filmed, quantile
+    def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False) -> None:
+        self.agent, self.env, self.filmed = agent, env, filmed
 
     def begin(self, n: int) -> None:
         self.agent.begin(n)
-        self.known: list[NDArray[np.float32]] = []  # [N, F], after each episode
+        self.features_after: list[NDArray[np.float32]] = []  # [N, F] of each episode
         self.episode = 0
         self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
-        """An episode is over."""
-        if (known := self.agent.features()) is not None:
-            self.known.append(known.copy())
+        """Keep what the agent knows now that an episode is over."""
+        if (features := self.agent.features()) is not None:
+            self.features_after.append(features.copy())
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         if self.episode == 0:
             theta = self.env.theta[: self.env.n // len(rngs), 0]
-            self.trial = int(np.abs(theta - np.quantile(theta, self.quantile)).argmin())
+            self.trial = int(np.abs(theta - np.quantile(theta, QUANTILE)).argmin())
         else:
             self.note()
         self.agent.reset(rngs)
@@ -62,8 +64,8 @@ class Recorder(Agent):
         if not self.filmed or self.episode > self.env.task.episodes:
             return
         row = {"state": self.env.state[self.trial].copy(), "action": action, "episode": self.episode - 1}
-        if (known := self.agent.features()) is not None:
-            row["known"] = known[self.trial].copy()
+        if (features := self.agent.features()) is not None:
+            row["known"] = features[self.trial].copy()
         for kind, value in row.items():
             self.clip.setdefault(kind, []).append(value)
 
@@ -119,45 +121,39 @@ class BenchmarkJob(Job):
                 agents = {"": guests.enter_context(contextlib.closing(guest))}
                 evaluation = evaluation or secrets.token_hex(8)  # drawn now that its agent cannot change any more
             trained, filmed = monitor.worked(), self.method in CLIPPED and 0 in self.seeds
-            ways = {label(self.method, way): way for way in agents}
-            agents = {name: agents[way] for name, way in ways.items()}
-            learned, salt = self.about.learned, self.salt + evaluation
-            found = {
-                name: evaluate(context, agent, learned, salt, filmed and name == self.method)
-                for name, agent in agents.items()
+            names, salt = {way: label(self.method, way) for way in agents}, self.salt + evaluation
+            scored = {
+                names[way]: evaluate(context, agent, self.about.learned, salt, filmed and not way)
+                for way, agent in agents.items()
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
-            notes = [
-                self._keep(name, agent) for name, agent in agents.items()
-            ]  # first: a seed's file says it is finished
-            meta = {"agents": ways, "curve": monitor.kept, "tier": self.about.tier}
-            if self.guest is not None:
-                meta["salts"] = [training, evaluation]
+            # First, since a seed's file says that it is finished:
+            notes = [self._keep(names[way], agent) for way, agent in agents.items()]
+            meta: dict[str, Any] = {"curve": monitor.kept, "tier": self.about.tier}
+            meta |= {"agents": {name: way for way, name in names.items()}}
+            meta |= {"salts": [training, evaluation]} if self.guest else {}
             for i, seed in enumerate(self.seeds):
-                rows = context.rows(i)
                 arrays: dict[str, Any] = {}
-                for name, (per_trial, probes, clip) in found.items():
-                    arrays.update({f"{name}/{key}": value[rows] for key, value in per_trial.items()})
-                    arrays[f"{name}/probe"] = probes[i]
-                    if seed == 0:
-                        arrays.update({f"{name}/{key}": value for key, value in clip.items()})
+                for name, (per_trial, probes, clip) in scored.items():
+                    own = {key: value[context.rows(i)] for key, value in per_trial.items()} | {"probe": probes[i]}
+                    arrays |= {f"{name}/{key}": value for key, value in (own | (clip if seed == 0 else {})).items()}
                 self.save(seed, arrays, monitor, meta)
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
 
     def _keep(self, name: str, agent: Agent) -> str:
         """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
-        told = ""
+        note = ""
         for i, seed in enumerate(self.seeds):
             folder = self.folder.parent / "agents" / f"{name}-{seed}"
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
             try:
                 if isinstance(agent, Guest):
-                    told = agent.keep(folder, about)
+                    note = agent.keep(folder, about)
                 elif isinstance(agent, LearnedAgent):
                     store.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
-                told = f"its agent is not kept: {error_line(error)}"
-        return told
+                note = f"its agent is not kept: {error_line(error)}"
+        return note
 
 
 def spaces(task: envs.Task) -> dict[str, int]:
@@ -176,14 +172,46 @@ def evaluate(
     streams = [stream(EVALUATION, seed, salt) for seed in seeds]
     trials, returns, theta = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    objective = measure.objective(context.expert, trials, theta)
     encoded = task.encode_theta(theta)
     groups = map(context.rows, range(len(seeds)))
-    probes = [[measure.probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.known)] for rows in groups]
+    probes = [[probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.features_after)] for rows in groups]
     clip = {key: np.array(value) for key, value in recorder.clip.items()}
     if filmed:
         clip["trial"] = np.array(recorder.trial)
     if "known" in clip:  # theta, as it can be read off at the end of the last episode
         clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
     r2 = np.array([[score for score, _ in each] for each in probes])
-    return {"theta": theta, "returns": returns, "objective": objective}, r2, clip
+    return {"theta": theta, "returns": returns, "objective": objective(context.expert, trials, theta)}, r2, clip
+
+
+def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
+    """Eq. (1) [B, E]: how likely the expert that sees theta [B, E, L] finds the imitator's own actions, by episode."""
+    b, e, t = trials.mask.shape
+    obs, action = (x.reshape(b * e * t, -1) for x in (trials.obs[:, :, :-1], trials.action))
+    log_expert = expert.log_prob(obs, action, np.repeat(theta.reshape(b * e, -1), t, 0)).reshape(b, e, t)
+    return imitation_objective(log_expert, trials.mask)
+
+
+def probe(features: Array, theta: Array) -> tuple[float, Callable[[Array], Array]]:
+    """Held-out R^2 of a linear probe for encoded theta [N, F'] in features [N, F], and the probe: [M, F] -> [M, F'].
+
+    It is fitted to the first half. 1: theta can be read off; 0 or less: no better than its mean. The probe is ridge
+    regression, and its penalty is chosen on the first half, by leave-one-out: with one for all, features as many as
+    trials would only be memorised. It does not extrapolate: where a feature hardly varies in the first half, the second
+    may be far outside.
+    """
+    # Here, since most commands that import this module probe nothing:
+    from sklearn.linear_model import RidgeCV
+    from sklearn.metrics import r2_score
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    half = len(features) // 2
+    first = features[:half].astype(float)
+    reader = make_pipeline(StandardScaler(), RidgeCV(np.logspace(0, 4, 9))).fit(first, theta[:half])
+    low, high = first.min(0), first.max(0)
+
+    def read(given: Array) -> Array:
+        return reader.predict(given.clip(low, high)).reshape(len(given), theta.shape[1])
+
+    return float(r2_score(theta[half:], read(features[half:]), multioutput="variance_weighted")), read

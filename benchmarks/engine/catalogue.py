@@ -70,8 +70,8 @@ def guest(name: str) -> Method | None:
     """A method's declaration if it is from outside, for jobs: another process does not know it."""
     if name not in METHODS.outside:
         return None
-    known = METHODS[name]
-    return Method(known.uses, known.version, known.cost, reference=known.reference)
+    method = METHODS[name]
+    return Method(method.uses, method.version, method.cost, reference=method.reference)
 
 
 EXACT = ("conditional", "interventional")
@@ -86,16 +86,16 @@ PRESETS = {
 }
 
 
-def check_names(kind: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Raises InputError for a name that is not known."""
+def check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None:
+    """Raises InputError for a name that is not among those allowed."""
     for name in names:
-        if name not in known:
-            raise envs.closest(kind, name, list(known))
+        if name not in allowed:
+            raise envs.closest(kind, name, list(allowed))
 
 
-def check(name: str, methods: Sequence[str] | None, seeds: int | None, known: Sequence[str]) -> None:
+def check(name: str, methods: Sequence[str], seeds: int | None, allowed: Sequence[str]) -> None:
     """Raises InputError for a preset, methods, or a number of seeds (None: the preset's) that cannot be."""
-    check_names("method", methods or (), known)
+    check_names("method", methods, allowed)
     check_names("preset", [name], list(PRESETS))
     if seeds is not None and not 1 <= seeds <= MOST_SEEDS:
         raise envs.InputError(f"--seeds was {seeds}; it must be at least 1, and at most {MOST_SEEDS:,}")

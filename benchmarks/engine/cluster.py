@@ -41,7 +41,6 @@ class Cluster(Engine):
     """Ray tasks, one core or one GPU each; their files are written here."""
 
     def __init__(self, address: str) -> None:
-        """address: HOST:PORT, or auto for the one this machine is part of. Raises InputError if nobody answers."""
         connect(address)
         here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=False)
         options: dict[str, Any] = {"num_cpus": 0, "max_restarts": -1, "max_task_retries": -1}
@@ -71,21 +70,17 @@ class Cluster(Engine):
                     sent[file] = ray.put(file.read_bytes())
             gpus = int(job.preset.device != "cpu" and job.about.learned)
             task = ray.remote(work).options(num_cpus=1, num_gpus=gpus, max_retries=0, scheduling_strategy="SPREAD")
-            about = (
-                replace(job, expert=absolute(job.expert)),
-                {**identity.identity(job), "code": sources.package()},
-                number,
-                self.mailbox,
-                list(files),
-            )
+            portable = replace(job, expert=absolute(job.expert))
+            expected = {**identity.identity(job), "code": sources.package()}
+            contents = (sent[file] for file in files.values())
             running[number] = attempt
-            tasks[task.remote(*about, *(sent[file] for file in files.values()))] = number
+            tasks[task.remote(portable, expected, number, self.mailbox, list(files), *contents)] = number
 
         def ended(task: Any) -> None:
             attempt = running.pop(tasks.pop(task))
             job = attempt.job
             try:
-                told, files = ray.get(task)
+                outcome, files = ray.get(task)
             except RayTaskError as error:
                 if not isinstance(error.cause, envs.InputError) or isinstance(error.cause, Unlike):
                     raise envs.InputError(failure(error)) from None
@@ -101,7 +96,7 @@ class Cluster(Engine):
                 keep(job, files)
                 job.checkpoint.unlink(missing_ok=True)
                 tick(job.ticks - attempt.ticks)
-                say(job, told)
+                say(job, outcome)
 
         for job in jobs:
             start(Attempt(job, 1))
@@ -134,7 +129,6 @@ class Mailbox:
         self.mail.append((number, ticks, files))
 
     def take(self) -> list[tuple[int, int, Files]]:
-        """All that came."""
         mail, self.mail = self.mail, []
         return mail
 
@@ -165,9 +159,9 @@ def given(job: Job) -> dict[str, Path]:
     """The files that a job needs: as they are called over there, and where they are here."""
     seeds = job.seeds if "demonstrations" in job.about.uses else ()
     inside = [job.checkpoint, *(job.folder / f"demonstrations-{seed}.npz" for seed in seeds)]
-    found = {f"jobs/{file.name}": file for file in inside}
-    found |= {str(Path("outside", *file.parts[1:])): file for file in from_outside(job)}
-    return {name: file for name, file in found.items() if file.is_file()}
+    files = {f"jobs/{file.name}": file for file in inside}
+    files |= {str(Path("outside", *file.parts[1:])): file for file in from_outside(job)}
+    return {name: file for name, file in files.items() if file.is_file()}
 
 
 def from_outside(job: Job) -> set[Path]:
@@ -200,5 +194,5 @@ def failure(error: RayTaskError) -> str:
     """What went wrong over there, in one line."""
     if isinstance(error.cause, Unlike):
         return str(error.cause)
-    told = [line.strip() for line in f"{type(error.cause).__name__}\n{error.cause}".splitlines() if line.strip()]
-    return f"a job failed on {error.ip}: {told[-1]}"
+    lines = f"{type(error.cause).__name__}\n{error.cause}".strip().splitlines()
+    return f"a job failed on {error.ip}: {lines[-1].strip()}"

@@ -25,9 +25,8 @@ DEMOS, EXPLORATION, EVALUATION, GUEST = 1, 2, 3, 4  # each purpose has seeds of 
 
 def stream(purpose: int, seed: int, salt: str = "") -> int:
     """A seed for one purpose of one run, far from all others; with a salt, one that nobody can have looked at."""
-    return int(
-        np.random.SeedSequence([purpose, seed, *salt.encode("utf-8", "surrogateescape")]).generate_state(1)[0] >> 1
-    )
+    entropy = [purpose, seed, *salt.encode("utf-8", "surrogateescape")]
+    return int(np.random.SeedSequence(entropy).generate_state(1)[0] >> 1)
 
 
 class Context:

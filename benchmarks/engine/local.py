@@ -67,16 +67,15 @@ class Local(Engine):
         with self._ended():
             with inherited():
                 futures = {self._executor.submit(run_job, job): job for job in jobs}
-            waiting = set(futures)
-            while waiting:
+            while futures:
                 while not self._ticks.empty():
                     tick(self._ticks.get())
-                for future in [f for f in waiting if f.done()]:
-                    waiting.remove(future)
+                for future in [future for future in futures if future.done()]:
+                    job = futures.pop(future)
                     try:
-                        say(futures[future], future.result())
+                        say(job, future.result())
                     except envs.InputError as error:
-                        say(futures[future], error)
+                        say(job, error)
                 time.sleep(0.1)
 
     @contextmanager

@@ -24,9 +24,7 @@ class Preset:
     query_trials: int  # a round
     fresh: int = 0  # expert trials drawn anew for each update of naive_rnn, and round of what does not accumulate; or 0
     device: str = "cpu"
-    configs: dict[str, dict[str, Any]] = field(
-        default_factory=dict, hash=False
-    )  # by method; values of its configuration
+    configs: dict[str, dict[str, Any]] = field(default_factory=dict, hash=False)  # of methods, by name
 
     def configured(self, method: str, **changes: Any) -> Preset:
         """The same with other values of a method's configuration."""
@@ -67,9 +65,9 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
         if method not in ("", *settings.configs):
             raise envs.closest("--set method", method, list(settings.configs))
         values = settings.configs[method] if method else asdict(replace(settings, configs={}))
-        if name not in values or name in ("device", "drifts", "configs"):
-            known = (each for each in values if each not in ("device", "drifts", "configs"))
-            raise envs.closest("--set amount", key, [f"{method}.{each}" if method else each for each in known])
+        amounts = [each for each in values if each not in ("device", "drifts", "configs")]
+        if name not in amounts:
+            raise envs.closest("--set amount", key, [f"{method}.{each}" if method else each for each in amounts])
         kind = get_type_hints(type(METHODS[method].on_control) if method else Preset)[name]
         new = {name: _parsed(key, value, get_args(kind) or (kind,), values[name])}
         settings = settings.configured(method, **new) if method else replace(settings, **new)

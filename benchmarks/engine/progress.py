@@ -31,14 +31,12 @@ class Progress:
             print(f"{self._label}: {share:4.0%}, {left} {note}".rstrip(), flush=True)
 
     def line(self, text: str) -> None:
-        """Print a line that stays."""
         if self._bar is not None:
             self._bar.write(text)
         else:
             print(text, flush=True)
 
     def close(self) -> None:
-        """Take the bar away."""
         if self._bar is not None:
             self._bar.close()
 

@@ -87,12 +87,13 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         for part in groups(job.about, missing, engine.slots(device))
     ]
     ours = [job for job in parts if "demonstrations" in job.about.uses and job.guest is None]
-    shown = {seed: job for job in ours for seed in job.seeds}
+    imitated = {seed: job for job in ours for seed in job.seeds}
     first: list[Job] = [
         DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
-        for seed, job in sorted(shown.items())
+        for seed, job in sorted(imitated.items())
+        if not job.context().has_demonstrations(seed)
     ]
-    run_jobs([job for job in first if not job.context().has_demonstrations(job.seeds[0])], label, engine.run)
+    run_jobs(first, label, engine.run)
     run_jobs(parts, label, engine.run)
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()
@@ -112,11 +113,9 @@ def written(like: Job, folder: Path) -> list[Job]:
 
 def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]:
     """Seeds to run side by side: as many groups as there are slots; references and guests share nothing."""
-    if not left:
-        return []
     alone = not method.learned or method.reference
     n = len(left) if alone else min(slots, len(left))
-    return [tuple(map(int, part)) for part in np.array_split(left, n)]
+    return [tuple(part.tolist()) for part in np.array_split(left, n)] if left else []
 
 
 def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:
@@ -125,11 +124,11 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:
         return
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
-    def say(job: Some, told: str | Exception) -> None:
-        if isinstance(told, Exception):
-            failed.append(told)
-            told = f"failed: {told}"
-        progress.line(f"{job.method}, {listed(job.seeds)}: {told}")
+    def say(job: Some, outcome: str | Exception) -> None:
+        if isinstance(outcome, Exception):
+            failed.append(outcome)
+            outcome = f"failed: {outcome}"
+        progress.line(f"{job.method}, {listed(job.seeds)}: {outcome}")
 
     run(jobs, progress.update, say)
     progress.close()

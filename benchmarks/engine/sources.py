@@ -22,9 +22,8 @@ from deconfounded.envs.support import outside
 MODELS = ("include", "model")  # MJCF elements that name further MJCF
 ROOT = Path(__file__).resolve().parents[2]
 OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
-LIBRARIES = tuple(
-    Path(sysconfig.get_paths()[name]).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")
-)
+LIBRARIES = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def last_edit() -> int:
@@ -58,20 +57,19 @@ def closure(files: Iterable[Path]) -> set[Path]:
 def _imports(file: Path, changed: int, roots: frozenset[Path]) -> tuple[Path, ...]:
     """Files that a file imports, of its own root or of `roots`; `changed`, its time stamp, is there for the cache."""
     own, package = _package(file)
-    imported: set[Path] = set()
+    names: list[str] = []
     for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package[: len(package) - node.level + 1] if node.level else ()
             module = ".".join([*above, *([node.module] if node.module else [])])
-            names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
-        else:
-            continue
-        for parts in (name.split(".") for name in names):
-            for root in roots | {own}:
-                if root not in LIBRARIES or parts[0] in package[:1]:
-                    imported |= set(_modules(root, parts))
+            names += [module, *(f"{module}.{alias.name}" for alias in node.names)]
+    imported: set[Path] = set()
+    for parts in (name.split(".") for name in names):
+        for root in roots | {own}:
+            if root not in LIBRARIES or parts[0] in package[:1]:
+                imported |= set(_modules(root, parts))
     return tuple(imported)
 
 
@@ -153,8 +151,8 @@ def digest(files: Iterable[Path], name: str = "") -> str:
     name: of the object in them, where a file defines several.
     """
     total = hashlib.sha256(name.encode())
-    for one in sorted((file.name, content(file)) for file in files):
-        total.update(os.fsencode(one[0]) + b"\0" + one[1])
+    for named, held in sorted((file.name, content(file)) for file in files):
+        total.update(os.fsencode(named) + b"\0" + held)
     return total.hexdigest()
 
 
@@ -165,14 +163,8 @@ def content(file: Path) -> bytes:
         return text
     tree = ast.parse(text)
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
-            first = node.body[0]
-            if (
-                isinstance(first, ast.Expr)
-                and isinstance(first.value, ast.Constant)
-                and isinstance(first.value.value, str)
-            ):
-                node.body = node.body[1:]
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            node.body = node.body[1:]
     return ast.dump(tree).encode()
 
 

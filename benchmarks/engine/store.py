@@ -16,30 +16,26 @@ META: dict[str, Any] = {  # what a file says of itself, and of what types
     **{"identity": dict, "seed": int, "budget": dict, "spans": list, "cpu_s": (int, float), "arrays": list},
     **{"machine": str, "commit": (str, type(None))},
 }
-
-
+SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what a file of run.py says beside that
 OF_AGENT = ("returns", "objective", "probe")
 
 
-SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what one of a run of run.py says beside that
-
-
-def broken(found: dict[str, Any]) -> str:
+def broken(data: dict[str, Any]) -> str:
     """Why what a file holds cannot be what a job wrote; empty if it can."""
-    meta = found["meta"]
+    meta = data["meta"]
     wanted = META | (SCORED if "agents" in meta else {})
     right = all(isinstance(meta.get(key, ...), kind) for key, kind in wanted.items())
     if not right or not isinstance(meta["identity"].get("method"), str):
         return "it does not say what it was made of"
     if not all(isinstance(amount, int) for amount in meta["budget"].values()):
         return "it does not say what data it used"
-    if lost := {"meta", *meta["arrays"]} ^ set(found):
+    if lost := {"meta", *meta["arrays"]} ^ set(data):
         return f"it lacks {', '.join(sorted(lost))}"
     for name in meta.get("agents", ()):
-        returns, objective, probe = (found.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
+        returns, objective, probe = (data.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
         if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
             return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
-    for key, value in found.items():
+    for key, value in data.items():
         if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
             return f"{key} holds NaN or infinity"
     return ""
@@ -63,7 +59,7 @@ Finished = list[tuple[str, int, dict[str, Any]]]
 def know_guests(folder: Path) -> None:
     """Make the methods from outside known whose results are in a folder, so that they stay in its tables."""
     for file in sorted(folder.glob("*-*.npz")):
-        if (found := read(file)) and (reference := found["meta"].get("reference")):
+        if (data := read(file)) and (reference := data["meta"].get("reference")):
             try:
                 catalogue.add(str(reference))
             except envs.InputError as error:
@@ -72,27 +68,22 @@ def know_guests(folder: Path) -> None:
 
 def left_in(folder: Path) -> Finished:
     """What jobs left in a folder, whatever code made it: each file is what it says it is."""
-    found = []
+    finished = []
     for file in sorted(folder.glob("*-*.npz")):
-        data = read(file)
-        if data is None or "agents" not in data["meta"]:
+        if (data := read(file)) is None or "agents" not in (meta := data["meta"]):
             continue
-        why, meta = broken(data), data["meta"]
-        if not why and file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
-            why = f"it is of {name}"
-        if why:
+        if why := broken(data):
             print(f"{file.name} is left out: {why}")
+        elif file.stem != (name := f"{meta['identity']['method']}-{meta['seed']}"):
+            print(f"{file.name} is left out: it is of {name}")
         else:
-            found.append((meta["identity"]["method"], meta["seed"], data))
-    return found
+            finished.append((meta["identity"]["method"], meta["seed"], data))
+    return finished
 
 
 def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:
     """What the jobs of each method wrote, by seed."""
-    found: dict[str, list[dict[str, Any]]] = {}
-    for method, _, data in finished:
-        found.setdefault(method, []).append(data)
-    return found
+    return {name: [data for method, _, data in finished if method == name] for name, *_ in finished}
 
 
 def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
@@ -107,10 +98,6 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         write_sealed(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
-    else:
-        before = read_sealed(file)
-        now = json.loads(json.dumps(settings))
-        if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
-            raise envs.InputError(
-                f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it"
-            )
+    before, now = read_sealed(file), json.loads(json.dumps(settings))
+    if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
+        raise envs.InputError(f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it")

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.axes import Axes
-
-from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
+from deconfounded.benchmarks.output.pictures import colour, encoded, panels
 from deconfounded.deconf.diagnosis.diagnose import GOOD, NEGLIGIBLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
 
@@ -36,12 +28,12 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
-    findings = [(title, text, _encoded(draw)) for title, text, draw in _findings(diagnosis)]
+    findings = _findings(diagnosis.figures)
     page = template("diagnosis.html.jinja").render(diagnosis=diagnosis, findings=findings, code=code, about=about)
     write_atomically(folder / "index.html", page + "\n")
-    reasons = "\n".join(diagnosis.reasons)
     how = f"\n\n{code}" if code else ""
-    return f"{diagnosis.verdict.upper()}\n{reasons}\nNext: {diagnosis.next.advice}{how}\n-> {folder / 'index.html'}"
+    text = "\n".join([diagnosis.verdict.upper(), *diagnosis.reasons, f"Next: {diagnosis.next.advice}{how}"])
+    return f"{text}\n-> {folder / 'index.html'}"
 
 
 def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
@@ -62,9 +54,8 @@ agent.save("agent")
 """
 
 
-def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
-    """Title, two sentences, and what to draw."""
-    figure = diagnosis.figures
+def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
+    """Title, two sentences, and a picture."""
     memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
     stakes, strayed = figure["stakes"], figure["strayed"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
@@ -77,13 +68,13 @@ def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], Non
             " less well than the present observation). The rest is, for the most part, evidence of the expert's past"
             " actions, and a clone's own actions are no evidence."
         )
-    sections: list[tuple[str, str, Callable[[Axes], None]]] = [
+    sections = [
         (
             "Is there a latent, and where is its evidence?",
             f"A memory of the trial predicts the expert's action {memory} nats a step better than the present"
             f" observation alone; {NEGLIGIBLE} is negligible. {source}",
-            lambda axes: _bars(axes, predictors, "nats a step over the present observation", NEGLIGIBLE),
-        ),
+            _bars(predictors, "nats a step over the present observation", NEGLIGIBLE),
+        )
     ]
     if "explored" in figure:
         explored, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
@@ -100,13 +91,11 @@ def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], Non
                 f" below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do not"
                 f" identify it. The expert's actions are evidence of it by {acted} nats a step, {figure['ratio']} times"
                 " as much: this is the false confidence of a clone that takes its own actions for the expert's.",
-                lambda axes: _bars(axes, evidence, "nats a step", NEGLIGIBLE),
+                _bars(evidence, "nats a step", NEGLIGIBLE),
             )
         )
-    deviations: Rows = {
-        "from all with right latents": (stakes, colour("expert")),
-        "paired by latent and start": (strayed, colour("expert")),
-    }
+    hue = colour("expert")
+    deviations: Rows = {"from all with right latents": (stakes, hue), "paired by latent and start": (strayed, hue)}
     sections.append(
         (
             "What is at stake?",
@@ -114,7 +103,7 @@ def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], Non
             f" much as by chance from those given right latents, and {strayed} times as much when paired by latent and"
             f" start; below {STAKES} that may be chance. Trajectories in the learned dynamics deviate from the data's"
             f" {figure['unlike']} times as much as by chance.",
-            lambda axes: _bars(axes, deviations, "deviation under a wrong latent, times chance", STAKES),
+            _bars(deviations, "deviation under a wrong latent, times chance", STAKES),
         )
     )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
@@ -125,32 +114,24 @@ def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], Non
             "What will it cost?",
             f"From 0 for the expert policy given a wrong latent to 1 for the right one, a naive clone scores {naive} by"
             f" trajectories, and a policy that infers the latent from the dynamics {latent}. Eq. (1) scores actions.",
-            lambda axes: _bars(axes, scores, "predicted score, last episode", GOOD),
+            _bars(scores, "predicted score, last episode", GOOD),
         )
     )
     return sections
 
 
-def _bars(axes: Axes, rows: Rows, label: str, threshold: float) -> None:
-    """A bar a row, its range over refits, and the threshold that decides."""
-    for i, (value, hue) in enumerate(rows.values()):
-        axes.barh(i, value.value, color=hue, height=0.55, alpha=0.85)
-        axes.plot([value.low, value.high], [i, i], color="0.15", lw=1.5)
-    axes.axvline(0, color="0.4", lw=0.8)
-    axes.axvline(threshold, color="0.4", lw=1, ls=":")
-    if max(abs(value.value) for value, _ in rows.values()) > WIDE * threshold:
-        axes.set_xscale("symlog", linthresh=threshold)
-    axes.set_yticks(range(len(rows)), list(rows))
-    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
-    axes.set(xlabel=label)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _encoded(draw: Callable[[Axes], None]) -> str:
-    """A picture, for a page."""
-    figure, axes = plt.subplots(figsize=(7, 1.9), layout="constrained")
-    draw(axes)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=110)
-    plt.close(figure)
-    return base64.b64encode(buffer.getvalue()).decode()
+def _bars(rows: Rows, label: str, threshold: float) -> str:
+    """A picture for the page: a bar a row, its range over refits, and the threshold that decides."""
+    with panels(picture := io.BytesIO(), size=(7, 1.9)) as [[axes]]:
+        for i, (value, hue) in enumerate(rows.values()):
+            axes.barh(i, value.value, color=hue, height=0.55, alpha=0.85)
+            axes.plot([value.low, value.high], [i, i], color="0.15", lw=1.5)
+        axes.axvline(0, color="0.4", lw=0.8)
+        axes.axvline(threshold, color="0.4", lw=1, ls=":")
+        if max(abs(value.value) for value, _ in rows.values()) > WIDE * threshold:
+            axes.set_xscale("symlog", linthresh=threshold)
+        axes.set_yticks(range(len(rows)), list(rows))
+        axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
+        axes.set(xlabel=label)
+        axes.spines[["top", "right"]].set_visible(False)
+    return encoded(picture)

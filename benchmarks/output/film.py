@@ -17,6 +17,8 @@ WIDTH, HEIGHT, HEAD, STRIP = 320, 240, 30, 80  # of a pane, px; a strip for each
 FRAMES = 240  # of a whole film, at most
 INK, GREY, TRUTH, BELIEF, RIGHT = (25, 25, 30), (150, 150, 155), (30, 150, 70), (205, 60, 40), (40, 90, 200)
 NAMES = {"expert": "expert, sees theta", "naive_rnn": "naive clone", "deconfounded": "deconfounded"}
+Clips = dict[str, dict[str, NDArray[Any]]]
+"""By agent, see Pane."""
 
 
 def frame_rate(task: envs.Task) -> int:
@@ -58,8 +60,8 @@ class Pane:
         draw = ImageDraw.Draw(pane)
         draw.text((8, 6), NAMES.get(self.name, self.name), fill=INK, font_size=17)
         digits = 0 if np.abs(self.earned).max() >= 10 else 2
-        said = f"earned {round(self.earned[row], digits) + 0.0:.{digits}f}" + (" - over" if over else "")
-        draw.text((WIDTH - 8, 8), said, fill=INK, font_size=14, anchor="ra")
+        earned = f"earned {self.earned[row]:z.{digits}f}" + " - over" * over
+        draw.text((WIDTH - 8, 8), earned, fill=INK, font_size=14, anchor="ra")
         for i in range(len(latents)):
             self._strip(draw, i, HEAD + HEIGHT + STRIP * i, episode, t)
         return pane
@@ -99,22 +101,20 @@ class Pane:
         draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
 
 
-def frames(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]]) -> list[NDArray[np.uint8]]:
+def frames(task: envs.Task, clips: Clips) -> list[Any]:
     """Pictures of the first and the last episode of a trial, all agents side by side.
 
     Raises InputError where no GL works.
     """
     panes = [Pane(task, name, clip) for name, clip in clips.items()]
     episodes = min(len(pane.starts) for pane in panes)
-    shown = sorted({0, episodes - 1})
-    longest = {e: max(pane.row(e, task.horizon)[0] - pane.starts[e] for pane in panes) for e in shown}
+    longest = {e: max(pane.row(e, task.horizon)[0] - pane.starts[e] for pane in panes) for e in (0, episodes - 1)}
     stride = max(1, -(-sum(longest.values()) // FRAMES))
-    found = []
-    for e in shown:
+    pictures = []
+    for e in longest:
         truth = panes[0].clip["theta"][e]
-        named = ", ".join(
-            f"{lat.name} {x:.3g} {lat.unit}".strip() for lat, x in zip(task.latents, truth.tolist(), strict=True)
-        )
+        pairs = zip(task.latents, truth.tolist(), strict=True)
+        named = ", ".join(f"{lat.name} {value:.3g} {lat.unit}".strip() for lat, value in pairs)
         for t in range(0, longest[e] + 1, stride):
             parts = [pane.picture(e, t) for pane in panes]
             whole = Image.new("RGB", (sum(part.width for part in parts), HEAD + parts[0].height), "white")
@@ -122,29 +122,24 @@ def frames(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]]) -> list[N
                 whole.paste(part, (k * WIDTH, HEAD))
             head = f"{task.name}: hidden {named}, episode {e + 1} of {episodes}"
             ImageDraw.Draw(whole).text((8, 7), head, fill=INK, font_size=18)
-            found.append(np.asarray(whole))
-    return found
+            pictures.append(np.asarray(whole))
+    return pictures
 
 
-def write(task: envs.Task, clips: dict[str, dict[str, NDArray[Any]]], file: Path) -> None:
+def write(task: envs.Task, clips: Clips, file: Path) -> None:
     """The film as .mp4. Raises InputError where no GL works."""
-    made = frames(task, clips)
-    writer: Any
-    with imageio.get_writer(file, fps=frame_rate(task), quality=7, macro_block_size=2) as writer:
-        for frame in made:
-            writer.append_data(frame)
+    imageio.mimsave(file, frames(task, clips), fps=frame_rate(task), quality=7, macro_block_size=2)
 
 
 def decoded(task: envs.Task, features: Array) -> Array:
     """Encoded thetas [M, F], as a probe reads them -> theta [M, L]; of more than two categories the likeliest."""
-    found, at = [], 0
-    for latent in task.latents:
-        part = features[:, at : at + latent.features]
-        at += latent.features
+    theta = []
+    parts = np.split(features, np.cumsum([latent.features for latent in task.latents])[:-1], -1)
+    for latent, part in zip(task.latents, parts, strict=True):
         if latent.distribution != "categorical":
-            found.append(latent.ppf(np.clip((part[:, 0] + 1) / 2, 0, 1)))
+            theta.append(latent.ppf(np.clip((part[:, 0] + 1) / 2, 0, 1)))
         elif latent.features == 2:
-            found.append(latent.low + np.clip((1 + part[:, 1] - part[:, 0]) / 2, 0, 1))
+            theta.append(latent.low + np.clip((1 + part[:, 1] - part[:, 0]) / 2, 0, 1))
         else:
-            found.append(latent.low + part.argmax(-1))
-    return np.stack(found, -1)
+            theta.append(latent.low + part.argmax(-1))
+    return np.stack(theta, -1)

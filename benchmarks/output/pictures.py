@@ -1,21 +1,77 @@
-"""Picture files, and the marks in them that say what they are made of."""
+"""Pictures: panels to draw in, the colour of each method, and marks in files that say what they are made of."""
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import io
 import json
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from deconfounded.envs.support.files import write_atomically
 
+COLOURS = {
+    "expert": "#222222",
+    "interventional": "#2ca02c",
+    "conditional": "#d62728",
+    "deconfounded": "#1f77b4",
+    "deconfounded_gru": "#17becf",
+    "deconfounded_discrete": "#9467bd",
+    "deconfounded_offline": "#a8a91e",
+    "dagger": "#e377c2",
+    "naive_rnn": "#ff7f0e",
+    "oracle_bc": "#7f7f7f",
+    "blind_bc": "#8c564b",
+    "random": "#b8b8b8",
+}
+OTHERS = ("#5254a3", "#637939", "#8c6d31", "#ad494a", "#7b4173", "#3182bd", "#e6550d", "#31a354", "#756bb1", "#843c39")
 
-def save_figure(figure: Any, file: Path, dpi: int, mark: str = "") -> None:
-    """A matplotlib figure as .png, atomically. mark: of what it is made of, for `mark_of`."""
-    buffer = io.BytesIO()
+
+def colour(method: str) -> str:
+    """A method's own, or one that its name decides."""
+    return COLOURS.get(method, OTHERS[zlib.crc32(method.encode()) % len(OTHERS)])
+
+
+@contextmanager
+def panels(
+    file: Path | io.BytesIO,
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    size: tuple[float, float],
+    dpi: int = 110,
+    mark: str = "",
+    **shared: Any,
+) -> Iterator[Any]:
+    """Panels [rows, columns] to draw in, saved as .png at the end. mark: of what it is made of, for `mark_of`."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, **shared)
+    try:
+        yield axes
+        save_figure(figure, file, dpi, mark)
+    finally:
+        plt.close(figure)
+
+
+def save_figure(figure: Any, file: Path | io.BytesIO, dpi: int, mark: str = "") -> None:
+    """A matplotlib figure as .png; a file is written atomically."""
+    buffer = io.BytesIO() if isinstance(file, Path) else file
     figure.savefig(buffer, dpi=dpi, metadata={"Comment": mark} if mark else None)
-    write_atomically(file, buffer.getvalue())
+    if isinstance(file, Path):
+        write_atomically(file, buffer.getvalue())
+
+
+def encoded(file: Path | io.BytesIO) -> str:
+    """In base64, for a page that needs no other file."""
+    return base64.b64encode(file.read_bytes() if isinstance(file, Path) else file.getvalue()).decode()
 
 
 def mark(*made_of: Any) -> str:
@@ -29,7 +85,6 @@ def mark_of(picture: Path) -> str:
 
     try:
         with Image.open(picture) as image:
-            value = image.info.get("Comment") or image.info.get("xmp", b"").decode()
+            return str(image.info.get("Comment") or image.info.get("xmp", b"").decode())
     except (OSError, ValueError):
         return ""
-    return str(value)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
+from deconfounded.benchmarks.engine.store import Finished
 from deconfounded.benchmarks.output import score
 from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
@@ -33,62 +34,39 @@ SLOT = ("preset", "set", "salt", "method", "deployment", "seed")  # of which a t
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
     """The records of what a job wrote of a seed, one for each agent that it scored; see record.schema.json."""
     meta = data["meta"]
-    made = meta["identity"]
-    found = []
+    seed = {key: meta["identity"][key] for key in ("task", "method", *MADE_OF)}
+    seed |= {key: meta[key] for key in ("seed", "tier", "budget", "cpu_s", "commit", "machine")}
+    seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
+    seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
+    seed |= {"curve": thinned(meta["curve"])} if meta["curve"] else {}
+    seed |= {"salts": meta["salts"]} if "salts" in meta else {}
+    records = []
     for name, deployment in meta["agents"].items():
         returns = data[f"{name}/returns"]
-        curve = {"curve": thinned(meta["curve"])} if meta["curve"] else {}
-        curve |= {"salts": meta["salts"]} if "salts" in meta else {}
-        found.append(
-            {
-                "schema": 3,
-                "task": made["task"],
-                "task_version": made["task_version"],
-                "method": made["method"],
-                "method_version": made["method_version"],
-                "deployment": deployment,
-                "seed": meta["seed"],
-                "preset": preset,
-                "set": list(changes),
-                "salt": made["salt"],
-                "tier": meta["tier"],
-                "budget": meta["budget"],
-                "eval_trials": len(returns),
-                "episodes": episodes,
-                "returns": returns.mean(0).round(6).tolist(),
-                "returns_sd": returns.std(0).round(6).tolist(),
-                "objective": data[f"{name}/objective"].mean(0).round(3).tolist(),
-                "theta_r2": data[f"{name}/probe"].round(4).tolist(),
-                "bits": bits(returns),
-                "cpu_s": meta["cpu_s"],
-                "spans": [[round(at, 1) for at in span] for span in meta["spans"]],
-                "settings": made["settings"],
-                "expert": made["expert"],
-                "expert_version": made["expert_version"],
-                "protocol": made["protocol"],
-                "outside": made["outside"],
-                "commit": meta["commit"],
-                "versions": made["versions"],
-                "machine": meta["machine"],
-                **curve,
-            }
-        )
-    return found
+        scored = {
+            "deployment": deployment,
+            "eval_trials": len(returns),
+            "returns": returns.mean(0).round(6).tolist(),
+            "returns_sd": returns.std(0).round(6).tolist(),
+            "objective": data[f"{name}/objective"].mean(0).round(3).tolist(),
+            "theta_r2": data[f"{name}/probe"].round(4).tolist(),
+            "bits": bits(returns),
+        }
+        records.append(seed | scored)
+    return records
 
 
 def thinned(curve: dict[str, list[tuple[int, float]]]) -> dict[str, dict[str, list[Any]]]:
     """Losses (update, loss) by kind as a record holds them: four digits, at least 50 points if there are as many."""
-    found: dict[str, dict[str, list[Any]]] = {}
+    thin: dict[str, dict[str, list[Any]]] = {}
     for kind, points in curve.items():
         kept = [(update, loss) for update, loss in points[:: max(len(points) // 50, 1)] if np.isfinite(loss)]
-        found[kind] = {"update": [at for at, _ in kept], "loss": [float(f"{loss:.4g}") for _, loss in kept]}
-    return found
+        thin[kind] = {"update": [update for update, _ in kept], "loss": [float(f"{loss:.4g}") for _, loss in kept]}
+    return thin
 
 
-def of_run(
-    finished: Sequence[tuple[str, int, dict[str, Any]]], preset: str, changes: Sequence[str], episodes: int
-) -> list[Record]:
-    """The records of all that jobs wrote: method, seed, and the data of `of_job`."""
+def of_run(finished: Finished, preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
+    """The records of all that jobs wrote."""
     return [record for *_, data in finished for record in of_job(data, preset, changes, episodes)]
 
 
@@ -169,6 +147,11 @@ def read(file: Path) -> list[Record]:
     return list(records.values())
 
 
+def held(file: Path) -> list[Record]:
+    """The records of a file, if it exists."""
+    return read(file) if file.exists() else []
+
+
 def named(record: Record) -> str:
     """What the record's agent is called in tables."""
     return label(record["method"], record["deployment"])
@@ -176,6 +159,13 @@ def named(record: Record) -> str:
 
 def _slot(record: Record) -> str:
     return json.dumps([record[key] for key in SLOT])
+
+
+def _grouped(records: Sequence[Record], key: Callable[[Record], str]) -> dict[str, list[Record]]:
+    groups: dict[str, list[Record]] = {}
+    for record in records:
+        groups.setdefault(key(record), []).append(record)
+    return groups
 
 
 def write(folder: Path, records: Sequence[Record]) -> None:
@@ -186,16 +176,13 @@ def write(folder: Path, records: Sequence[Record]) -> None:
     """
     from filelock import FileLock
 
-    by_task: dict[str, list[Record]] = {}
     for record in records:
-        by_task.setdefault(check(record, f"{record.get('method')}, seed {record.get('seed')}")["task"], []).append(
-            record
-        )
+        check(record, f"{record.get('method')}, seed {record.get('seed')}")
     check_folder(folder)
     with FileLock(folder / ".lock"):
-        for task, new in by_task.items():
+        for task, new in _grouped(records, lambda record: record["task"]).items():
             file = folder / place(task)
-            kept = {_slot(record): record for record in (read(file) if file.exists() else ())}
+            kept = {_slot(record): record for record in held(file)}
             for record in new:
                 before = kept.pop(_slot(record), None)
                 if before is not None and stale(before, record):
@@ -217,19 +204,14 @@ def _line(record: Record) -> str:
 
 def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
     """The records of a task under an unchanged preset, by method and seed: of its newest version, and each method's."""
-    file = folder / place(task)
-    found = [one for one in (read(file) if file.exists() else ()) if one["preset"] == preset and not one["set"]]
-    found = _newest([one for one in found if not one["salt"]], "task_version")
-    by_method: dict[str, list[Record]] = {}
-    for record in found:
-        by_method.setdefault(record["method"], []).append(record)
-    newest = [record for of in by_method.values() for record in _newest(of, "method_version")]
-    return sorted(newest, key=lambda record: (named(record), record["seed"]))
-
-
-def _newest(records: list[Record], version: str) -> list[Record]:
-    newest = max((record[version] for record in records), default=0)
-    return [record for record in records if record[version] == newest]
+    plain = ("preset", "set", "salt")
+    kept = [record for record in held(folder / place(task)) if [record[key] for key in plain] == [preset, [], ""]]
+    newest: dict[str, int] = {}
+    for name, version in (("task", "task_version"), ("method", "method_version")):
+        for record in kept:
+            newest[record[name]] = max(newest.get(record[name], 0), record[version])
+        kept = [record for record in kept if record[version] == newest[record[name]]]
+    return sorted(kept, key=lambda record: (named(record), record["seed"]))
 
 
 def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, Any]:
@@ -242,16 +224,12 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         for key in COMMON:
             if record[key] != first[key]:
                 raise InputError(f"records with {key} {first[key]} and {record[key]} do not belong in one table")
-    made_of: dict[str, list[Any]] = {}
-    for record in records:
-        parts = [record["method_version"], record["outside"]]
-        if made_of.setdefault(record["method"], parts) != parts:
-            raise InputError(f"records of two versions of {record['method']} do not belong in one table")
-    if missing := [name for name in REFERENCES if name not in {record["method"] for record in records}]:
+    by_method, by_agent = _grouped(records, lambda record: record["method"]), _grouped(records, named)
+    for method, of in by_method.items():
+        if any(record[key] != of[0][key] for record in of for key in ("method_version", "outside")):
+            raise InputError(f"records of two versions of {method} do not belong in one table")
+    if missing := [name for name in REFERENCES if name not in by_method]:
         raise InputError(f"records of {first['task']} are without those of {missing[0]}, which scores need")
-    by_agent: dict[str, list[Record]] = {}
-    for record in records:
-        by_agent.setdefault(named(record), []).append(record)
     rank = {name: i for i, name in enumerate(order)}
     names = sorted(by_agent, key=lambda name: rank.get(by_agent[name][0]["method"], len(rank)))
     return {
@@ -260,12 +238,12 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         "commits": sorted({record["commit"] or "unknown" for record in records}),
         "versions": first["versions"],
         "machine": "; ".join(sorted({record["machine"] for record in records})),
-        "wall_s": round(covered([(begin, end) for record in records for begin, end in record["spans"]]), 1),
+        "wall_s": round(covered([span for record in records for span in record["spans"]]), 1),
         "methods": score.summarise({name: by_agent[name] for name in names}, first["episodes"]),
     }
 
 
-def covered(spans: list[tuple[float, float]]) -> float:
+def covered(spans: Sequence[Any]) -> float:
     """Length of the union of spans of time."""
     total, until = 0.0, -np.inf
     for start, end in sorted(spans):

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
@@ -20,9 +15,8 @@ from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.store import Finished
 from deconfounded.benchmarks.output import film, records, score
-from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.benchmarks.output.pictures import mark, save_figure
+from deconfounded.benchmarks.output.pictures import colour, encoded, mark, panels
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
 
@@ -43,25 +37,23 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
         print(f"no pictures: {error_line(error)}")
     write_atomically(folder / "report.html", page(results, folder))
     head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
-    return f"\n{head}\n\n{score.table(results)}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
+    table = score.plain_table(score.COLUMNS, score.rows(results["methods"]))
+    return f"\n{head}\n\n{table}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
     """Curves, and a video where a GL works."""
     adaptation(results, folder / "adaptation.png")
-    clips: dict[str, dict[str, Any]] = {}
-    for *_, data in finished:
-        for name in CLIPPED:
-            if f"{name}/state" in data:
-                clip = {key: data[f"{name}/{key}"] for key in ("state", "action", "episode")}
-                clip["theta"] = data[f"{name}/theta"][int(data[f"{name}/trial"]), : task.episodes]
-                if f"{name}/read" in data:
-                    clip["belief"] = film.decoded(task, data[f"{name}/read"])
-                clips[name] = clip
     learning(results, folder / "learning.png")
+    clips: film.Clips = {}
+    for name, data in ((name, data) for name in CLIPPED for *_, data in finished if f"{name}/state" in data):
+        clips[name] = {key: data[f"{name}/{key}"] for key in ("state", "action", "episode")}
+        clips[name]["theta"] = data[f"{name}/theta"][int(data[f"{name}/trial"]), : task.episodes]
+        if f"{name}/read" in data:
+            clips[name]["belief"] = film.decoded(task, data[f"{name}/read"])
     beliefs(task, {name: clip for name, clip in clips.items() if "belief" in clip}, folder / "beliefs.png")
     try:
-        film.write(task, {name: clips[name] for name in CLIPPED if name in clips}, folder / "video.mp4")
+        film.write(task, clips, folder / "video.mp4")
     except Exception as error:  # no GL, or no encoder: the run is good all the same
         print(f"no video: {error_line(error)}")
 
@@ -70,75 +62,65 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
     """Score over the episodes of a trial, each method a line in its 95% band; later episodes than trained on shaded."""
     drawn = ("score", "score_beyond", "band")
     data = {name: [entry.get(key) for key in drawn] for name, entry in results["methods"].items()}
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
-    trained = 0
-    for name, entry in results["methods"].items():
-        values = entry["score"] + entry.get("score_beyond", [])
-        trained, at = len(entry["score"]), range(1, len(values) + 1)
-        # Dotted: another way of deploying the same agent.
-        style = ":" if entry["deployment"] else "--" if name in (*EXACT, *REFERENCES) else "-"
-        axes.plot(at, values, style, marker="o", ms=4, color=colour(entry["method"]), label=name)
-        if entry["band"]:
-            axes.fill_between(at, *np.transpose(entry["band"]), color=colour(entry["method"]), alpha=0.12, lw=0)
-            if len(values) == 1:
-                axes.vlines(at, *np.transpose(entry["band"]), color=colour(entry["method"]))
-    longest = max(len(e["score"]) + len(e.get("score_beyond", [])) for e in results["methods"].values())
-    if longest > trained:
-        axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
-        axes.text(trained + 0.6, 0.02, "longer than trained on", color="0.45", fontsize=8)
-    axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
-    save_figure(figure, file, 110, mark(results["task"], data, sources.of_code(adaptation)))
-    plt.close(figure)
+    made_of = mark(results["task"], data, sources.of_code(adaptation))
+    with panels(file, size=(7, 4.2), mark=made_of) as [[axes]]:
+        trained = longest = 0
+        for name, entry in results["methods"].items():
+            values, hue = entry["score"] + entry.get("score_beyond", []), colour(entry["method"])
+            trained, longest, at = len(entry["score"]), max(longest, len(values)), range(1, len(values) + 1)
+            # Dotted: another way of deploying the same agent.
+            style = ":" if entry["deployment"] else "--" if name in (*EXACT, *REFERENCES) else "-"
+            axes.plot(at, values, style, marker="o", ms=4, color=hue, label=name)
+            if entry["band"]:
+                axes.fill_between(at, *np.transpose(entry["band"]), color=hue, alpha=0.12, lw=0)
+                if len(values) == 1:
+                    axes.vlines(at, *np.transpose(entry["band"]), color=hue)
+        if longest > trained:
+            axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
+            axes.text(trained + 0.6, 0.02, "longer than trained on", color="0.45", fontsize=8)
+        axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
 
 
 def learning(results: dict[str, Any], file: Path) -> None:
     """Training losses over updates, one panel a kind of loss, the mean over seeds; none where a round did another."""
-    curves = {
-        name: entry["curve"]
-        for name, entry in results["methods"].items()
-        if "curve" in entry and not entry["deployment"]
-    }
-    kinds = list(dict.fromkeys(kind for curve in curves.values() for kind in curve))
+    trained = {name: entry for name, entry in results["methods"].items() if not entry["deployment"]}
+    curves = [(kind, name, curve) for name, entry in trained.items() for kind, curve in entry.get("curve", {}).items()]
+    kinds = list(dict.fromkeys(kind for kind, *_ in curves))
     if not kinds:
         return
-    figure, panels = plt.subplots(1, len(kinds), figsize=(4.5 * len(kinds), 3.4), layout="constrained", squeeze=False)
-    for panel, kind in zip(panels[0], kinds, strict=True):
-        for name, curve in curves.items():
-            if kind in curve:
-                loss = np.array(curve[kind]["loss"], float)
-                panel.plot(curve[kind]["update"], loss, color=colour(name), lw=1.2, label=name)
-        panel.set(xlabel="update", title=f"{kind} loss")
-        panel.legend(frameon=False, fontsize=8)
-    save_figure(figure, file, 110)
-    plt.close(figure)
+    with panels(file, 1, len(kinds), size=(4.5 * len(kinds), 3.4)) as [row]:
+        for kind, name, curve in curves:
+            panel, loss = row[kinds.index(kind)], np.array(curve["loss"], float)
+            panel.plot(curve["update"], loss, color=colour(name), lw=1.2, label=name)
+        for panel, kind in zip(row, kinds, strict=True):
+            panel.set(xlabel="update", title=f"{kind} loss")
+            panel.legend(frameon=False, fontsize=8)
 
 
-def beliefs(task: envs.Task, clips: dict[str, dict[str, Any]], file: Path) -> None:
+def beliefs(task: envs.Task, clips: film.Clips, file: Path) -> None:
     """What agents believed of theta in the trial that is filmed, step by step, and the truth; a panel a latent."""
     if not clips:
         return
     count = len(task.latents)
-    figure, panels = plt.subplots(count, 1, figsize=(8, 2.6 * count), layout="constrained", squeeze=False, sharex=True)
     theta = next(iter(clips.values()))["theta"]
-    for i, (panel, latent) in enumerate(zip(panels[:, 0], task.latents, strict=True)):
-        for episode, truth in enumerate(theta[:, i]):
-            label = "true" if episode == 0 else None
-            panel.plot([episode, episode + 1], [truth] * 2, color=colour("expert"), lw=1, ls="--", label=label)
-            panel.axvline(episode + 1, color="0.9", lw=0.8)
-        for name, clip in clips.items():
-            for episode in range(len(theta)):
-                seen = clip["belief"][clip["episode"] == episode, i]
-                at = episode + np.arange(len(seen)) / task.horizon
-                panel.plot(at, seen, color=colour(name), lw=1.4, label=None if episode else name)
-        panel.set(ylabel=f"{latent.name}{f', {latent.unit}' if latent.unit else ''}", xlim=(0, len(theta)))
-        panel.set_xticks(np.arange(len(theta)) + 0.5, range(1, len(theta) + 1))
-        panel.tick_params(axis="x", length=0)
-    panels[-1, 0].set(xlabel="episode")
-    panels[0, 0].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
-    figure.savefig(file, dpi=110)
-    plt.close(figure)
+    with panels(file, count, size=(8, 2.6 * count), sharex=True) as axes:
+        for i, (panel, latent) in enumerate(zip(axes[:, 0], task.latents, strict=True)):
+            for episode, truth in enumerate(theta[:, i]):
+                label = "true" if episode == 0 else None
+                panel.plot([episode, episode + 1], [truth] * 2, color=colour("expert"), lw=1, ls="--", label=label)
+                panel.axvline(episode + 1, color="0.9", lw=0.8)
+            for name, clip in clips.items():
+                for episode in range(len(theta)):
+                    belief = clip["belief"][clip["episode"] == episode, i]
+                    at = episode + np.arange(len(belief)) / task.horizon
+                    panel.plot(at, belief, color=colour(name), lw=1.4, label=None if episode else name)
+            panel.set(ylabel=f"{latent.name}{f', {latent.unit}' if latent.unit else ''}", xlim=(0, len(theta)))
+            panel.set_xticks(np.arange(len(theta)) + 0.5, range(1, len(theta) + 1))
+            panel.tick_params(axis="x", length=0)
+        axes[-1, 0].set(xlabel="episode")
+        axes[0, 0].legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
 
 
 PICTURES = {
@@ -153,14 +135,12 @@ PICTURES = {
 
 def certificate(task: str, version: int, run: Path) -> Path | None:
     """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/."""
-    for folder in (
-        run.absolute().parent / "certificates",
-        Path(__file__).resolve().parents[2] / "docs" / "certificates",
-    ):
+    for parent in (run.absolute().parent, sources.ROOT / "docs"):
+        picture = parent / "certificates" / f"{task}.png"
         try:
-            found = json.loads((folder / f"{task}.json").read_bytes())
-            if (found["task"], found["task_version"]) == (task, version) and (folder / f"{task}.png").is_file():
-                return folder / f"{task}.png"
+            certified = json.loads(picture.with_suffix(".json").read_bytes())
+            if (certified["task"], certified["task_version"]) == (task, version) and picture.is_file():
+                return picture
         except (OSError, ValueError, KeyError, TypeError):
             pass
     return None
@@ -168,29 +148,20 @@ def certificate(task: str, version: int, run: Path) -> Path | None:
 
 def page(results: dict[str, Any], folder: Path) -> str:
     """The report as one HTML file that needs no other."""
-
-    def encoded(file: Path) -> str:
-        return base64.b64encode(file.read_bytes()).decode()
-
-    pictures = [(*told, encoded(folder / name)) for name, told in PICTURES.items() if (folder / name).exists()]
-    certified = certificate(results["task"], results["task_version"], folder)
-    if certified:
+    pictures = [(*texts, encoded(folder / name)) for name, texts in PICTURES.items() if (folder / name).exists()]
+    if certified := certificate(results["task"], results["task_version"], folder):
         command = f"deconf certify --task {results['task']}"
         pictures.append(("Is it confounded?", f"The task's certificate, of {command}.", encoded(certified)))
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
-    how = json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2)
-    methods = sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"])
     filters = {
         "two_decimals": score.two_decimals,
         "height": lambda value: 23 - 20 * min(max(value, -0.1), 1.1),
         "last_mean": lambda returns: np.mean(returns, 0)[-1],
     }
-    return template("report.html.jinja", filters).render(
-        results=results,
-        outcome=score.outcome(results["methods"]),
-        methods=methods,
-        pictures=pictures,
-        certified=certified,
-        movie=movie,
-        how=how,
-    )
+    parts = {
+        "outcome": score.outcome(results["methods"]),
+        "methods": sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]),
+        "how": json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2),
+    }
+    shown = {"results": results, "pictures": pictures, "certified": certified, "movie": movie}
+    return template("report.html.jinja", filters).render(**parts, **shown)

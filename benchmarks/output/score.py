@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine.catalogue import REFERENCES
+from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES
 from deconfounded.envs.streams import Array
 
 VERSION = 1  # raised when the same records come to other figures
@@ -44,20 +44,18 @@ def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, d
 
     Where the method did something else for a while, the loss is None at one update in between: not to be bridged.
     """
-    found = {}
+    means = {}
     for kind in dict.fromkeys(kind for curve in curves for kind in curve):
-        every = [curve[kind] for curve in curves if kind in curve]
-        update = every[0]["update"]
-        loss = np.mean([one["loss"] for one in every if one["update"] == update], 0)
+        same = [curve[kind] for curve in curves if kind in curve]
+        update = np.array(same[0]["update"])
+        loss = np.mean([curve["loss"] for curve in same if curve["update"] == same[0]["update"]], 0)
         steps = np.diff(update)
         gaps = 1 + np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.zeros(0, int)
-        at = np.insert(np.array(update), gaps, [update[i - 1] + 1 for i in gaps])
-        between = np.insert(loss, gaps, np.nan)
-        found[kind] = {
-            "update": at.tolist(),
-            "loss": [None if np.isnan(value) else float(f"{value:.4g}") for value in between],
+        means[kind] = {
+            "update": np.insert(update, gaps, update[gaps - 1] + 1).tolist(),
+            "loss": [None if np.isnan(x) else float(f"{x:.4g}") for x in np.insert(loss, gaps, np.nan)],
         }
-    return found
+    return means
 
 
 def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
@@ -72,13 +70,13 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
     `episodes` is the length of the trials trained on; what agents did in later ones, if any, is told apart.
     """
 
-    def means(name: str, key: str) -> Array:
+    def stacked(name: str, key: str) -> Array:
         return np.array([record[key] for record in by_method[name]])
 
-    random, expert = (float(means(name, "returns")[:, :episodes].mean()) for name in REFERENCES)
+    random, expert = (float(stacked(name, "returns")[:, :episodes].mean()) for name in REFERENCES)
     methods = {}
     for name, seeds in by_method.items():
-        returns = means(name, "returns")
+        returns = stacked(name, "returns")
         scores = normalise(returns, random, expert)
         band = bootstrap(scores)
         methods[name] = {
@@ -90,8 +88,8 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
             "score_last": round(float(scores[:, episodes - 1].mean()), 4),
             "ci95": None if band is None else band[episodes - 1].tolist(),
             "band": None if band is None else band.round(4).tolist(),
-            "objective": means(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
-            "theta_r2": means(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
+            "objective": stacked(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
+            "theta_r2": stacked(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
             "tier": seeds[0]["tier"],
             "version": seeds[0]["method_version"],
             "budget": mean_budget([record["budget"] for record in seeds]),
@@ -112,37 +110,38 @@ def outcome(methods: dict[str, Any]) -> str:
     Where the two are not .1 apart, nothing can be told. Other ways to deploy the same agent are left out.
     """
 
-    def said(names: Sequence[str]) -> str:
-        told = [f"{name} ({two_decimals(methods[name]['score_last'])})" for name in names]
-        return " and ".join(filter(None, [", ".join(told[:-1]), told[-1]]))
+    def listed(*names: str) -> str:
+        scores = [f"{name} ({two_decimals(methods[name]['score_last'])})" for name in names]
+        return " and ".join(filter(None, [", ".join(scores[:-1]), scores[-1]]))
 
     seeds = max(len(entry["seeds"]) for entry in methods.values())
-    of = "of one seed" if seeds == 1 else f"means of {seeds} seeds"
+    basis = f"Scores of the last episode, {'of one seed' if seeds == 1 else f'means of {seeds} seeds'}."
     judged = [name for name, entry in methods.items() if entry["tier"] in "123" and not entry["deployment"]]
     judged.sort(key=lambda name: -methods[name]["score_last"])
-    if not judged or not {"conditional", "interventional"} <= set(methods):
-        scored = (
-            f"{said(judged)}, where the expert has 1; no" if judged else "No method that learns without theta, and no"
+    if not judged or not set(EXACT) <= set(methods):
+        text = (
+            f"{listed(*judged)}, where the expert has 1; no"
+            if judged
+            else "No method that learns without theta, and no"
         )
-        return f"{scored} pair of exact policies was run to compare with. Scores of the last episode, {of}."
-    low, high = (methods[name]["score_last"] for name in ("conditional", "interventional"))
+        return f"{text} pair of exact policies was run to compare with. {basis}"
+    (low, deluded), (high, exact) = ((methods[name]["score_last"], listed(name)) for name in EXACT)
     if high - low < 0.1:
-        return (
-            f"Nothing can be told here: the exact policies, {said(['interventional'])} and {said(['conditional'])}, are"
-            f" alike. The others: {said(judged)}. Scores of the last episode, {of}."
-        )
+        alike = f"Nothing can be told here: the exact policies, {exact} and {deluded}, are alike."
+        return f"{alike} The others: {listed(*judged)}. {basis}"
     middle, sides = (low + high) / 2, dict[str, list[str]]()
     for name in judged:
         entry = methods[name]
         least, most = entry["ci95"] or (entry["score_last"],) * 2
-        fate = f"learned what can be known, like the exact policy {said(['interventional'])}"
-        if least <= middle:
-            fate = f"may be on either side of the middle between the exact policies, {two_decimals(middle)}"
         if most < middle:
-            fate = f"fell in with the deluded exact policy, {said(['conditional'])}"
-            fate = fate if any(entry["theta_r2"]) else "has no memory to learn with"
+            memory = any(entry["theta_r2"])
+            fate = f"fell in with the deluded exact policy, {deluded}" if memory else "has no memory to learn with"
+        elif least <= middle:
+            fate = f"may be on either side of the middle between the exact policies, {two_decimals(middle)}"
+        else:
+            fate = f"learned what can be known, like the exact policy {exact}"
         sides.setdefault(fate, []).append(name)
-    return f"{'; '.join(f'{said(names)} {fate}' for fate, names in sides.items())}. Scores of the last episode, {of}."
+    return f"{'; '.join(f'{listed(*names)} {fate}' for fate, names in sides.items())}. {basis}"
 
 
 def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[str, int, dict[str, Any]]]) -> str:
@@ -151,14 +150,14 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
     out = csv.writer(text, lineterminator="\n")
     latents = [lat.name for lat in task.latents]
     out.writerow(["method", "seed", "trial", *latents, "episode", "return", "score", "objective"])
-    zero, one = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
+    random, expert = (np.mean(results["methods"][name]["return"]) for name in REFERENCES)
     for _, seed, data in finished:
         for name in data["meta"]["agents"]:
-            returns, objective = data[f"{name}/returns"], data[f"{name}/objective"]
-            values = np.stack([returns, normalise(returns, zero, one), objective], -1).round(4)
-            for trial, (theta, episodes) in enumerate(zip(data[f"{name}/theta"], values.tolist(), strict=True)):
-                for episode, (now, row) in enumerate(zip(theta, episodes, strict=True)):
-                    out.writerow([name, seed, trial, *(f"{value:.6g}" for value in now), episode + 1, *row])
+            returns, theta = data[f"{name}/returns"], data[f"{name}/theta"]
+            values = np.stack([returns, normalise(returns, random, expert), data[f"{name}/objective"]], -1).round(4)
+            for trial, episode in np.ndindex(returns.shape):
+                latent = (f"{value:.6g}" for value in theta[trial, episode])
+                out.writerow([name, seed, trial, *latent, episode + 1, *values[trial, episode].tolist()])
     return text.getvalue()
 
 
@@ -173,24 +172,25 @@ def two_decimals(value: float) -> str:
     return f"{np.round(value, 2):z.2f}"
 
 
+def budget(used: dict[str, int]) -> str:
+    """The data that a seed used, as tables show it."""
+    return ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in used.items() if n)
+
+
 def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     """The `methods` of results.json as rows of COLUMNS, best first; return and Eq. (1) are of the last episode."""
-    found: list[tuple[str, ...]] = []
+    lines: list[tuple[str, ...]] = []
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
         interval = "-" if entry["ci95"] is None else " to ".join(map(two_decimals, entry["ci95"]))
-        scores, known = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
-        last = two_decimals(entry["score_last"])
-        data = ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in entry["budget"].items() if n)
-        value = f"{np.mean(entry['return'], 0)[-1]:.1f}"
-        cost = f"{entry['cpu_s']:.0f}" if "cpu_s" in entry else ""  # not noted by older runs
-        numbers = (value, scores, last, interval, f"{entry['objective'][-1]:,.0f}", known)
-        found.append((name, entry["tier"], *numbers, data, cost))
-    return found
+        scores, r2 = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
+        scored = (f"{np.mean(entry['return'], 0)[-1]:.1f}", scores, two_decimals(entry["score_last"]), interval)
+        costs = (budget(entry["budget"]), f"{entry['cpu_s']:.0f}")
+        lines.append((name, entry["tier"], *scored, f"{entry['objective'][-1]:,.0f}", r2, *costs))
+    return lines
 
 
-def table(results: dict[str, Any]) -> str:
-    """The results as a plain table."""
-    lines = [COLUMNS, *rows(results["methods"])]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
-    cells = ([cell.ljust(width) for cell, width in zip(line, widths, strict=True)] for line in lines)
-    return "\n".join("  ".join(line).rstrip() for line in cells)
+def plain_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells under a head, in columns as wide as they must be."""
+    lines = [head, *rows]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, line, widths)).rstrip() for line in lines)

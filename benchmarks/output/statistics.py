@@ -34,11 +34,8 @@ def paired(one: Mapping[int, float], other: Mapping[int, float]) -> Figure | Non
     if not seeds:
         return None
     differences = np.array([one[seed] - other[seed] for seed in seeds])
-    mean, n = differences.mean(), len(seeds)
-    if n == 1:
-        return Figure(mean, None, 1)
-    half = stats.t.ppf(0.975, n - 1) * differences.std(ddof=1) / n**0.5
-    return Figure(mean, (mean - half, mean + half), n)
+    interval = tuple(stats.ttest_1samp(differences, 0).confidence_interval()) if len(seeds) > 1 else None
+    return Figure(differences.mean(), interval, len(seeds))
 
 
 def iqm(runs: list[Array]) -> Array:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import numpy as np
 
 from deconfounded.benchmarks.output import score
-from deconfounded.benchmarks.studies import spectra, validation
-from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
+from deconfounded.benchmarks.studies import spectrum, validate
+from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
 UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
 BUDGET = 4  # settings of each opponent
@@ -18,57 +17,39 @@ NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
 
 def rates() -> str:
     """The table of docs/speed.md: control steps a second, as `deconf performance speed` measured them."""
-    shown, grown = ("64", "256", "4096"), ("256", "4096")
+    sizes = ("64", "256", "4096")
     rows = []
-    for name, by_size in json.loads((DOCS / "speed" / "speed.json").read_bytes())["tasks"].items():
-        few, many = (by_size[n]["closed_loop"] for n in grown)
-        rows.append(
-            (
-                name,
-                *(f"{by_size[n]['closed_loop']:,.0f}" for n in shown),
-                *(score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in shown),
-                *(f"{by_size[shown[0]][way]:,.0f}" for way in ("mj_step", "sync_vector_env")),
-                score.two_decimals(few / many),
-                f"{by_size[grown[1]]['kib']:.0f}",
-            )
-        )
-    loops = (*(f"closed loop, {n}" for n in shown), *(f"of open loop, {n}" for n in shown))
-    told = ("mj_step x threads", f"SyncVectorEnv, {shown[0]}", "a step, {1} / {0}".format(*grown), "KiB each")
-    return markdown_table(("task", *loops, *told), rows)
+    for name, by_size in kept("speed/speed")["tasks"].items():
+        few, middle, many = (by_size[n] for n in sizes)
+        closed = (f"{by_size[n]['closed_loop']:,.0f}" for n in sizes)
+        shares = (score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
+        peers = (f"{few[way]:,.0f}" for way in ("mj_step", "sync_vector_env"))
+        slowdown = score.two_decimals(middle["closed_loop"] / many["closed_loop"])
+        rows.append((name, *closed, *shares, *peers, slowdown, f"{many['kib']:.0f}"))
+    loops = [f"{what} loop, {n}" for what in ("closed", "of open") for n in sizes]
+    others = ("mj_step x threads", "SyncVectorEnv, 64", "a step, 4096 / 256", "KiB each")
+    return markdown_table(("task", *loops, *others), rows)
 
 
 def _origins(made: list[dict[str, Any]]) -> str:
     """Where what is kept was made, and of which code, each once."""
-    where = (
-        f"{one['machine']}, torch {one['versions']['torch']}, of {(one['commit'] or 'unknown')[:7]}" for one in made
-    )
-    return "; ".join(dict.fromkeys(where))
+    origins = {(row["machine"], row["versions"]["torch"], (row["commit"] or "unknown")[:7]): None for row in made}
+    return "; ".join(f"{machine}, torch {torch}, of {commit}" for machine, torch, commit in origins)
 
 
 def validated() -> str:
     """The table of docs/diagnose.md: what `deconf validate` measured where the truth is known."""
-    rows = diagnosed()
-    parts = [f"{validation.told(rows)} ({_origins(rows)})", validation.table(rows)]
+    rows = kept(validate.KEPT)
+    parts = [f"{validate.summary(rows)} ({_origins(rows)})", validate.table(rows)]
     return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"])
-
-
-def diagnosed() -> list[dict[str, Any]]:
-    """A row a case that `deconf validate` diagnosed."""
-    return validation.rows(DOCS / "diagnose" / "validation.json")
 
 
 def noises() -> str:
     """The table of docs/spectrum.md: scores and certificates under more and less noise."""
-    found = spectrum()
-    points = found["points"]
-    about = f"Means over {found['seeds']} seeds; {_origins(points)}."
-    return "\n\n".join([spectra.foretold(points), spectra.table(points), about])
-
-
-def spectrum() -> dict[str, Any]:
-    """What `deconf spectrum` measured."""
-    found: dict[str, Any] = json.loads((DOCS / "spectrum.json").read_bytes())
-    return found
+    measured = kept("spectrum")
+    points = measured["points"]
+    about = f"Means over {measured['seeds']} seeds; {_origins(points)}."
+    return "\n\n".join([spectrum.foretold(points), spectrum.table(points), about])
 
 
 def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -82,10 +63,10 @@ def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def tuning() -> str:
     """The table of docs/opponents.md: what `deconf tune` tried of each opponent, and what was best."""
-    found, rows = json.loads((DOCS / "tuning.json").read_bytes()), []
-    tasks = list(found["rows"][0]["scores"])
-    for method in dict.fromkeys(row["method"] for row in found["rows"]):
-        of = [row for row in found["rows"] if row["method"] == method]
+    tried, rows = kept("tuning")["rows"], []
+    tasks = list(tried[0]["scores"])
+    for method in dict.fromkeys(row["method"] for row in tried):
+        of = [row for row in tried if row["method"] == method]
         best = chosen(of) if len(of) == BUDGET else None
         for row in of:
             scores = [score.two_decimals(np.mean(row["scores"][task])) for task in tasks]
@@ -93,4 +74,4 @@ def tuning() -> str:
             word = "" if row is not best else "kept" if method == UNTUNED else "chosen"
             rows.append((method, row["setting"], *scores, *cpu, word))
     head = ("method", "setting", *tasks, *(f"{task}, CPU s a seed" for task in tasks), "")
-    return f"{markdown_table(head, rows)}\n\n{_origins(found['rows'])}."
+    return f"{markdown_table(head, rows)}\n\n{_origins(tried)}."

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 
@@ -53,33 +53,18 @@ With those of Tier 3, whose gap only queries of the expert can close, it is {_co
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
 
 
-def picture(
-    points: Sequence[tuple[str, float, float]],
-    file: Path,
-    foretold: str = FORETOLD,
-    hues: Sequence[str] | None = None,
-    hollow: Sequence[bool] | None = None,
-    mark: str = "",
-) -> None:
-    """A dot for each name, predicted and measured gap; foretold: what predicts; hues, hollow: if the dots differ.
+def picture(points: Sequence[Sequence[Any]], file: Path, foretold: str = FORETOLD, mark: str = "") -> None:
+    """A dot for each name, predicted and measured gap, and its colour and fill if dots differ; foretold: what predicts.
 
     Dots within 0.05 of the origin, where there is nothing to tell, bear no name: they hide each other's.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6.4, 5.2), layout="constrained")
-    axes.axline((0, 0), slope=1, color="0.8", lw=1)
-    some = zip(points, hues or ["tab:blue"] * len(points), hollow or [False] * len(points), strict=True)
-    for (name, predicted, measured), hue, empty in some:
-        at = predicted, measured
-        axes.plot(*at, "o", color=hue, fillstyle="none" if empty else "full")
-        if np.hypot(*at) > 0.05:
-            axes.annotate(name, at, xytext=(4, 4), textcoords="offset points", fontsize=8)
-    axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
-    axes.margins(0.14, 0.08)
-    axes.set_title("what cloning loses, score in the last episode", fontsize=11)
-    save_figure(figure, file, 100, mark)
-    plt.close(figure)
+    with panels(file, size=(6.4, 5.2), dpi=100, mark=mark) as [[axes]]:
+        axes.axline((0, 0), slope=1, color="0.8", lw=1)
+        for name, predicted, measured, *style in points:
+            hue, fill = style or ("tab:blue", "full")
+            axes.plot(predicted, measured, "o", color=hue, fillstyle=fill)
+            if np.hypot(predicted, measured) > 0.05:
+                axes.annotate(name, (predicted, measured), xytext=(4, 4), textcoords="offset points", fontsize=8)
+        axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
+        axes.margins(0.14, 0.08)
+        axes.set_title("what cloning loses, score in the last episode", fontsize=11)

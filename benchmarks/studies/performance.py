@@ -29,7 +29,8 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine import identity
-from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.studies import runs, stepping
 from deconfounded.envs.physics import cores
 from deconfounded.envs.support.files import check_folder, write_json
@@ -91,10 +92,8 @@ def by_values(values: int) -> dict[str, float]:
     from deconfounded.experts.rollout import run_trials
 
     env = envs.BatchEnv(envs.get(GRID), 32)
-    agents = {
-        name: ExactAgent(env, policy.load(env.task), name == "conditional", values)
-        for name in ("interventional", "conditional")
-    }
+    expert = policy.load(env.task)
+    agents = {name: ExactAgent(env, expert, name == "conditional", values) for name in EXACT[::-1]}
     timed = {f"exact {name}": partial(run_trials, env, agent, 2, 0) for name, agent in agents.items()}
     return stepping.seconds(timed, time.process_time, 1)
 
@@ -107,18 +106,15 @@ def power(by: dict[int, float]) -> float:
 def growth(args: argparse.Namespace) -> None:
     """By the steps of a trial, and by the values of the grid."""
     measured: dict[str, dict[str, dict[int, float]]] = {}
-    for what, sizes, measure in (
-        ("steps of a trial", STEPS, by_steps),
-        ("values of the grid", VALUES, by_values),
-    ):
+    for what, sizes, measure in (("steps of a trial", STEPS, by_steps), ("values of the grid", VALUES, by_values)):
         rows = {n: measure(n) for n in sizes}
         measured[what] = {name: {n: row[name] for n, row in rows.items()} for name in rows[sizes[0]]}
         for name, by in measured[what].items():
             costs = ", ".join(f"{n}: {1000 * seconds:,.0f}" for n, seconds in by.items())
             print(f"{name}, by {what}: ms {costs}; grows as n^{power(by):.2f}")
     write_json(args.out / "growth.json", measured)
-    with stepping.panels(args.out / "growth.png", 1, 2, (10, 4)) as panels:
-        for axes, (what, curves) in zip(panels, measured.items(), strict=True):
+    with panels(args.out / "growth.png", 1, 2, size=(10, 4)) as [row]:
+        for axes, (what, curves) in zip(row, measured.items(), strict=True):
             for name, by in curves.items():
                 axes.plot(list(by), list(by.values()), "o-", label=f"{name}: n^{power(by):.2f}")
                 axes.set(xscale="log", yscale="log", xlabel=what, ylabel="CPU seconds")
@@ -129,8 +125,7 @@ def growth(args: argparse.Namespace) -> None:
 
 def few(full: Preset) -> Preset:
     """The preset's networks and batches, on little data and for few updates."""
-    small: dict[str, Any] = {"rounds": 1, "final_updates": 0}
-    small |= {"inference_updates": UPDATES, "imitation_updates": UPDATES}
+    small = {"rounds": 1, "final_updates": 0, "inference_updates": UPDATES, "imitation_updates": UPDATES}
     little = replace(full, expert_trials=128, explore_trials=128, eval_trials=1, fresh=0)
     little = little.configured("deconfounded", **small).configured("deconfounded_discrete", **small)
     return little.configured("naive_rnn", updates=UPDATES, chunk=min(full.configs["naive_rnn"]["chunk"], 50))
@@ -185,43 +180,43 @@ def scaled(config: dict[str, Any], share: float) -> dict[str, Any]:
 def cost(args: argparse.Namespace) -> None:
     """Of some tasks: one seed of each learned method, with each share of its updates."""
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records, score
+    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output.index import last_scores
 
     for task in args.tasks or map(envs.get, COST):
         full, measured = preset("default", task, args.device), dict[str, Any]()
         for share in SHARES:
             settings = replace(full, configs={name: scaled(config, share) for name, config in full.configs.items()})
             own = args.out / f"cost-{task.name}" / f"{share:g}"
-            made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own, device=args.device)
+            made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own)
             results = records.gather(made)["methods"]
-            zero, one = (float(np.mean(results[name]["return"])) for name in REFERENCES)
+            last = last_scores(results)
             for method in LEARNED:
-                last = score.normalise(np.array(results[method]["return"])[:, -1], zero, one)
-                point = {"cpu_s": results[method]["cpu_s"], "scores": last.round(4).tolist()}
+                scores = [round(score, 4) for score in last[method].values()]
+                point = {"cpu_s": results[method]["cpu_s"], "scores": scores}
                 measured.setdefault(method, {})[f"{share:g}"] = point
-                print(f"{task.name}, {method:22} {share:5g} of the updates: {point['cpu_s']:6.1f} CPU s, {last[0]:.3f}")
+                costs = f"{point['cpu_s']:6.1f} CPU s, {scores[0]:.3f}"
+                print(f"{task.name}, {method:22} {share:5g} of the updates: {costs}")
         write_json(args.out / f"cost-{task.name}.json", {"task": task.name, "seeds": 1, "methods": measured})
-        with stepping.panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), (13, 6)) as panels:
-            for axes, (method, points) in zip(panels, measured.items(), strict=False):
+        with panels(args.out / f"cost-{task.name}.png", 2, -(-len(measured) // 2), size=(13, 6)) as grid:
+            for axes, (method, points) in zip(grid.flat, measured.items(), strict=False):
                 cpu, scores = [[point[key] for point in points.values()] for key in ("cpu_s", "scores")]
                 axes.plot(cpu, scores, "o-", color="tab:blue", label="1/4, 1/2 and all of the updates")
                 axes.set(title=method, xlabel="CPU seconds a seed", xlim=(0, None), ylim=(-0.05, 1.1))
-            for axes in panels[len(measured) :]:
+            for axes in grid.flat[len(measured) :]:
                 axes.axis("off")
-            panels[0].set_ylabel(f"score on {task.name}, last episode")
-            panels[0].legend(frameon=False, fontsize=8)
+            grid[0, 0].set_ylabel(f"score on {task.name}, last episode")
+            grid[0, 0].legend(frameon=False, fontsize=8)
 
 
 PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "cost": cost}
 
 
 def main() -> None:
-    """The command line."""
-    parser = Parser(__doc__)
+    parser = Parser(__doc__, "--device")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     named = f"of speed and cost; default: all with physics, and {', '.join(COST)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=(), help=named)
-    parser.add_argument("--device", default="cpu", help="torch device of seeds and cost, e.g. cuda")
     parser.add_argument("--out", type=place, default=Path("results") / "performance", help="output folder")
     args = parser.parse_args()
     check_names("part", args.parts, list(PARTS))

@@ -1,8 +1,8 @@
 """Keep a finished run in docs/, and write the pages anew: `deconf publish results/slippery_cartpole-default`
 
 Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
-certificate; makes a small animated picture of the video; and brings the pages up to date (`site.py`). All of it is
-looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
+certificate; makes a small animated picture of the video; and brings the pages up to date from what docs/ keeps. All of
+it is looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
 README's picture of docs/index.html, which takes Chromium.
 """
 
@@ -17,8 +17,10 @@ import hashlib
 import json
 import shutil
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -26,13 +28,19 @@ from PIL import Image
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
-from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.output import index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of
-from deconfounded.benchmarks.studies import browser, site
-from deconfounded.benchmarks.studies.cards import DOCS
+from deconfounded.benchmarks.studies import cards, findings, gap, results, spectrum, validate
+from deconfounded.benchmarks.studies.cards import DOCS, TIERS
 from deconfounded.envs.support.files import write_atomically
 
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+README = DOCS.parent / "README.md"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 LOOK: dict[str, Any] = {"duration": 150, "loop": 0, "quality": 30, "method": 4}  # of clips
 
 
@@ -51,13 +59,14 @@ def copy(source: Path, file: Path) -> None:
 def check_certificate(file: Path, task: envs.Task) -> None:
     """Raises InputError for a file that is no certificate of the task, as pages show it."""
     try:
-        found = json.loads(file.read_bytes())
-        numbers = [check["measured"] for check in found["checks"].values()] + found["conditional"]["score"]
-        numbers += [found["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
-        whole = np.isfinite(np.array(numbers, float)).all() and found["verdict"] in ("passed", "failed")
+        made = json.loads(file.read_bytes())
+        numbers = [check["measured"] for check in made["checks"].values()] + made["conditional"]["score"]
+        numbers += [made["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions")]
+        whole = np.isfinite(np.array(numbers, float)).all() and made["verdict"] in ("passed", "failed")
+        right = whole and (made["task"], made["task_version"]) == (task.name, task.version)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        whole = False
-    if not whole or (found["task"], found["task_version"]) != (task.name, task.version):
+        right = False
+    if not right:
         raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
 
 
@@ -68,12 +77,11 @@ def keep(run: Path) -> None:
         raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
     if len(files) != 1 or not (run / "adaptation.png").is_file():
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
-    found = records.read(files[0])
-    results = records.gather(found, list(METHODS))
+    made = records.read(files[0])
+    results = records.gather(made, list(METHODS))
     if results["preset"] != "default" or {"set", "salt"} & set(results):
-        raise envs.InputError(
-            f"{run} is of preset {results['preset']}, or changed; pages show the default preset alone"
-        )
+        wrong = f"of preset {results['preset']}, or changed"
+        raise envs.InputError(f"{run} is {wrong}; pages show the default preset alone")
     if results["task"] not in envs.SUITE:
         raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
     task = envs.get(results["task"])
@@ -92,7 +100,7 @@ def keep(run: Path) -> None:
                 shutil.copy(kept, small) if mark_of(kept) == looks else clip(run / "video.mp4", small, looks)
             except Exception as error:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
-        records.write(DOCS / "records", found)
+        records.write(DOCS / "records", made)
         copy(run / "adaptation.png", DOCS / f"{task.name}.png")
         if small.exists():
             copy(small, DOCS / f"{task.name}.webp")
@@ -102,17 +110,93 @@ def keep(run: Path) -> None:
         shutil.copy(file, DOCS / "certificates")
 
 
+def _filled(file: Path, tables: dict[str, str]) -> str:
+    """The page with each table between `<!-- its name -->` and `<!-- /its name -->`."""
+    text = file.read_text("utf-8")
+    for name, table in tables.items():
+        marks = [f"<!-- {slash}{name} -->" for slash in ("", "/")]
+        if [text.count(mark) for mark in marks] != [1, 1]:
+            raise envs.InputError(f"{file.name} lacks its marks {' and '.join(marks)}, each once; put them back")
+        before, rest = text.split(marks[0])
+        text = "\n".join([before + marks[0], table, marks[1] + rest.split(marks[1])[1]])
+    return text
+
+
+def texts(found: index.Found) -> dict[Path, str]:
+    """By its file, what each page is to say. found: what `results.published` gives."""
+    certified = cards.certified()
+    tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
+    tables = {
+        DOCS / "diagnose.md": {"validation": findings.validated()},
+        DOCS / "opponents.md": {"fared": results.fared(found, certified), "tuning": findings.tuning()},
+        DOCS / "spectrum.md": {"noises": findings.noises()},
+        DOCS / "speed.md": {"costs": results.costs(found), "rates": findings.rates()},
+        DOCS / "paper.md": {"controls": results.controls(found)},
+        README: {"summary": results.summary(found), "certificates": cards.certificates(certified)},
+    }
+    return {
+        DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
+        DOCS / "tasks.md": cards.tasks_page(),
+        DOCS / "results.md": results.results_page(found, certified),
+        **{file: _filled(file, of) for file, of in tables.items()},
+    }
+
+
+def write() -> str:
+    """Bring all of them up to date, and their pictures; what has not changed is not written.
+
+    Returns README's table of results.
+    """
+    found = results.published()
+    for file, text in texts(found).items():
+        if file.read_text(encoding="utf-8") != text:
+            write_atomically(file, text)
+    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
+    redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
+    redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
+    return results.summary(found)
+
+
+def redraw(file: Path, draw: Callable[..., None], data: Any) -> None:
+    """Draw a picture of data (json) again, if these or the module that draws it have changed since it was drawn."""
+    made_of = mark(data, sources.of_code(draw))
+    if mark_of(file) != made_of:
+        draw(data, file, mark=made_of)
+
+
+def chromium() -> str | None:
+    """Where Chromium is, if there is one."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
+@contextmanager
+def browser(width: int, height: int, dark: bool = False) -> Iterator[Page]:
+    """An empty page of that size, px. Raises InputError without a browser, without Playwright, or for what it says."""
+    path = chromium()
+    if path is None:
+        raise envs.InputError(f"no browser was found; install one of {', '.join(BROWSERS)}")
+    try:
+        from playwright.sync_api import Error, sync_playwright
+    except ModuleNotFoundError:
+        raise envs.InputError("playwright is not installed; `pip install -e .[dev]` brings it") from None
+    look = {"viewport": {"width": width, "height": height}, "color_scheme": "dark" if dark else "light"}
+    try:
+        with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path) as browser:
+            yield browser.new_page(**look, is_mobile=width < 600)
+    except Error as error:
+        raise envs.InputError(f"the browser says: {error.message.splitlines()[0]}") from None
+
+
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("run", type=Path, nargs="?", help="output folder of a finished run")
     parser.add_argument("--still", action="store_true", help="docs/index.png too, by Chromium")
     args = parser.parse_args()
     if args.run is not None:
         keep(args.run)
-    print(site.write())
+    print(write())
     if args.still:
-        with browser.page(1280, 960) as page:
+        with browser(1280, 960) as page:
             page.goto((DOCS / "index.html").as_uri())
             write_atomically(DOCS / "index.png", page.screenshot())
 

@@ -10,7 +10,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, score
-from deconfounded.benchmarks.output.answers import NOTE, PEER, answers
+from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
 
@@ -28,12 +28,8 @@ TIMED = ("bandit", "tilted_cartpole", "slippery_cartpole")  # in docs/speed.md
 
 def published() -> index.Found:
     """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
-    found = []
-    for name in envs.SUITE:
-        task = envs.get(name)
-        if of_task := records.of_task(DOCS / "records", name):
-            found.append((task, records.gather(of_task, list(METHODS))))
-    return found
+    kept = {name: records.of_task(DOCS / "records", name) for name in envs.SUITE}
+    return [(envs.get(name), records.gather(of, list(METHODS))) for name, of in kept.items() if of]
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
@@ -56,7 +52,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
     seeds = score.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
-    commits = ", ".join(dict.fromkeys(one[:7] for one in results["commits"]))
+    commits = ", ".join(dict.fromkeys(commit[:7] for commit in results["commits"]))
     rows = []
     for row in score.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
@@ -71,8 +67,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     ]
     if older := outdated(task, results):
         parts.append(f"Of an older version, and not yet made again: {', '.join(older)}.")
-    if (DOCS / "records" / "superseded" / records.place(task.name)).exists():
-        link = f"records/superseded/{records.place(task.name)}"
+    if (DOCS / (link := f"records/superseded/{records.place(task.name)}")).exists():
         parts.append(f"Superseded, and not to be compared: [the records of earlier versions]({link}).")
     if (DOCS / f"{task.name}.webp").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
@@ -99,19 +94,19 @@ theta (more is better), are of the last episode; theta R2 is of a linear probe o
 Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
 mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
 those of training."""
-    parts = [head, in_short(found, certified), *(section(*one) for one in found), gap.section(gaps(found))]
+    parts = [head, in_short(found, certified), *(section(*of) for of in found), gap.section(gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def in_short(found: index.Found, certified: dict[str, Any]) -> str:
     """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
-    told = [f"- {answer}" for answer in answers(index.certified(found, certified))]
-    return "\n".join(["## In short", "", *told, "", NOTE]) if told else ""
+    lines = [f"- {answer}" for answer in answers(index.certified(found, certified))]
+    return "\n".join(["## In short", "", *lines, "", NOTE]) if lines else ""
 
 
 def gaps(found: index.Found) -> list[gap.Gap]:
     """Of all tasks that have the records for it."""
-    return [one for task, results in found if (one := gap.gap(task, results["methods"]))]
+    return [both for task, results in found if (both := gap.gap(task, results["methods"]))]
 
 
 def summary(found: index.Found) -> str:
@@ -131,12 +126,11 @@ def controls(found: index.Found) -> str:
     ours = {task.name: results["methods"] for task, results in found if task.name in AUTHORS}
     for task, theirs in AUTHORS.items():
         rows.append((task, "the authors' return", *(f"{theirs[method]:,}" for method in methods)))
-        last = {
-            method: (np.mean(entry["return"], 0)[-1], entry["score_last"])
-            for method, entry in ours.get(task, {}).items()
-        }
-        for i, what in enumerate(("the return here", "the score here")):
-            rows.append(("", what, *(score.two_decimals(last[name][i]) if name in last else "" for name in methods)))
+        entries = ours.get(task, {})
+        returns = {name: np.mean(entry["return"], 0)[-1] for name, entry in entries.items()}
+        scores = {name: entry["score_last"] for name, entry in entries.items()}
+        for what, last in (("the return here", returns), ("the score here", scores)):
+            rows.append(("", what, *(score.two_decimals(last[name]) if name in last else "" for name in methods)))
     return markdown_table(("task", "in the last episode", *methods), rows)
 
 
@@ -146,7 +140,7 @@ def costs(found: index.Found) -> str:
     rows = []
     for method in METHODS:
         seconds = [methods.get(method, {}).get("cpu_s") for methods in by_task.values()]
-        rows.append((method, *("" if one is None else f"{one:,.1f}" for one in seconds)))
+        rows.append((method, *("" if cpu is None else f"{cpu:,.1f}" for cpu in seconds)))
     return markdown_table(("method", *by_task), rows)
 
 
@@ -156,14 +150,12 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
     over = index.over_tasks(scores, list(scores))["methods"]
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
-        ends = (
-            f"{task}, {score.two_decimals(means[task])}"
-            for task in (end(means, key=means.__getitem__) for end in (min, max))
-        )
+        ends = (end(means, key=means.__getitem__) for end in (min, max))
+        extremes = (f"{task}, {score.two_decimals(means[task])}" for task in ends)
         figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
-        rows.append((name, METHODS[name].tier, str(len(means)), *figures, *ends))
-    told = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
-    return markdown_table(("method", "tier", "tasks", *told), rows)
+        rows.append((name, METHODS[name].tier, str(len(means)), *figures, *extremes))
+    summary = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
+    return markdown_table(("method", "tier", "tasks", *summary), rows)
 
 
 def _with_interval(figure: dict[str, Any] | None) -> str:

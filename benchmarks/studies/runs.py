@@ -30,7 +30,6 @@ def run(
     expert: str | None = None,
     preset: str = "default",
     changes: Sequence[str] = (),
-    device: str = "cpu",
     cluster: str | None = None,
     base: Preset | None = None,
 ) -> list[Record]:
@@ -45,9 +44,9 @@ def run(
     label = f"{task.name}, {', '.join(wanted)}, {listed(own)}"
     # Workers of its own: a record names the code that is there when it is made, and they have imported it.
     with commands.locked(folder), commands.engine(cluster) as engine:
-        about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert)
+        about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert, "")
         prepare(folder, about, resume=True)
-        finished, _ = run_all(jobs, device, label, engine)
+        finished, _ = run_all(jobs, settings.device, label, engine)
     asked = [entry for entry in finished if entry[0] in wanted and entry[1] in own]
     return records.of_run(asked, preset, changes, task.episodes)
 

@@ -9,8 +9,7 @@ on their own model.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
@@ -23,7 +22,7 @@ from gymnasium.vector import SyncVectorEnv
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.envs.physics import Physics, cores
 
 SIZES = (1, 16, 64, 256, 1024, 4096)  # environments
@@ -43,29 +42,11 @@ def seconds(
     return {name: float(np.median(each[1:])) for name, each in times.items()}
 
 
-@contextmanager
-def panels(file: Path, rows: int, columns: int, size: tuple[float, float]) -> Iterator[Any]:
-    """Panels to draw in, which make up a picture."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
-    yield axes.flat
-    save_figure(figure, file, 110)
-    plt.close(figure)
-
-
 def raw(model: mujoco.MjModel, steps: int) -> Callable[[], object]:
     """So many physics steps of one environment in one thread, from its start, without control."""
     data = mujoco.MjData(model)
 
-    def run() -> None:
-        mujoco.mj_resetData(model, data)
-        mujoco.mj_step(model, data, nstep=steps)
-
-    return run
+    return lambda: (mujoco.mj_resetData(model, data), mujoco.mj_step(model, data, nstep=steps))
 
 
 def closed_loop(env: Any, actions: Any) -> Callable[[], object]:
@@ -83,11 +64,11 @@ def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
     """Control steps a second, by way of stepping; KiB an environment. The same actions and the same thetas for all."""
     steps = max(8, min(task.horizon, 20_000 // n))
     actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, *task.action_space.shape)).astype(np.float32)
-    process = psutil.Process()
-    before = process.memory_info().rss
+    memory = psutil.Process().memory_info
+    before = memory().rss
     ours = envs.make_vec(task.name, n)
     loop = closed_loop(ours, actions)
-    memory = (process.memory_info().rss - before) / 1024 / n
+    kib = (memory().rss - before) / 1024 / n
     start, simulator = ours.batch.state.copy(), ours.batch.simulator
     assert isinstance(simulator, Physics)
     controls = np.ascontiguousarray(actions.transpose(1, 0, 2), float)
@@ -103,10 +84,10 @@ def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
         runs["sync_vector_env"] = closed_loop(SyncVectorEnv([lambda: envs.make(task.name) for _ in range(n)]), few)
         counts["sync_vector_env"] = n * len(few)
     rates = {name: counts[name] / each for name, each in seconds(runs).items()}
-    return {**rates, "kib": memory}
+    return {**rates, "kib": kib}
 
 
-def against_envpool(n: int = 64) -> dict[str, Any] | None:
+def against_envpool() -> dict[str, Any] | None:
     """Physics steps a second in closed loop over raw mj_step times threads, of ours and of envpool's cartpole."""
     try:
         import envpool  # type: ignore[import-not-found]
@@ -114,10 +95,11 @@ def against_envpool(n: int = 64) -> dict[str, Any] | None:
         cartpole = files("dm_control") / "suite" / "cartpole.xml"  # what suite.load makes of it fails under MuJoCo 4
     except ImportError:
         return None
+    n = 64
     theirs = envpool.make("CartpoleBalance-v1", env_type="gymnasium", num_envs=n, num_threads=cores())
+    theirs.reset()
     task = envs.get("tilted_cartpole")
     assert isinstance(task, envs.MujocoTask)
-    theirs.reset()
     actions = np.random.default_rng(0).uniform(-1, 1, (200, n, 1))
     runs = {
         "ours": closed_loop(envs.make_vec(task.name, n), actions),
@@ -155,7 +137,7 @@ def picture(measured: dict[str, dict[str, dict[str, float]]], file: Path) -> Non
     """Closed loop as a share of open loop, and microseconds a step of one environment, by number of environments."""
     import matplotlib
 
-    with panels(file, 1, 2, (11, 4)) as (left, right):
+    with panels(file, 1, 2, size=(11, 4)) as [[left, right]]:
         for axes in (left, right):
             axes.set_prop_cycle(color=matplotlib.color_sequences["tab20"])
         for name, by_size in measured.items():

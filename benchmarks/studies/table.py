@@ -40,16 +40,12 @@ def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
     from deconfounded.benchmarks.output import records
 
     today = identity(job)
-    there = {
-        record["seed"]
-        for record in kept
-        if (record["method"], record["preset"]) == (job.method, preset) and not records.stale(record, today)
-    }
-    return tuple(seed for seed in job.seeds if seed not in there)
+    same = [record for record in kept if (record["method"], record["preset"]) == (job.method, preset)]
+    fresh = {record["seed"] for record in same if not records.stale(record, today)}
+    return tuple(seed for seed in job.seeds if seed not in fresh)
 
 
 def main() -> None:
-    """The command line."""
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
     parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
@@ -64,26 +60,21 @@ def main() -> None:
 
     folder = args.out or Path("results") / "table"
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
+    settings = {task.name: changed(preset(args.preset, task, args.device), args.set) for task in tasks}
     jobs = [
-        BenchmarkJob(
-            task.reference,
-            changed(preset(args.preset, task, args.device), args.set),
-            method,
-            seeds_of(method, least, most),
-            folder / task.name / "jobs",
-        )
+        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs")
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods
+        if (seeds := seeds_of(method, least, most))
     ]
-    files = {task.reference: kept / records.place(task.name) for task in tasks}
-    there = {name: records.read(file) if file.exists() else [] for name, file in files.items()}
+    there = {task.reference: records.held(kept / records.place(task.name)) for task in tasks}
     left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}
     if args.list:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
         return
-    options = {"preset": args.preset, "changes": args.set, "device": args.device, "cluster": args.cluster}
+    options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster}
     for job, seeds in left.items():
         made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
         records.write(kept, made)

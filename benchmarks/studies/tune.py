@@ -74,8 +74,8 @@ def began(today: Preset) -> Preset:
 
 def title(change: Change) -> str:
     """Of a setting."""
-    told = (f"{name} {by}" if isinstance(by, str) else f"{name} x {by:g}" for name, by in change.items())
-    return ", ".join(told) or "the preset"
+    parts = (f"{name} {by}" if isinstance(by, str) else f"{name} x {by:g}" for name, by in change.items())
+    return ", ".join(parts) or "the preset"
 
 
 def kept(file: Path) -> list[dict[str, Any]]:
@@ -85,17 +85,13 @@ def kept(file: Path) -> list[dict[str, Any]]:
 
 def keep(row: dict[str, Any], file: Path) -> None:
     """Among the file's rows, in place of the one of the same method and setting."""
-    rows = kept(file)
-    same = [one for one in rows if (one["method"], one["setting"]) == (row["method"], row["setting"])]
-    if same:
-        rows[rows.index(same[0])] = row
-    else:
-        rows.append(row)
-    write_json(file, {"seeds": SEEDS, "rows": sorted(rows, key=lambda one: list(TRIED).index(one["method"]))})
+    rows = {(held["method"], held["setting"]): held for held in kept(file)}
+    rows[row["method"], row["setting"]] = row
+    ordered = sorted(rows.values(), key=lambda row: list(TRIED).index(row["method"]))
+    write_json(file, {"seeds": SEEDS, "rows": ordered})
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--methods", nargs="+", metavar="NAME", help=f"some of {', '.join(TRIED)}; default: all")
     parser.add_argument("--out", type=place, default=Path("results") / "tuning", help="output folder")

@@ -13,19 +13,20 @@ if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
 
     stop_at_once()
 
-import json
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import stats
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, run_command
 from deconfounded.benchmarks.engine.catalogue import check_names
-from deconfounded.benchmarks.studies import noise, runs, unconfounded, validation
-from deconfounded.benchmarks.studies.cards import DOCS
-from deconfounded.benchmarks.studies.spectrum import variants
+from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
+from deconfounded.benchmarks.studies.cards import DOCS, kept, markdown_table
 from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
@@ -37,7 +38,7 @@ CASES: dict[str, str | None] = {
     **unconfounded.EXPERTS,
     **{
         case: str(ASSETS / "experts" / f"{base}.safetensors")
-        for base, kind, factor, case in (one for base in noise.BASES for one in variants(base))
+        for base, kind, factor, case in chain(*map(spectrum.variants, noise.BASES))
         if kind == "process" and factor != 1
     },
 }
@@ -45,6 +46,8 @@ CASES: dict[str, str | None] = {
 
 TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
+KEPT = "diagnose/validation"
+FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # of the table
 
 
 def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
@@ -54,11 +57,11 @@ def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
     """
     from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
+    truth = ("confounded", 2) if certified else ("not confounded", 1)
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
-        return bool(diagnosis.verdict == "confounded" and diagnosis.tier == 3)
+        truth = ("confounded", 3)
     alike = task.name == "nothing_hidden" and diagnosis.next is VARY_LATENT
-    expected = ("confounded", 2) if certified else ("not confounded", 1)
-    return bool(alike or (diagnosis.verdict, diagnosis.tier) == expected)
+    return alike or (diagnosis.verdict, diagnosis.tier) == truth
 
 
 def predicted(diagnosis: Diagnosis) -> float:
@@ -81,21 +84,21 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     count = TRIALS.get(task.name, 256)
     settings = replace(preset("default", task, "cpu"), expert_trials=count, explore_trials=count // 4)
     context = Context(task, settings, (SEED,), folder=folder, expert=source)
-    shown, file = context.demonstrations, folder / "explored.npz"
-    made_of = f"{shown.sha256} {settings.explore_trials} {identity.PROTOCOL}"
+    demonstrations, file = context.demonstrations, folder / "explored.npz"
+    made_of = f"{demonstrations.sha256} {settings.explore_trials} {identity.PROTOCOL}"
     try:
         Trials.load(file, made_of)
     except envs.InputError:
         rngs = context.rngs  # once: each exploration draws thetas of its own
-        policy = exploration.fit(shown, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
-        joined([context.explore(agent, rngs) for agent in (None, policy)]).save(file, made_of)
+        explorer = exploration.fit(demonstrations, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
+        joined([context.explore(agent, rngs) for agent in (None, explorer)]).save(file, made_of)
     return folder / f"demonstrations-{SEED}.npz", file
 
 
 def point(task: envs.Task) -> dict[str, Any] | None:
     """What `spectrum.py` found of a task of noise.py; None of others."""
-    points = json.loads((DOCS / "spectrum.json").read_bytes())["points"]
-    titles = (noise.title(one["task"], one["kind"], one["factor"]) for one in points)
+    points = kept("spectrum")["points"]
+    titles = (noise.title(*(point[key] for key in ("task", "kind", "factor"))) for point in points)
     return dict(zip(titles, points, strict=True)).get(type(task).__name__)
 
 
@@ -107,39 +110,77 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
 
     if of := point(task):
         return {name: float(np.mean(of["scores"][name])) for name in LEARNED}
-    kept = records.of_task(DOCS / "records", task.name)
-    if not kept:
-        settings, methods = preset("default", task, "cpu"), (*REFERENCES, *LEARNED)
-        kept = runs.run(task, settings, methods, range(3), folder, expert=source)
-    found = records.gather(kept)["methods"]
-    return {name: float(found[name]["score_last"]) for name in LEARNED if name in found}
+    made = records.of_task(DOCS / "records", task.name) or runs.run(
+        task, preset("default", task, "cpu"), (*REFERENCES, *LEARNED), range(3), folder, expert=source
+    )
+    methods = records.gather(made)["methods"]
+    return {name: float(methods[name]["score_last"]) for name in LEARNED}
 
 
 def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     """Whether it is passed: docs/ says so of the suite and of its variants; of others it is made here."""
     if task.name in envs.SUITE:
-        file = DOCS / "certificates" / f"{task.name}.json"
-        return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
-    if of := point(task):
-        return bool(of["certificate"]["verdict"] == "passed")
-    return bool(runs.certificate(task, source, folder)["verdict"] == "passed")
+        made = kept(f"certificates/{task.name}")
+    elif of := point(task):
+        made = of["certificate"]
+    else:
+        made = runs.certificate(task, source, folder)
+    return made is not None and bool(made["verdict"] == "passed")
+
+
+def _unseen(row: dict[str, Any]) -> bool:
+    """Whether the thresholds were set without looking at it."""
+    return hasattr(noise, row["case"])
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """How many are right, and Spearman's correlation of the predicted and the measured gap."""
+    sentences = []
+    for what, unseen in (("that thresholds were set by", False), ("not looked at then", True)):
+        of = [row for row in rows if _unseen(row) is unseen]
+        if len(of) > 2:
+            share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
+            rank = stats.spearmanr([row["predicted"] for row in of], [row["measured"] for row in of]).statistic
+            alike = f"predicted and measured gaps rank alike by {two_decimals(rank)}"
+            sentences.append(f"Of cases {what}, {share}; {alike}.")
+    return " ".join(sentences)
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A row a case."""
+    lines = []
+    for row in rows:
+        verdict = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
+        figures = (row["found"][key]["value"] if key in row["found"] else None for key in FIGURES)
+        cells = ("" if value is None else two_decimals(value) for value in (*figures, row["predicted"]))
+        certified, judged = "passed" if row["certified"] else "failed", "" if row["right"] else "wrong"
+        lines.append((row["task"], certified, verdict, judged, *cells, two_decimals(row["measured"])))
+    return markdown_table(("task", "certificate", "diagnosis", "", *FIGURES, "predicted gap", "measured"), lines)
+
+
+def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
+    """A dot a case: red where the certificate is passed, hollow where the thresholds were set without it."""
+    points = []
+    for row in rows:
+        name = row["task"].replace("_process_", " x").replace("x0_", "x.").replace("0_", ".")
+        style = "tab:red" if row["certified"] else "tab:green", "none" if _unseen(row) else "full"
+        points.append((name, row["predicted"], row["measured"], *style))
+    gap.picture(points, file, "the diagnosis", mark)
 
 
 def main() -> None:
-    """The command line."""
     parser = Parser(__doc__)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help="some of the cases; default: all")
     parser.add_argument("--out", type=place, default=Path("results") / "validation", help="output folder")
     args = parser.parse_args()
-    known = {case.rpartition(":")[2]: case for case in CASES}
-    check_names("task", args.tasks or (), list(known))
+    cases = {case.rpartition(":")[2]: case for case in CASES}
+    check_names("task", args.tasks or (), list(cases))
     from deconfounded.benchmarks.diagnose import run
     from deconfounded.benchmarks.engine import identity
 
-    kept = DOCS / "diagnose" / "validation.json"
     about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
-    for name in args.tasks or known:
-        task, source = envs.get(known[name]), CASES[known[name]]
+    for name in args.tasks or cases:
+        task, source = envs.get(cases[name]), CASES[cases[name]]
         folder = args.out / task.name
         folder.mkdir(parents=True, exist_ok=True)
         diagnosis, _ = run(*data(task, source, folder), 0, folder / "diagnosis", f"deconf validate --tasks {name}")
@@ -156,11 +197,11 @@ def main() -> None:
             "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
-        rows = {one["case"]: one for one in validation.rows(kept)} | {name: row}
-        write_json(kept, [rows[case] for case in known if case in rows])
+        rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}
+        write_json(DOCS / f"{KEPT}.json", [rows[case] for case in cases if case in rows])
         print(f"{task.name}: {diagnosis.verdict}, {'right' if row['right'] else 'WRONG'}")
-    validation.picture(validation.rows(kept), kept.with_suffix(".png"))
-    print(f"{validation.told(validation.rows(kept))} -> {kept.parent}")
+    picture(kept(KEPT), DOCS / f"{KEPT}.png")
+    print(f"{summary(kept(KEPT))} -> {DOCS / KEPT}.png")
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ REACHED = (  # where a command's work begins
     *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
     *("benchmarks.studies.stepping.seconds", "benchmarks.studies.performance.update_seconds"),
     *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
-    *("benchmarks.output.report.write", "benchmarks.studies.site.write"),
+    *("benchmarks.output.report.write", "benchmarks.studies.publish.write"),
     *("benchmarks.check.check_task",),
 )
 MOST = 4 << 30  # bytes of memory, so that what asks for more is seen here
