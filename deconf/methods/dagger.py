@@ -121,7 +121,7 @@ class DaggerAgent(LearnedAgent):
 
 
 def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> DaggerAgent:
-    """In rounds, label roll-outs and train on all labels so far.."""
+    """In rounds, label roll-outs and train on all labels so far."""
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
 

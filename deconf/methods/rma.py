@@ -109,8 +109,7 @@ def train(
 ) -> RmaAgent:
     """Clone the teacher, then train the student on its own roll-outs.
 
-     trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
-    .
+    trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
     """
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
