@@ -29,7 +29,7 @@ def main() -> None:
             check(task)
         except Skipped as why:
             print(f"skip {name}: {why}", flush=True)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             failed = True
             print(f"FAIL {name}: {sentence(error)}", flush=True)
         else:

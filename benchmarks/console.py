@@ -10,6 +10,7 @@ import select
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -131,9 +132,15 @@ class Stoppable:
             signal.signal(number, handler)
 
 
+def _from_outside(error: SystemExit) -> bool:
+    """Whether it was raised by neither a command nor argparse: by a task's reward, for example."""
+    file = traceback.extract_tb(error.__traceback__)[-1].filename
+    return file != argparse.__file__ and not Path(file).resolve().is_relative_to(ROOT / "benchmarks")
+
+
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
     """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
-    from deconfounded.envs.support.errors import InputError
+    from deconfounded.envs.support.errors import InputError, error_line
 
     escape_output()
     signals = Stoppable()
@@ -141,8 +148,12 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
         with signals, quiet_pipe():
             main()
         return
-    except (Exception, KeyboardInterrupt) as error:
-        if isinstance(error, KeyboardInterrupt) or signals.stopped:  # an import turns it into an error of its own
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
+        if isinstance(error, SystemExit):
+            if not _from_outside(error):
+                raise
+            told, code = f"error: it was ended by {error_line(error)}", 2
+        elif isinstance(error, KeyboardInterrupt) or signals.stopped:  # an import turns it into an error of its own
             told, code = f"interrupted; {interrupted}", 128 + (signals.stopped or signal.SIGINT)
         elif isinstance(error, InputError):
             told, code = f"error: {error}", 2

@@ -12,8 +12,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from deconfounded.envs.batch import BatchEnv, Seed, check_number
+from deconfounded.envs.batch import BatchEnv, Seed
 from deconfounded.envs.streams import Obs
+from deconfounded.envs.support.numbers import check_number
 from deconfounded.envs.task import InputError, Mask, Renderer, Task
 
 Info = dict[str, Any]

@@ -6,22 +6,11 @@ from typing import Any
 import numpy as np
 
 from deconfounded.envs.streams import Obs, generators
+from deconfounded.envs.support.numbers import check_number, is_seed
 from deconfounded.envs.task import Array, InputError, Mask, Streams, Task
 
 MAX_ENVS = 10_000_000
 Seed = int | Sequence[int | None] | None
-
-
-def check_number(what: str, given: object, most: float = np.inf) -> None:
-    """Raise InputError unless `given` is a whole number from 1 to `most`. what: the things counted, for the message."""
-    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
-    if not whole or not 1 <= given <= most:  # type: ignore[operator]
-        limit = "up" if most == np.inf else f"to {most:,}"
-        raise InputError(f"the number of {what} was {given!r}; it must be a whole number from 1 {limit}")
-
-
-def _is_seed(given: object) -> bool:
-    return isinstance(given, int | np.integer) and not isinstance(given, bool) and bool(given >= 0)
 
 
 class BatchEnv:
@@ -54,10 +43,10 @@ class BatchEnv:
         """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
         if seed is None:
             seed = [None] * self.n
-        elif isinstance(seed, int | np.integer) and _is_seed(seed):
+        elif isinstance(seed, int | np.integer) and is_seed(seed):
             seed = [int(seed) + i for i in range(self.n)]
         whole = isinstance(seed, list | tuple | np.ndarray) and np.shape(seed) == (self.n,)
-        if isinstance(seed, int) or not whole or not all(value is None or _is_seed(value) for value in seed):
+        if isinstance(seed, int) or not whole or not all(value is None or is_seed(value) for value in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [generators(value) for value in seed]
 
@@ -72,7 +61,7 @@ class BatchEnv:
         if not isinstance(options, dict):
             raise InputError(f"reset options were {options!r}; they must be a dictionary")
         if unknown := set(options) - {"keep_theta", "theta"}:
-            raise InputError(f"reset option {sorted(unknown)[0]!r} is unknown; there are keep_theta and theta")
+            raise InputError(f"reset option {min(map(repr, unknown))} is unknown; there are keep_theta and theta")
         keep, forced = self._keep_mask(options.get("keep_theta", False)), options.get("theta")
         if keep.any() and forced is not None:
             raise InputError("reset was given keep_theta and theta; give one of them")

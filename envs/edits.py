@@ -9,7 +9,8 @@ from deconfounded.envs.streams import Array
 
 
 def _uphill(gravity: Array, angle: float) -> list[float]:
-    return [gravity[2] * np.sin(angle), 0.0, gravity[2] * np.cos(angle)]
+    x, y, z = gravity
+    return [x * np.cos(angle) + z * np.sin(angle), y, z * np.cos(angle) - x * np.sin(angle)]
 
 
 class Edit(ABC):
@@ -90,15 +91,37 @@ class ModelEdit(Edit):
 
 
 class SpecEdit(Edit):
-    """The same edits before compilation: the reference for tests of ModelEdit."""
+    """The same edits before compilation: the reference for tests of ModelEdit.
+
+    MJCF states a number in several ways: a mass by density or <inertial>, a position within <frame>s, an angle by
+    euler, a spring by springdamper. Not all of them are the attribute that is edited, so that the specification is
+    first rewritten to state what it compiles to.
+    """
 
     def __init__(self, spec: mujoco.MjSpec) -> None:
         super().__init__(spec, spec.option)
-        self.spec = spec
+        self.spec, model = spec, spec.compile()
+        for joint in spec.joints:
+            if joint.springdamper.any():
+                joint.springdamper, joint.stiffness[0] = [0, 0], model.jnt_stiffness[joint.id]
+                joint.damping[0] = model.dof_damping[model.jnt_dofadr[joint.id]]
+        for actuator in spec.actuators:
+            actuator.biasprm = model.actuator_biasprm[actuator.id]
+        for tendon in spec.tendons:
+            tendon.springlength = model.tendon_lengthspring[tendon.id]
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        spec.compiler.settotalmass, spec.compiler.balanceinertia = -1, 0
+        spec.compiler.boundmass = spec.compiler.boundinertia = 0
+        for body, i in [(body, body.id) for body in spec.bodies[1:]]:  # a new frame takes ids away
+            body.set_frame(body.parent.add_frame())
+            body.alt.type = body.ialt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+            body.explicitinertial, body.mass, body.fullinertia = True, model.body_mass[i], [np.nan] * 6
+            for part in ("pos", "quat", "ipos", "iquat", "inertia"):
+                setattr(body, part, getattr(model, f"body_{part}")[i])
 
     def body_mass(self, name: str, scale: float) -> None:
-        for geom in self.spec.body(name).geoms:
-            geom.mass *= scale
+        self.spec.body(name).mass *= scale
+        self.spec.body(name).inertia *= scale
 
     def actuator_gain(self, name: str, scale: float) -> None:
         self.spec.actuator(name).gainprm[0] *= scale

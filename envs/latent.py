@@ -28,6 +28,9 @@ class Latent:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
+        for part in ("low", "high", "drift"):
+            if isinstance(value := getattr(self, part), bool) or not isinstance(value, int | float | np.number):
+                raise InputError(f"{part} of latent {self.name} was {value!r}; it must be a number")
         rules = {
             "uniform": ("low < high", True),
             "loguniform": ("0 < low < high", self.low > 0),

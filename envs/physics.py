@@ -13,9 +13,10 @@ from mujoco import rollout
 from numpy.typing import ArrayLike, NDArray
 
 from deconfounded.envs import render
-from deconfounded.envs.edits import Edit, ModelEdit, SpecEdit
+from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.noise import ProcessNoise, columns
 from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.handles import Handle
 from deconfounded.envs.task import Renderer, Simulator, Task
 
@@ -46,11 +47,14 @@ class Physics(Simulator):
         self._threads = threads if threads > 1 else 0
         self._pools = {size: Handle(partial(rollout.Rollout, nthread=size)) for size in {0, self._threads}}
         self._datas = [mujoco.MjData(model) for _ in range(max(threads, 1))]
+        self._warned = [data.warning.number for data in self._datas]  # views of MuJoCo's counts of warnings, by kind
+        self._quiet = [np.zeros_like(warned).tobytes() for warned in self._warned]
+        self._timestep = float(model.opt.timestep)
         self._edits = [ModelEdit(edited, model, self._datas[0]) for edited in self.models]
         self._buffer: Array = np.empty(0)
 
     def __getstate__(self) -> dict[str, Any]:
-        local = ("_threads", "_pools", "_datas", "_edits", "_buffer")
+        local = ("_threads", "_pools", "_datas", "_warned", "_quiet", "_edits", "_buffer")
         return {name: value for name, value in vars(self).items() if name not in local}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -84,18 +88,58 @@ class Physics(Simulator):
         threads = self._threads if n > 1 else 0
         # Arrays are float64 and contiguous already. There is no warm start: the solver starts from scratch in every
         # control step, so that the next state is a function of this state alone.
-        self._pools[threads]().rollout(
-            models,
-            self._datas[: max(threads, 1)],
-            np.ascontiguousarray(state),
-            control,
-            nstep=steps,
-            state=out,
-            sensordata=np.empty((n, steps, models[0].nsensordata)),
-            skip_checks=True,
-            chunk_size=max(1, n // (2 * max(threads, 1))),  # two chunks a thread: each hand-over takes time
-        )
+        try:
+            self._pools[threads]().rollout(
+                models,
+                self._datas[: max(threads, 1)],
+                np.ascontiguousarray(state),
+                control,
+                nstep=steps,
+                state=out,
+                sensordata=np.empty((n, steps, models[0].nsensordata)),
+                skip_checks=True,
+                chunk_size=max(1, n // (2 * max(threads, 1))),  # two chunks a thread: each hand-over takes time
+            )
+        except mujoco.FatalError as error:  # too little memory for the solver, for example
+            raise InputError(f"the physics of {self.task.name} failed: {error}") from None
+        self._check_stability(models, state, control, rows, out)
         return out
+
+    def _check_stability(
+        self, models: list[mujoco.MjModel], state: Array, control: Array, rows: NDArray[np.int64] | None, out: Array
+    ) -> None:
+        """Call the task's `failed` where MuJoCo warned: it starts anew from qpos0, or drops contacts, and goes on.
+
+        A rollout stops at a warning, so that time stands still or is set back. There are two exceptions: the only
+        substep of an episode's first step, and full buffers in the last substep of a step, of which MuJoCo's counts
+        cover the environments that each thread stepped last.
+        """
+        steps, advanced = out.shape[1], out[:, -1, 0] - state[:, 0]
+        least, quiet = (steps - 0.5) * self._timestep, [warned.tobytes() for warned in self._warned] == self._quiet
+        if quiet and steps > 1 and advanced[advanced.argmin()] > least:  # argmin is quick, and finds NaN
+            return
+        doubtful = ~(advanced > least) | (steps == 1) & (state[:, 0] == 0) | (not quiet)
+        doubtful |= ~(abs(control).max((1, 2), initial=0) <= mujoco.mjMAXVAL)
+        for warned in self._warned:
+            warned[:] = 0
+        for i in np.flatnonzero(doubtful).tolist():
+            data = mujoco.MjData(models[i])
+            mujoco.mj_setState(models[i], data, np.ascontiguousarray(state[i]), STATE.value)
+            for ctrl in control[i]:
+                data.ctrl[:], time = ctrl, data.time
+                mujoco.mj_step(models[i], data)
+                if (kinds := np.flatnonzero(data.warning.number)).size:
+                    text = mujoco.mju_warningText(int(kinds[0]), int(data.warning.lastinfo[kinds[0]]))
+                    where = self._where(i if rows is None else int(rows[i]), time)
+                    message = f"the physics of {self.task.name} failed in {where}: {text}"
+                    self._mujoco_task.failed(state[i], out[i, -1], message)
+                    break
+
+    def _where(self, i: int, time: float) -> str:
+        """The step of environment i at this time, and its theta, for errors."""
+        named = zip(self.task.latents, self.theta[i], strict=True)
+        theta = ", ".join(f"{latent.name} {value:g} {latent.unit}".rstrip() for latent, value in named)
+        return f"step {int(time / self._mujoco_task.control_dt + 1e-6) + 1} of an episode with {theta}"
 
 
 class MujocoTask(Task):
@@ -116,6 +160,10 @@ class MujocoTask(Task):
     @abstractmethod
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         """Set theta [L] in a model."""
+
+    def failed(self, before: Array, after: Array, message: str) -> None:
+        """MuJoCo could not go on from state `before` [S]: raise InputError with its message, or set `after` [S]."""
+        raise InputError(message)
 
     def control(self, action: Array) -> Array:
         """Action [..., A] in [-1, 1] -> MuJoCo's ctrl [..., nu]; by default middle + swing * action, of `controls`."""
@@ -187,8 +235,11 @@ class MujocoTask(Task):
     def renderer(self, theta: Array) -> Renderer:
         spec = self.spec()
         self.decorate(spec)
-        self.apply_latent(SpecEdit(spec), theta)
-        return render.MujocoRenderer(spec.compile())
+        model = spec.compile()
+        edit = ModelEdit(model, copy.copy(model), mujoco.MjData(model))
+        self.apply_latent(edit, theta)
+        edit.finish()
+        return render.MujocoRenderer(model)
 
     def sample_noise(self, rng: Streams) -> Array:
         """Unit normal noise: of the process first, then a column for each reading."""

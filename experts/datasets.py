@@ -3,12 +3,14 @@
 import os
 import warnings
 from collections.abc import Callable
+from operator import index
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import gymnasium
 import numpy as np
+from gymnasium import spaces
 
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
@@ -82,9 +84,15 @@ def write(
 def read(source: Path | str) -> tuple[Trials, Array | None]:
     """Trials of a data set's folder, and its thetas [B, E, L], for scoring alone, or None if it has none.
 
-    Raises InputError if there is no data set, or if its episodes' metadata do not name their trial.
+    Observations of one number are one column, discrete ones are one-hot. Raises InputError if there is no data set, if
+    its episodes' metadata do not name their trial, and for what cannot be [B, E, T + 1, O] and [B, E, T, A].
     """
-    import minari
+    if not isinstance(source, str | Path):
+        raise InputError(f"a data set was {source!r}; it must be the path of its folder")
+    try:
+        import minari
+    except ModuleNotFoundError:
+        raise InputError(f"{source} needs Minari; `pip install deconfounded-imitation[data]` brings it") from None
 
     folders = [file.parent for file in sorted(Path(source).rglob("metadata.json")) if file.parent.name == "data"]
     if len(folders) != 1:
@@ -93,26 +101,53 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
         dataset = minari.MinariDataset(folders[0])
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
         episodes = list(dataset.iterate_episodes())
-    except InputError:
-        raise
+        named = [entry for entry in metadata if {"trial", "episode"} <= set(entry)]
+        places = [(index(entry["trial"]), index(entry["episode"])) for entry in named]
+        t = int(dataset.storage.metadata.get(HORIZON, max((len(episode.rewards) for episode in episodes), default=0)))
+        theta = [np.asarray(entry["theta"], float) for entry in metadata if entry.get("theta") is not None]
     except Exception as error:
         raise InputError(f"the data set in {source} cannot be read: {' '.join(str(error).split())}") from None
-    if not episodes or any("trial" not in entry or "episode" not in entry for entry in metadata):
+    if not places or len(places) < len(metadata):
         raise InputError(f"episodes of {source} do not say which `trial` and `episode` they are, in their metadata")
-    places = [(int(entry["trial"]), int(entry["episode"])) for entry in metadata]
     b, e = (1 + max(numbers) for numbers in zip(*places, strict=True))
-    if len(set(places)) != b * e or len(places) != b * e:
-        raise InputError(f"{source} holds {len(places)} episodes; every trial of {b} must have each of {e} once")
-    t = int(dataset.storage.metadata.get(HORIZON, max(len(episode.rewards) for episode in episodes)))
-    width, n_actions = action_sizes(dataset.action_space)
-    obs = np.zeros((b, e, t + 1, np.shape(episodes[0].observations)[-1]), np.float32)
-    action, mask = np.zeros((b, e, t, width), np.float32), np.zeros((b, e, t), bool)
-    for at, episode in zip(places, episodes, strict=True):
+    if sorted(places) != [(i, j) for i in range(b) for j in range(e)]:
+        raise InputError(f"{source} holds {len(metadata)} episodes; every trial of {b} must have each of {e} once")
+    if (longest := max(len(episode.rewards) for episode in episodes)) > t:
+        raise InputError(f"an episode of {source} has {longest} steps; its {HORIZON}, {t}, must be at least that")
+    if len({value.shape for value in theta}) > 1:
+        raise InputError(f"thetas of {source} are of several shapes; each must have a number for each latent")
+    obs, action = [np.zeros(0)] * len(metadata), [np.zeros(0)] * len(metadata)
+    mask = np.zeros((b, e, t), bool)
+    for episode, (i, j) in zip(episodes, places, strict=True):
         n = len(episode.rewards)
-        obs[at][: n + 1], obs[at][n + 1 :] = episode.observations, episode.observations[-1]
-        action[at][:n] = np.reshape(episode.actions, (n, width))
-        mask[at][:n] = True
-    thetas = {at: entry.get("theta") for at, entry in zip(places, metadata, strict=True)}
-    complete = all(value is not None for value in thetas.values())
-    theta = np.array([[thetas[i, j] for j in range(e)] for i in range(b)]) if complete else None
-    return Trials(obs, action, mask, n_actions), theta
+        mask[i, j, :n] = True
+        of = f"of episode {j} of trial {i} in {source}"
+        seen = _rows(f"observations {of}", episode.observations, dataset.observation_space, n + 1, True)
+        obs[i * e + j] = np.pad(seen, ((0, t - n), (0, 0)))
+        done = _rows(f"actions {of}", episode.actions, dataset.action_space, n, False)
+        action[i * e + j] = np.pad(done, ((0, t - n), (0, 0)))
+    _, n_actions = action_sizes(dataset.action_space)
+    trials = Trials(np.reshape(obs, (b, e, t + 1, -1)), np.reshape(action, (b, e, t, -1)), mask, n_actions)
+    if len(theta) < len(metadata):
+        return trials, None
+    return trials, np.stack([theta[places.index((i, j))] for i in range(b) for j in range(e)]).reshape(b, e, -1)
+
+
+def _rows(what: str, values: Any, space: spaces.Space[Any], n: int, observed: bool) -> Array:
+    """n values in a space -> [n, K]. Raises InputError for values and spaces that are not one row a step.
+
+    observed: a discrete value is then one-hot, and else, as an action, one column.
+    """
+    axes = (0, 1) if observed else (1,)
+    box = isinstance(space, spaces.Box) and len(space.shape) in axes
+    if not box and not (isinstance(space, spaces.Discrete) and space.start == 0):
+        right = "Box of one axis or none" if observed else "Box(-1, 1, (A,))"
+        raise InputError(f"{what} are of {space}; they must be of {right}, or Discrete from 0 up")
+    if np.shape(values) != (n, *space.shape):  # type: ignore[misc]
+        raise InputError(f"{what} have shape {np.shape(values)}; it must be {(n, *space.shape)}")  # type: ignore[misc]
+    rows = np.reshape(values, (n, -1))
+    if not (observed and isinstance(space, spaces.Discrete)):
+        return rows
+    if not np.isin(rows, np.arange(space.n)).all():
+        raise InputError(f"{what} hold a number that is not one of 0..{space.n - 1}")
+    return np.eye(int(space.n))[rows[:, 0].astype(int)]

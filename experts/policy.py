@@ -173,6 +173,8 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
             raise InputError(f"expert weights at {file} lack a whole layer {i}; {remedy}")
         if weight.shape[1] != width or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise InputError(f"layer {i} of {file} takes {weight.shape[1]} finite inputs, not {width}; {remedy}")
+        if weight.dtype.kind != "f" or bias.dtype.kind != "f":
+            raise InputError(f"layer {i} of {file} is of {weight.dtype} and {bias.dtype}, not of float32; {remedy}")
         width = len(bias)
     if width != task.action_width:
         raise InputError(f"expert weights at {file} give {width} actions, not {task.action_width}; {remedy}")

@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from deconfounded.envs.streams import Array, Mask, Obs, Streams, generators, unseeded
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
+from deconfounded.envs.support.numbers import check_number, is_seed
 from deconfounded.envs.support.spaces import action_sizes
+from deconfounded.experts.arrays import LARGEST, check_rounding, numbers, padded, size
 
 if TYPE_CHECKING:
     from deconfounded.envs.batch import BatchEnv
@@ -31,7 +33,8 @@ class Trials:
 
     obs [B, E, T + 1, O] float32; action [B, E, T, A] float32; mask [B, E, T] bool, whether step t took place (False
     once an episode has ended early); actions: the number of discrete actions, or 0 for actions in [-1, 1].
-    Raises InputError for shapes that do not fit each other, NaN, or invalid actions.
+    What is given for steps that did not take place is replaced: by the observation before them, and by actions of 0.
+    Raises InputError for shapes that do not fit each other, NaN, invalid actions, and values that float32 would lose.
     """
 
     obs: NDArray[np.float32]
@@ -40,29 +43,40 @@ class Trials:
     actions: int = 0
 
     def __post_init__(self) -> None:
-        for name, dtype in (("obs", np.float32), ("action", np.float32), ("mask", bool)):
-            try:
-                array = np.array(getattr(self, name), dtype)
-            except (TypeError, ValueError) as error:
-                raise InputError(f"{name} of Trials must be an array of numbers ({error})") from None
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        if not isinstance(self.actions, int | np.integer) or self.actions < 0:
+        given = {name: numbers(name, getattr(self, name)) for name in ("obs", "action", "mask")}
+        obs, action, mask = given.values()
+        if mask.dtype != bool and not np.isin(mask, (0, 1)).all():
+            raise InputError("mask of Trials held numbers other than 0 and 1; it must be bool")
+        if not isinstance(self.actions, int | np.integer) or isinstance(self.actions, bool) or self.actions < 0:
             raise InputError(f"actions of Trials was {self.actions!r}; it must be how many there are, or 0")
-        b, e, t = self.mask.shape if self.mask.ndim == 3 else (0, 0, 0)
-        if self.obs.shape[:-1] != (b, e, t + 1) or self.action.shape[:-1] != (b, e, t):
+        b, e, t = mask.shape if mask.ndim == 3 else (0, 0, 0)
+        fit = obs.shape[:-1] == (b, e, t + 1) and action.shape[:-1] == (b, e, t)
+        if not fit or 0 in (obs.shape[-1], action.shape[-1]):
             raise InputError(
-                f"Trials of obs {self.obs.shape}, action {self.action.shape}, mask {self.mask.shape}; they must be"
+                f"Trials of obs {obs.shape}, action {action.shape}, mask {mask.shape}; they must be"
                 " [B, E, T + 1, O], [B, E, T, A] and [B, E, T]"
             )
-        if not (np.isfinite(self.obs).all() and np.isfinite(self.action).all()):
-            raise InputError("Trials held NaN or infinity; every observation and action must be finite")
-        if not self.mask.any():
+        with np.errstate(over="ignore"):  # infinity is refused
+            action = action.astype(np.float32)
+        if not mask.any():
             raise InputError("Trials held no step that took place; their mask must be True somewhere")
-        if self.actions and not np.isin(self.action, np.arange(self.actions)).all():
+        mask = mask.astype(bool)
+        if not mask.all():
+            obs, action = padded(obs, mask), np.where(mask[..., None], action, 0)
+        if not (np.isfinite(obs).all() and np.isfinite(action).all()):
+            raise InputError("Trials held NaN or infinity; every observation and action must be finite")
+        if (far := size(obs)) > LARGEST:
+            raise InputError(f"Trials held an observation of {far:g}; they must be at most {LARGEST:g} in size")
+        if self.actions and not np.isin(action, np.arange(self.actions)).all():
             raise InputError(f"Trials held an action that is not one of 0..{self.actions - 1}")
-        if not self.actions and (far := float(np.abs(self.action).max())) > 1:
-            raise InputError(f"Trials held an action of size {far:g}; actions must be in [-1, 1], or `actions` given")
+        if not self.actions and (far := size(action)) > 1:
+            raise InputError(f"Trials held an action of size {far:.9g}; actions must be in [-1, 1], or `actions` given")
+        if not np.can_cast(obs.dtype, np.float32):
+            check_rounding(obs, mask)
+        for name, array, dtype in (("obs", obs, np.float32), ("action", action, np.float32), ("mask", mask, bool)):
+            kept = np.array(array, dtype)
+            kept.setflags(write=False)
+            object.__setattr__(self, name, kept)
 
     def __len__(self) -> int:
         return len(self.mask)
@@ -182,10 +196,12 @@ def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
 
 def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
     """The environments' seeds for n trials, in equal groups. Raises InputError where n is no multiple of the seeds."""
-    seeds = [int(seed)] if isinstance(seed, int | np.integer) else [int(first) for first in seed]
+    seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes) else [seed]
+    if not seeds or not all(is_seed(first) for first in seeds):
+        raise InputError(f"seed was {seed!r}; it must be a whole number from 0 up, or one for each group of trials")
     if n % len(seeds):
         raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
-    return [first + i for first in seeds for i in range(n // len(seeds))]
+    return [int(first) + i for first in seeds for i in range(n // len(seeds))]
 
 
 class Rollout(NamedTuple):
@@ -206,6 +222,7 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     trials, each of which is the same, bit for bit, as it is alone. theta [N, L]: None: drawn from p(theta).
     """
     task, n = env.task, env.n
+    check_number("episodes", episodes)
     each = trial_seeds(n, seed)
     seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)

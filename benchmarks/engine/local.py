@@ -16,7 +16,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine import progress
 from deconfounded.benchmarks.engine.guest import die_with_parent
-from deconfounded.benchmarks.engine.scheduler import Engine, Some
+from deconfounded.benchmarks.engine.scheduler import Engine, Some, run_job
 from deconfounded.envs.physics import cores
 
 
@@ -66,7 +66,7 @@ class Local(Engine):
             self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, (self._ticks,))
         with self._ended():
             with inherited():
-                futures = {self._executor.submit(job.run): job for job in jobs}
+                futures = {self._executor.submit(run_job, job): job for job in jobs}
             waiting = set(futures)
             while waiting:
                 while not self._ticks.empty():

@@ -16,6 +16,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.engine.store import Finished, read
+from deconfounded.envs.support.errors import InputError, error_line
 
 
 class Work(Protocol):
@@ -31,6 +32,14 @@ class Work(Protocol):
 
 
 Some = TypeVar("Some", bound=Work)
+
+
+def run_job(job: Work) -> str:
+    """The job's line. Raises InputError where code from outside raises SystemExit, which would end the process."""
+    try:
+        return job.run()
+    except SystemExit as error:
+        raise InputError(f"the job was ended by {error_line(error)}") from None
 
 
 Run = Callable[[list[Some], Callable[[int], None], Callable[[Some, str | Exception], None]], None]

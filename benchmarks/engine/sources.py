@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 from deconfounded import envs
 from deconfounded.envs.support import outside
 
+MODELS = ("include", "model")  # MJCF elements that name further MJCF
 ROOT = Path(__file__).resolve().parents[2]
 OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
 LIBRARIES = tuple(
@@ -39,22 +40,24 @@ def is_ours(file: Path) -> bool:
 def closure(files: Iterable[Path]) -> set[Path]:
     """The Python files given, and the files outside of this package that they import, directly or not.
 
-    A module is looked for beside the file that imports it or, if that file is in a package, in the same package.
+    A module is looked for where the imports of a file given start, which is in the path when it runs, and of the file
+    that imports it; but in a folder of installed libraries only in the same package.
     """
     reached: set[Path] = set()
     left = [file.resolve() for file in files]
+    roots = frozenset(_package(file)[0] for file in left)
     while left:
         file = left.pop()
         if file not in reached and not is_ours(file):
             reached.add(file)
-            left += _imports(file, file.stat().st_mtime_ns)
+            left += _imports(file, file.stat().st_mtime_ns, roots)
     return reached
 
 
 @cache
-def _imports(file: Path, changed: int) -> tuple[Path, ...]:
-    """Files beside a file that it imports; `changed`, its time stamp, is there for the cache."""
-    root, package = _package(file)
+def _imports(file: Path, changed: int, roots: frozenset[Path]) -> tuple[Path, ...]:
+    """Files that a file imports, of its own root or of `roots`; `changed`, its time stamp, is there for the cache."""
+    own, package = _package(file)
     imported: set[Path] = set()
     for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.Import):
@@ -65,10 +68,10 @@ def _imports(file: Path, changed: int) -> tuple[Path, ...]:
             names = [module, *(f"{module}.{alias.name}" for alias in node.names)]
         else:
             continue
-        for name in names:
-            parts = name.split(".")
-            if not package or parts[0] == package[0]:
-                imported |= set(_modules(root, parts))
+        for parts in (name.split(".") for name in names):
+            for root in roots | {own}:
+                if root not in LIBRARIES or parts[0] in package[:1]:
+                    imported |= set(_modules(root, parts))
     return tuple(imported)
 
 
@@ -90,25 +93,41 @@ def _modules(root: Path, parts: list[str]) -> Iterator[Path]:
                 yield file
 
 
-def mjcf(file: Path) -> set[Path]:
-    """An MJCF file, and the files that it includes or takes meshes, textures and height fields from."""
-    if not file.is_file():
-        return set()
-    named = {file}
-    try:
-        tree = ElementTree.fromstring(file.read_bytes())
-    except ElementTree.ParseError:  # MuJoCo says what is wrong with it
-        return named
-    compiler = {key: value for element in tree.iter("compiler") for key, value in element.items()}
-    for element in tree.iter():
-        if name := element.get("file"):
-            if element.tag in ("include", "model"):
-                named |= mjcf(file.parent / name)
-                continue
-            kind = "meshdir" if element.tag in ("mesh", "skin") else "texturedir"
-            asset = file.parent / compiler.get(kind, compiler.get("assetdir", "")) / name
-            named |= {asset} if asset.is_file() else set()
-    return named
+def mjcf(*files: Path) -> set[Path]:
+    """MJCF files, and the files that they include or name: models, meshes, textures, height fields.
+
+    A name is looked for in every folder that MuJoCo may look in: there may be a file too many, but none is missing.
+    """
+    reached: set[Path] = set()
+    elements: list[ElementTree.Element] = []
+    left = list(files)
+    while left:
+        file = Path(os.path.normpath(left.pop()))
+        if file in reached or not file.is_file():
+            continue
+        reached.add(file)
+        try:
+            elements += ElementTree.fromstring(file.read_bytes()).iter()
+        except ElementTree.ParseError:  # MuJoCo says what is wrong with it
+            continue
+        folders = {one.parent for one in reached}
+        left += [
+            folder / element.get("file", "") for element in elements for folder in folders if element.tag in MODELS
+        ]
+    below = {element.get(kind, "") for element in elements for kind in ("meshdir", "texturedir", "assetdir")}
+    names = {value for element in elements for key, value in element.items() if key.startswith("file")}
+    names |= {Path(name).name for name in names}  # strippath
+    places = (file.parent / folder / name for file in tuple(reached) for folder in below for name in names)
+    return reached | {Path(os.path.normpath(place)) for place in places if place.is_file()}
+
+
+@cache
+def _named(file: Path, changed: int) -> tuple[Path, ...]:
+    """MJCF files that a Python file names, beside it or in a folder there; `changed` as above."""
+    texts = (node.value for node in ast.walk(ast.parse(file.read_bytes())) if isinstance(node, ast.Constant))
+    names = [text for text in texts if isinstance(text, str) and text.endswith(".xml") and "\0" not in text]
+    places = (folder / name for name in names for folder in (file.parent, *file.parent.glob("*/")))
+    return tuple(place for place in places if place.is_file())
 
 
 def of_task(task: envs.Task) -> set[Path]:
@@ -117,7 +136,9 @@ def of_task(task: envs.Task) -> set[Path]:
     own = {file for file in classes if not any(file.is_relative_to(folder) for folder in LIBRARIES)}
     if not own:
         return set()
-    return closure(own) | mjcf(task.home / f"{task.name}.xml")
+    files = closure(own)
+    named = [model for file in files for model in _named(file, file.stat().st_mtime_ns)]
+    return files | mjcf(task.home / f"{task.name}.xml", *named)
 
 
 def of_reference(reference: str) -> set[Path]:

@@ -20,6 +20,7 @@ from ray.exceptions import RayError
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, progress, sources
 from deconfounded.benchmarks.engine.jobs import Job
+from deconfounded.benchmarks.engine.scheduler import run_job
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
@@ -51,7 +52,7 @@ def work(
         courier = Courier(folder, number, mailbox)
         progress.tell(courier)
         try:
-            told = job.run()
+            told = run_job(job)
         finally:
             courier.over.set()
         left = {str(file.relative_to(folder)): file for file in folder.rglob("*") if file.is_file()}

@@ -12,8 +12,8 @@ from deconfounded.envs.streams import Array
 
 NOTE = (
     "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Opponents were"
-    " tuned on two of these tasks, with other seeds, to score best. naive_rnn was not: trained less it clones less well"
-    " and scores higher, see opponents.md."
+    " tuned on two of these tasks, with other seeds, to score best. naive_rnn kept its preset, though what else was"
+    " tried scores higher, see opponents.md."
 )
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",

@@ -32,8 +32,11 @@ def listed(rng: Rngs) -> list[np.random.Generator]:
 
 
 def drawn(source: Source) -> Trials:
-    """The trials, or fresh ones."""
-    return source if isinstance(source, Trials) else source()
+    """The trials, or fresh ones. Raises InputError for anything else, None, say."""
+    trials = source() if callable(source) else source
+    if not isinstance(trials, Trials):
+        raise InputError(f"trials were {trials!r}; they must be Trials, or a function that returns Trials")
+    return trials
 
 
 class Draws:
@@ -80,6 +83,7 @@ class Signature:
     @staticmethod
     def of(trials: Trials) -> Signature:
         """Read off data. Observations that hold only 0 and 1 are modelled as Bernoulli, others as Gaussian."""
+        trials = drawn(trials)
         binary = bool(np.isin(trials.obs, (0, 1)).all())
         return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
 
@@ -131,6 +135,7 @@ class Batch:
     @staticmethod
     def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
         """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
+        trials = drawn(trials)
         if len(trials) % seeds:
             raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
         mask = trials.mask.reshape(len(trials), -1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import torch
 
-from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.data import Batch, Draws, drawn
 from deconfounded.deconf.core.models import LatentModel
 from deconfounded.experts.rollout import Trials
 
@@ -19,6 +19,7 @@ SHARES = 11  # 0, .1, ..., 1
 
 def apart(trials: Trials) -> Trials:
     """Each episode as a trial of its own: [B, E, T] -> [B E, 1, T]."""
+    trials = drawn(trials)
     obs, action = (x.reshape(-1, 1, *x.shape[2:]) for x in (trials.obs, trials.action))
     return Trials(obs, action, trials.mask.reshape(-1, 1, trials.mask.shape[2]), trials.actions)
 

@@ -6,6 +6,7 @@ that one's numbers are the same, bit for bit, whatever runs beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.envs.support.errors import InputError
 
 SMALL = 16**3  # multiplications; torch gives oneDNN a product of more than that
 
@@ -78,7 +80,9 @@ class Adam:
     """Adam over stacked parameters, each seed's gradient clipped to norm 1, optionally cooled along a cosine."""
 
     def __init__(self, modules: Iterable[nn.Module], learning_rate: float, updates: int | None = None) -> None:
+        modules = list(modules)
         self.parameters = list(dict.fromkeys(p for module in modules for p in module.parameters()))  # some are shared
+        self._trained = ", ".join(type(module).__name__ for module in modules)
         self._adam = torch.optim.Adam(self.parameters, learning_rate)
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
 
@@ -94,19 +98,32 @@ class Adam:
             self._schedule.load_state_dict(state["schedule"])
 
     def step(self, loss: Tensor) -> None:
-        """One update on losses [S]."""
+        """One update on losses [S]. Raises InputError, which names the update, where it would make parameters NaN."""
         self._adam.zero_grad()
         loss.sum().backward()
         with torch.no_grad():
             # Summed one by one: a sum over a stack takes another order for one seed than for several.
-            squares = sum(p.grad.flatten(1).square().sum(1) for p in self.parameters if p.grad is not None)
-            scale = (1 / (torch.as_tensor(squares).sqrt() + 1e-6)).clamp(max=1)
+            squares = torch.as_tensor(
+                sum(p.grad.flatten(1).square().sum(1) for p in self.parameters if p.grad is not None)
+            )
+            if not math.isfinite(sum(loss.flatten().tolist())) or math.isnan(sum(squares.flatten().tolist())):
+                self._fail(loss)
+            scale = (1 / (squares.sqrt() + 1e-6)).clamp(max=1)
             for p in self.parameters:
                 if p.grad is not None:
                     p.grad *= scale.reshape(-1, *[1] * (p.dim() - 1))
         self._adam.step()
         if self._schedule is not None:
             self._schedule.step()
+
+    def _fail(self, loss: Tensor) -> None:
+        update = 1 + max((int(state["step"]) for state in self._adam.state.values()), default=0)
+        value = next((x for x in loss.flatten().tolist() if not math.isfinite(x)), None)
+        what = "its gradient was NaN" if value is None else f"it was {value}"
+        raise InputError(
+            f"the loss of {self._trained} failed in update {update}: {what}; a lower learning rate may help, or data of"
+            " about unit size"
+        )
 
 
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

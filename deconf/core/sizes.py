@@ -1,4 +1,29 @@
-"""How large networks are, by how much is observed."""
+"""How large networks are, by how much is observed, and what configurations can hold."""
+
+from __future__ import annotations
+
+import math
+from typing import get_args, get_type_hints
+
+from deconfounded.envs.support.errors import InputError
 
 MANY, WIDE = 16, 128  # from so many observed numbers on, all methods' networks on control are so wide
 SPACIOUS = 8  # dimensions of theta_hat there: with 4, one seed of three read it less well on ant_goal and the walker
+
+
+class Configuration:
+    """Base of a method's configuration, a dataclass. Raises InputError for a value of another type, or below its least.
+
+    The least is 1, but 0 for numbers that are not whole, for updates and for grids.
+    """
+
+    def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self)).items():
+            value, kinds = getattr(self, name), get_args(kind) or (kind,)
+            valid = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
+            least = 0 if float in kinds or name.endswith(("updates", "grid")) else 1
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            if not valid or (number and not least <= value < math.inf):
+                right = " or ".join(getattr(one, "__name__", repr(one)) for one in kinds)
+                limit = f", from {least} up" if {int, float} & set(kinds) else ""
+                raise InputError(f"{name} of {type(self).__name__} was {value!r}; it must be {right}{limit}")

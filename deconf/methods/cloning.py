@@ -13,6 +13,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
@@ -20,7 +21,7 @@ from deconfounded.experts.rollout import Trials
 
 
 @dataclass(frozen=True)
-class CloningConfig:
+class CloningConfig(Configuration):
     """Widths and amounts, for each seed; batch counts steps."""
 
     width: int = 64

@@ -29,6 +29,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed,
 from deconfounded.deconf.core.drift import apart
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -42,7 +43,7 @@ Returns trials, and beside them what the expert would have done at each step [B,
 
 
 @dataclass(frozen=True)
-class DaggerConfig:
+class DaggerConfig(Configuration):
     """Widths and amounts, for each seed. Each round queries on fresh roll-outs of the policy so far."""
 
     width: int = 64

@@ -24,7 +24,7 @@ from deconfounded.deconf.core.models import LatentModel, final_belief
 from deconfounded.deconf.core.models import new as new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -36,7 +36,7 @@ Explore = Callable[[Agent | None], Trials]
 
 
 @dataclass(frozen=True)
-class DeconfoundedConfig:
+class DeconfoundedConfig(Configuration):
     """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy.
 
     The discrete model has no bound to weigh and no step to leave out: beta, warm_up, inference_steps and fit_prior are
@@ -169,12 +169,10 @@ def train(
     what draws them: fresh ones every round, if config does not accumulate.
     explore: called once a round. Raises InputError if the two disagree.
     """
-    if config.rounds < 1:
-        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
     each = apart if config.drifts else lambda trials: trials
-    shown, first = each(drawn(trials)), explore(None)
+    shown, first = each(drawn(trials)), drawn(lambda: explore(None))
     episodes, first = first.mask.shape[1], each(first)
     signature = Signature.of(shown)
     if Signature.of(first) != signature:

@@ -19,7 +19,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed,
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -29,7 +29,7 @@ from deconfounded.experts.rollout import Trials
 
 
 @dataclass(frozen=True)
-class MeanConfig:
+class MeanConfig(Configuration):
     """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy."""
 
     model: Literal["evidence", "gru"] = "gru"
@@ -125,10 +125,8 @@ def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tens
 def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
     """trials: of the expert, without theta, in as many equal groups as there are generators in rng.
 
-    explore: called once a round. Raises InputError for less than one round.
+    explore: called once a round.
     """
-    if config.rounds < 1:
-        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
     first, draws = explore(None), Draws(rngs, device)
     expert, seen = Batch.of(trials, len(rngs), device), Batch.of(first, len(rngs), device)

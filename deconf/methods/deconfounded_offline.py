@@ -19,7 +19,7 @@ from deconfounded.deconf.core.drift import apart, choose_kept
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS
+from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -28,7 +28,7 @@ from deconfounded.experts.rollout import Trials
 
 
 @dataclass(frozen=True)
-class OfflineConfig:
+class OfflineConfig(Configuration):
     """Widths and amounts, for each seed. First Eq. (7), then Eq. (6): nothing of the second acts back on the first."""
 
     width: int = 64

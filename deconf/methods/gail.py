@@ -28,6 +28,7 @@ from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
 from deconfounded.envs.support.errors import InputError
@@ -42,7 +43,7 @@ Open = Callable[[int, int], Environments]
 
 
 @dataclass(frozen=True)
-class GailConfig:
+class GailConfig(Configuration):
     """Widths and amounts, for each seed. A round is `steps` in each of `envs`, from new trials; then PPO, then D."""
 
     width: int = 64
@@ -190,10 +191,8 @@ def train(
     trials: of the expert, in as many equal groups as there are generators in rng. environments: to practise in. space:
     of actions.
 
-    Raises InputError for less than one round, or where sb3-contrib is not installed.
+    Raises InputError where sb3-contrib is not installed.
     """
-    if config.rounds < 1:
-        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
     if find_spec("sb3_contrib") is None:
         raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
     from deconfounded.deconf.methods.practice import Player, Practice, new_ppo, numbers

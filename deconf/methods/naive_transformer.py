@@ -21,6 +21,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -28,7 +29,7 @@ from deconfounded.deconf.methods.clones import clone
 
 
 @dataclass(frozen=True)
-class TransformerConfig:
+class TransformerConfig(Configuration):
     """Widths and amounts, for each seed; batch counts trials, shortest is the least share of them an update reads."""
 
     width: int = 64

@@ -15,11 +15,12 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 
 
 @dataclass(frozen=True)
-class RecurrentConfig:
+class RecurrentConfig(Configuration):
     """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
 
     width: int = 64

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -15,7 +16,7 @@ from deconfounded.experts.rollout import ExpertAgent, RandomAgent
 
 
 @dataclass(frozen=True)
-class ExactConfig:
+class ExactConfig(Configuration):
     """grid: values of each latent; 0 where all latents are categories, which have values of their own."""
 
     grid: int = 21

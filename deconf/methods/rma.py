@@ -21,6 +21,7 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -37,7 +38,7 @@ Returns trials, and the encoded theta [B, E, F] of their episodes."""
 
 
 @dataclass(frozen=True)
-class RmaConfig:
+class RmaConfig(Configuration):
     """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation.
 
     Updates are of the student; each round adds roll-outs of the student so far, and later rounds get more updates.

@@ -12,8 +12,10 @@ from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.task import Task
 
+TIERS = (1, 2, 3, None)
 
-def sentence(error: Exception) -> str:
+
+def sentence(error: BaseException) -> str:
     """An error in one line: its message and, unless a check raised it, its type and its place in the source."""
     from_check = isinstance(error, AssertionError) and str(error)
     return " ".join(str(error).split()) if from_check else error_line(error)
@@ -25,12 +27,13 @@ def _part(task: Task, name: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InputError(f"{name} of {task.name}: {sentence(error)}") from error
 
 
 def check_task(task: Task) -> None:
     """Build a task, take a step, then an episode of random actions. Raises InputError that names what does not fit."""
+    _check_numbers(task)
     if isinstance(task, MujocoTask):
         _check_model(task)
     with _part(task, "action_space"):
@@ -42,6 +45,7 @@ def check_task(task: Task) -> None:
     with _part(task, "init_state"):
         state = task.init_state(rng)
     with _part(task, "outcome"):
+        env.simulator.outcome(state[:1], action[:1], np.arange(1))  # alone: a failure in a thread would end the process
         noise = task.sample_noise(rng)[:, 0]
         then = task.apply_noise(env.simulator.outcome(state, action), noise)
     for name, shape, ask in (
@@ -57,6 +61,17 @@ def check_task(task: Task) -> None:
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):
         _check_episodes(task)
+
+
+def _check_numbers(task: Task) -> None:
+    """Amounts that are stated as plain numbers."""
+    least = {"horizon": 1, "episodes": 1, "version": 0, **({"substeps": 1} if isinstance(task, MujocoTask) else {})}
+    for name, low in least.items():
+        value = getattr(task, name)
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
+            raise InputError(f"{name} of {task.name} was {value!r}; it must be a whole number from {low} up")
+    if task.tier not in TIERS or isinstance(task.tier, bool):
+        raise InputError(f"tier of {task.name} was {task.tier!r}; it must be 1, 2, 3 or None")
 
 
 def _check_model(task: MujocoTask) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 class InputError(ValueError):
     """Bad input from outside: one line that says what was given and what would be right."""
 
+    def __str__(self) -> str:
+        return " ".join(super().__str__().split())  # arrays print in several
+
 
 def error_line(error: BaseException) -> str:
     """An error in one line: its message, its type and its place in the source; of an InputError the message alone."""
