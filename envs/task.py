@@ -207,9 +207,10 @@ class Task(ABC):
             raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
         for column, lat in zip(array.T, self.latents, strict=True):
             whole = lat.distribution == "categorical"
-            for bad in column[~((column >= lat.low) & (column <= lat.high)) | whole & (column % 1 != 0)][:1]:
+            bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column % 1 != 0)]
+            if bad.size:
                 right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
-                raise InputError(f"{lat.name} of {self.name} was {bad:g}; it must be {right}")
+                raise InputError(f"{lat.name} of {self.name} was {bad[0]:g}; it must be {right}")
         return array
 
     def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:

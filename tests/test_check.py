@@ -19,6 +19,7 @@ from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks import slippery_walker
+from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
 
@@ -186,6 +187,13 @@ class NoEffect(SlipperyCartpole):
         pass
 
 
+class NoBump(ForkedPath):
+    """A latent of two values."""
+
+    def apply_latent(self, edit: Edit, theta: Array) -> None:
+        pass
+
+
 class InPlaceOnly(SlipperyCartpole):
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         if isinstance(edit, ModelEdit):
@@ -247,6 +255,7 @@ class UnnamedGeom(SlipperyCartpole):
     [
         (WiderNoise, "log_prob_is_the_density_of_the_noise", "log_prob of slippery_cartpole"),
         (NoEffect, "effect", r"thetas .* have the trajectories of "),
+        (NoBump, "effect", r"thetas \[\[1\]\] have the trajectories of \[0\]"),
         (InPlaceOnly, "set_in_place_equals_recompiled", "tendon_frictionloss of models set in place and compiled"),
         (EditsTheNominal, "nominal_model_is_not_touched", "tendon_frictionloss of models of the task"),
         (Leaky, "no_leak", "first observations of theta .* differ"),

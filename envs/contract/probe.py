@@ -29,8 +29,9 @@ def same(left: object, right: object, what: str) -> None:
     a, b = np.asarray(left), np.asarray(right)
     require(a.shape == b.shape, f"{what} differ: their shapes are {a.shape} and {b.shape}")
     places = np.argwhere((a != b) & ((a == a) | (b == b)))
-    for at in places[:1].tolist():
-        first = f"{a[tuple(at)]} and {b[tuple(at)]} at {at}, the first of {len(places)} such places"
+    if len(places):
+        at = tuple(places[0].tolist())
+        first = f"{a[at]} and {b[at]} at {list(at)}, the first of {len(places)} such places"
         raise AssertionError(f"{what} differ: {first}")
 
 
@@ -92,7 +93,8 @@ def gl_works() -> bool:
 def beyond_bounds(task: Task, state: Array) -> str:
     """A message about an observation of states [N, S] that is out of its bounds by more than 1e-3, or ""."""
     for seen, (name, (low, high)) in zip(task.observe(state).T, task.observation.items(), strict=True):
-        for bad in seen[~((seen >= low - 1e-3) & (seen <= high + 1e-3))][:1]:
+        bad = seen[~((seen >= low - 1e-3) & (seen <= high + 1e-3))]
+        if bad.size:
             right = f"its bounds, {low:g} to {high:g}, must be wide enough never to clip"
-            return f"observation {name} of {task.name} was {bad:g}; {right}"
+            return f"observation {name} of {task.name} was {bad[0]:g}; {right}"
     return ""
