@@ -32,7 +32,7 @@ from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
-from deconfounded.deconf.methods import cloning
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -68,7 +68,7 @@ class Witness(ExpertAgent):
         super().reset(rngs)
         if self.dynamics:
             self.beliefs.append(np.exp(self.log_belief))
-            self.log_belief = self.grid.drifted(self.log_belief)
+            self.log_belief = self.grid.predict(self.log_belief)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
@@ -149,7 +149,7 @@ def certify(
 
     demo_env = envs.BatchEnv(task, 2 * trials)
     demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, seed)).trials
-    blind = returns(cloning.train(demos, cloning.CloningConfig(), np.random.default_rng(seed)))
+    blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(seed)))
     done(STAGES[4])
 
     scored = {name: normalise(x, zero, one) for name, x in (("int", interventional), ("cond", conditional))}

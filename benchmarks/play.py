@@ -21,7 +21,7 @@ from deconfounded.benchmarks.console import Parser, run_command
 from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.guest import Stranger
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.methods.cloning import MemorylessAgent
+from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 from deconfounded.envs.support.files import check_file
 from deconfounded.experts import store
 from deconfounded.experts.rollout import Agent

@@ -1,5 +1,5 @@
 """Deconfounded imitation learning: beliefs, methods, exact references.
 
-The first network that is imported sets torch to one thread (`core/nets.py`), since the networks are small and more
-threads make them many times slower; call `torch.set_num_threads` afterwards for networks of your own that are not.
+Importing networks sets torch to one thread (`core/nets.py`), since they are small and many times slower with more
+threads; call `torch.set_num_threads` afterwards for large networks of your own.
 """

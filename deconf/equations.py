@@ -1,8 +1,8 @@
-"""The paper's equations as pure functions, each the only copy: what needs one calls it here.
+"""The paper's equations as pure functions, each implemented here alone.
 
 theta: hidden latent; theta_hat: learned latent; tau_:t = (s_0, a_0, ..., s_t): history. K counts values of theta.
-Arrays and tensors may have more axes in front; losses average over the last one, where `mask` is 1. Eq. (4) is
-the bandit itself: envs/tasks/bandit.py.
+Arrays and tensors may have more axes in front; losses average over the last one, where `mask` is 1. Eq. (4) is the
+bandit: envs/tasks/bandit.py.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torch import Tensor
 
 from deconfounded.envs.streams import Array
 
-Kind = TypeVar("Kind", Array, Tensor)
+Values = TypeVar("Values", Array, Tensor)
 
 
 def imitation_objective(log_expert: Array, taken: NDArray[np.bool_]) -> Array:
     """Eq. (1): sum over a rollout of log pi_exp(a_t | s_t, theta) of the imitator's own actions.
 
-    log_expert [..., T], taken [..., T] (False after an episode's end) -> [...]. The larger, the better. (The paper
-    prints a minus sign inside an objective it maximises.)
+    log_expert [..., T], taken [..., T] (False after an episode's end) -> [...], to maximise. (The paper prints a minus
+    sign inside the objective that it maximises.)
     """
     return np.where(taken, log_expert, 0).sum(-1)
 
@@ -33,11 +33,11 @@ def posterior_policy(log_belief: Array, policy: Array) -> Array:
     return (np.exp(log_belief)[..., None] * policy).sum(-2)
 
 
-def belief_update(log_belief: Kind, log_dynamics: Kind, log_policy: Kind | None = None) -> Kind:
+def belief_update(log_belief: Values, log_dynamics: Values, log_policy: Values | None = None) -> Values:
     """One step of p_int, Eq. (5) and (8), or, given the expert's log-probabilities too, of p_cond, Eq. (3) and (9).
 
     log_belief [..., K], log p(s_{t+1} | s_t, a_t, theta) [..., K], log pi_exp(a_t | s_t, theta) [..., K] ->
-    normalised log-belief [..., K]; of several steps, if those are sums over them.
+    normalised log-belief [..., K]. Sums over several steps update by all of them.
     """
     joint = log_belief + log_dynamics if log_policy is None else log_belief + log_dynamics + log_policy
     if isinstance(joint, Tensor):
@@ -52,12 +52,12 @@ def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean over the last axis of those entries [..., M] whose mask is 1; 0 where none is."""
+    """The mean over the last axis of entries [..., M] whose mask is 1; 0 where there is none."""
     return (x * mask).sum(-1) / mask.sum(-1).clamp(min=1)
 
 
 def inference_loss(log_next: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
-    """Eq. (6) with its sign turned, averaged over steps.
+    """The negative of Eq. (6), averaged over steps.
 
     log_next: log p_psi(s_{t+1} | s_t, a_t, theta_hat) for theta_hat ~ q_phi(. | tau_:t), and kl: of q_phi(. | tau_:t)
     from the prior; all [..., M].
@@ -66,21 +66,21 @@ def inference_loss(log_next: Tensor, kl: Tensor, beta: float, mask: Tensor) -> T
 
 
 def offline_loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
-    """Eq. (7) with its sign turned, averaged over trajectories.
+    """The negative of Eq. (7), averaged over trajectories.
 
-    log_next, log_policy, mask: of the steps of each trajectory, for theta_hat ~ q_phi_off(. | tau_e) [..., B, T]; kl:
-    of q_phi_off(. | tau_e) from the prior [..., B].
+    log_next, log_policy, mask [..., B, T]: of steps, for theta_hat ~ q_phi_off(. | tau_e); kl [..., B]: of
+    q_phi_off(. | tau_e) from the prior.
     """
     return -(((log_next + log_policy) * mask).sum(-1) - beta * kl).mean(-1)
 
 
 def imitation_loss(log_policy: Tensor, mask: Tensor) -> Tensor:
-    """The last line of Algorithm 1: minus log pi_eta(a | s, ...) [..., M], averaged over steps."""
+    """The last line of Algorithm 1: the mean over steps of -log pi_eta(a | s, ...) [..., M]."""
     return -masked_mean(log_policy, mask)
 
 
 def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
-    """Footnote 4: minus log sum_k p(k) prod_t p_psi(s_{t+1} | s_t, a_t, k), a step.
+    """Footnote 4: -log sum_k p(k) prod_t p_psi(s_{t+1} | s_t, a_t, k), divided by the number of steps.
 
     log_prior [..., K], log_next [..., B, T, K], mask [..., B, T] -> [...].
     """

@@ -1,8 +1,8 @@
 """Exact interventional and conditional policies, Eq. (2) to (5), by a posterior over a grid of theta.
 
-The bandit's grid is its five arms, and the posterior a closed form. On MuJoCo each grid value is simulated for one
-control step from the present state, and weighed by the Gaussian process noise. Once evidence is in, nearly all values
-have next to no mass; those are left out of the simulation (`Grid.log_dynamics`).
+The bandit's grid is its five arms, and the posterior has a closed form. On MuJoCo the likelihood of a grid value is the
+density of the process noise about the simulation of one control step. Values of small mass are pruned from the
+simulation (`Grid.log_dynamics`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from deconfounded.envs.task import Simulator
 from deconfounded.experts.policy import Expert, sample_rows
 from deconfounded.experts.rollout import Agent
 
-LEFT_OUT = 1e-4  # of the mass: a value that has less is not simulated
-AT_LEAST = 2
+PRUNE_BELOW = 1e-4  # of the mass: values with less are not simulated
+AT_LEAST = 2  # values that are
 
 
 def log_next(
@@ -31,63 +31,62 @@ def log_next(
     theta: Array,
     rows: NDArray[np.int64] | None = None,
 ) -> Array:
-    """log p(s' | s, a, theta) [M], of its physics and of its readings; but for what is the same for every theta.
+    """log p(s' | s, a, theta) [M], of physics and sensors, up to a constant that does not depend on theta.
 
     state, next_state [M, S], action [M, A], theta [M, L]; rows [M]: the simulator's environment of that theta.
     """
     task = simulator.task
-    told = task.log_sense(next_state, theta)
+    log_prob = task.log_sense(next_state, theta)
     if task.moves_state:
-        told = told + task.log_prob(next_state, simulator.outcome(state, action, rows))
-    return told
+        log_prob = log_prob + task.log_prob(next_state, simulator.outcome(state, action, rows))
+    return log_prob
 
 
 class Grid:
-    """K equally likely thetas (`Task.theta_grid`), and what one transition of each of N environments says of them."""
+    """K equally likely thetas (`Task.theta_grid`), and their likelihoods for transitions of N environments."""
 
     def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
         self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k)
-        self._next = env.task.transition(k) if env.task.drifts else None
+        self._transition = env.task.transition(k) if env.task.drifts else None
         self._simulator = env.task.simulator(len(self.theta))
         for i, theta in enumerate(self.theta):
             self._simulator.set_theta(i, theta)
-        place = np.stack([lat.cdf(self.theta[:, i]) for i, lat in enumerate(env.task.latents)], -1)
-        self._distance = np.abs(place[:, None] - place).sum(-1)
+        quantile = np.stack([lat.cdf(self.theta[:, i]) for i, lat in enumerate(env.task.latents)], -1)
+        self._distance = np.abs(quantile[:, None] - quantile).sum(-1)
 
     def prior(self, n: int) -> Array:
         """Log-belief [N, K] before any evidence."""
         return np.full((n, len(self.theta)), -np.log(len(self.theta)))
 
-    def drifted(self, log_belief: Array) -> Array:
-        """The log-belief [N, K] of the next episode's theta: that of a theta which walks, or else the same."""
-        if self._next is None:
+    def predict(self, log_belief: Array) -> Array:
+        """The log-belief [N, K] about the next episode's theta: the same, unless theta drifts."""
+        if self._transition is None:
             return log_belief
-        return np.log(np.exp(log_belief) @ self._next + 1e-300)
+        return np.log(np.exp(log_belief) @ self._transition + 1e-300)
 
     def log_dynamics(self, state: Array, action: Array, next_state: Array, log_belief: Array | None = None) -> Array:
         """log p(s' | s, a, theta) [N, K]; state, next_state [N, S], action [N, A].
 
-        log_belief [N, K]: where physics has to be simulated, values with less mass than LEFT_OUT are not, but for the
-        two heaviest, which always are; each is given the evidence of the nearest one that is. A value left out keeps
-        its mass that way, and gains when those beside it do: once it has enough, it is simulated again. By Ville's
-        inequality, a theta of the grid that is the true one is ever left out in at most K LEFT_OUT of all trials
-        (.2% for 21 values), since the odds of all others against it are a martingale, K - 1 at first. Without
-        log_belief, or where it leaves nothing out, this is the whole grid, bit for bit.
+        log_belief [N, K]: where physics has to be simulated, values with less mass than PRUNE_BELOW are not, except for
+        the two heaviest; each has the likelihood of the nearest simulated value instead. So a pruned value gains mass
+        when its neighbours do, and is then simulated again. If theta is on the grid, it is ever pruned in at most a
+        share K PRUNE_BELOW of trials (.2% for 21 values): by Ville's inequality, since the odds of all other values
+        against it are a martingale that starts at K - 1. Without log_belief, or where nothing is pruned, this is the
+        whole grid, bit for bit.
         """
         n, k = len(state), len(self.theta)
-        wanted = np.ones((n, k), bool)
-        simulated = isinstance(self.env.task, MujocoTask) and self.env.task.moves_state
-        if log_belief is not None and simulated and k > AT_LEAST:
-            wanted = log_belief >= np.log(LEFT_OUT)
-            np.put_along_axis(wanted, np.argpartition(log_belief, -AT_LEAST)[:, -AT_LEAST:], True, -1)
-        row, value = np.nonzero(wanted)
-        found = np.zeros((n, k))
-        theta = self.theta[value]
-        found[row, value] = log_next(self._simulator, state[row], action[row], next_state[row], theta, value)
-        if (some := ~wanted.all(-1)).any():
-            nearest = np.where(wanted[some, None], self._distance, np.inf).argmin(-1)
-            found[some] = np.take_along_axis(found[some], nearest, -1)
-        return found
+        kept = np.ones((n, k), bool)
+        costly = isinstance(self.env.task, MujocoTask) and self.env.task.moves_state
+        if log_belief is not None and costly and k > AT_LEAST:
+            kept = log_belief >= np.log(PRUNE_BELOW)
+            np.put_along_axis(kept, np.argpartition(log_belief, -AT_LEAST)[:, -AT_LEAST:], True, -1)
+        row, value = np.nonzero(kept)
+        log_prob, theta = np.zeros((n, k)), self.theta[value]
+        log_prob[row, value] = log_next(self._simulator, state[row], action[row], next_state[row], theta, value)
+        if (pruned := ~kept.all(-1)).any():
+            nearest = np.where(kept[pruned, None], self._distance, np.inf).argmin(-1)
+            log_prob[pruned] = np.take_along_axis(log_prob[pruned], nearest, -1)
+        return log_prob
 
     def log_policy(self, obs: Array, action: Array) -> Array:
         """log pi_exp(a | s, theta) [N, K]; obs [N, O], action [N, A]."""
@@ -97,10 +96,10 @@ class Grid:
 
 
 class ExactAgent(Agent):
-    """Samples theta from the grid posterior every step, and acts as the expert of that theta.
+    """Samples theta from the posterior on a grid at every step, and acts as the expert under that theta.
 
-    conditional: count the expert's own probability of the actions taken as evidence too, Eq. (3): the causal delusion.
-    static: take theta to be the same in all episodes, even where it drifts. Reads the environment's state, never its
+    conditional: the posterior takes the agent's actions for evidence too, Eq. (3): the causal delusion. static: it
+    assumes the same theta in all episodes, even where theta drifts. The agent reads the environment's state, not its
     theta.
     """
 
@@ -114,7 +113,7 @@ class ExactAgent(Agent):
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
         if not (self._first or self.static):
-            self.log_belief = self.grid.drifted(self.log_belief)
+            self.log_belief = self.grid.predict(self.log_belief)
         self._first = False
 
     def act(self, obs: NDArray[np.float32]) -> Array:

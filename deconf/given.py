@@ -1,8 +1,8 @@
-"""What a method is handed: the data that it declares that it uses, and nothing else.
+"""The data of a method: the kinds that it declares with `uses`, and nothing else.
 
-Environments, their seeds, theta and the expert are out of its reach: it holds arrays, and a function that asks for
-more of them. A method from outside runs in a process of its own. This prevents accidental leakage, not cheating: files
-on the disk can be read, and the seeds of a run without a salt are public.
+A method has no reference to environments, their seeds, theta or the expert: it holds arrays, and a function that
+requests more of them. A method from outside runs in a process of its own. This prevents accidental leakage, not
+cheating: files can be read, and the seeds of a run without a salt are public.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ FloatArray = NDArray[np.float32]
 
 
 class Ask(Protocol):
-    """Asks for data of a kind; `agent` is rolled out for it. Raises InputError for what was not declared."""
+    """Requests data of a kind; `agent` is rolled out for it. Raises InputError for kinds that were not declared."""
 
-    def __call__(self, kind: str, *what: Any, agent: Agent | None = None) -> Any: ...
+    def __call__(self, kind: str, *details: Any, agent: Agent | None = None) -> Any: ...
 
 
 class Given:
     """The data of one or more seeds, which are trained side by side.
 
     observations: O, the width of an observation. action_space: Box in [-1, 1], or Discrete. episodes: of a trial.
-    horizon: steps of an episode, at most. config: the method's amounts, an object of the class that it declared. rngs:
-    a generator a seed. monitor: what training reports to. Trials are in as many equal groups as there are seeds, one
-    after another. Every method and property raises InputError for what was not declared.
+    horizon: the most steps of an episode. config: the method's configuration, of the class that it declared. rngs: a
+    generator for each seed. monitor: receives progress and checkpoints. Trials are in as many equal groups as there are
+    seeds, one after another. Methods and properties raise InputError for kinds of data that were not declared.
     """
 
     def __init__(
@@ -51,47 +51,47 @@ class Given:
 
     @property
     def rng(self) -> np.random.Generator:
-        """The first seed's random numbers. A method from outside has one seed at a time."""
+        """The first seed's generator. A method from outside has one seed at a time."""
         return self.rngs[0]
 
     @property
     def demonstrations(self) -> Trials:
-        """Expert trials, without theta; the same whenever they are asked for."""
+        """Expert trials, without theta; the same at each request."""
         return self._ask("demonstrations")
 
     @property
     def source(self) -> Trials | Callable[[], Trials]:
-        """The demonstrations; or, where a preset says so, a function that draws fresh ones."""
+        """The demonstrations; or, if the preset says so, a function that draws fresh ones."""
         return (lambda: self._ask("fresh demonstrations")) if self._fresh else self.demonstrations
 
     @property
     def theta(self) -> Array:
-        """The encoded theta [B, E, F] of each demonstration's episodes, about unit size."""
+        """The encoded theta [B, E, F] of the demonstrations' episodes, of about unit scale."""
         return self._ask("theta")
 
     def explore(self, agent: Agent | None = None, trials: int | None = None) -> Trials:
-        """Roll an agent out under fresh thetas; None: random actions. trials: for each seed; None: the preset's."""
+        """Roll out an agent (None: random actions) under fresh thetas. trials: for each seed; None: the preset's."""
         return self._ask("exploration", trials, agent=agent)
 
     def explore_with_theta(self, agent: Agent | None = None) -> tuple[Trials, Array]:
-        """The same, and the encoded theta [B, E, F] of each episode."""
+        """Roll out an agent as in `explore`, with the encoded theta [B, E, F] of each episode."""
         return self._ask("exploration with theta", None, agent=agent)
 
     def query(self, agent: Agent | None = None, trials: int | None = None) -> tuple[Trials, FloatArray]:
-        """Such roll-outs, and what the expert would have done at each step [B, E, T, A]."""
+        """Roll out an agent as in `explore`, with the expert's action at each step [B, E, T, A]."""
         return self._ask("queries", trials, agent=agent)
 
     def environments(self, seed: int, n: int) -> Environments:
-        """n environments of the seed of that index, to explore in step by step, under fresh thetas."""
+        """n environments of the seed of that index, under fresh thetas, for exploration step by step."""
         return Environments(self._ask, self._ask("environments", seed, n), n)
 
     def acting_theta(self) -> Array:
-        """The encoded theta [N, F] of the environments that the agent acts in: for an oracle that is deployed."""
+        """The encoded theta [N, F] of the environments that the agent acts in, for an oracle in deployment."""
         return self._ask("acting theta")
 
     @property
     def environment(self) -> Any:
-        """The environments that evaluation steps, and the expert: for reference policies alone."""
+        """The environments of evaluation, and the expert: for reference policies alone."""
         return self._ask("environment")
 
     def progress(self, share: float, **losses: float) -> None:
@@ -102,7 +102,7 @@ class Given:
 
 
 class Environments:
-    """n environments in trials of several episodes; theta stays for a trial, and is not to be seen."""
+    """n environments, in trials of several episodes under one hidden theta."""
 
     def __init__(self, ask: Ask, number: int, n: int) -> None:
         self._ask, self._number, self.n = ask, number, n
@@ -112,5 +112,5 @@ class Environments:
         return self._ask("reset", self._number)
 
     def step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Actions [n, A] -> what followed [n, O], what to act on next [n, O], which episodes and which trials ended."""
+        """Actions [n, A] -> next observations [n, O], these after resets [n, O], ends of episodes and of trials [n]."""
         return self._ask("step", self._number, action)

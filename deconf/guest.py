@@ -1,4 +1,4 @@
-"""The guest's end of the wall: what a method from outside asks for, and its agent, over a connection."""
+"""A guest's end of the connection: requests of a method from outside for data, and calls of its agent."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from deconfounded.deconf.wire import pack
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.experts.rollout import Agent
 
-ANSWERED = ("act", "features")
+RETURNING = ("act", "features")  # calls whose result is sent back
 
 
 class ChannelMonitor(Monitor):
-    """Sends progress; a method from outside keeps no checkpoint."""
+    """Sends progress over the connection; a method from outside has no checkpoints."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
@@ -33,50 +33,53 @@ class ChannelMonitor(Monitor):
 
 
 class ChannelAsk:
-    """Asks at the other end, and is the agent for it meanwhile. Raises InputError while it waits, or once closed."""
+    """Requests data over the connection, and meanwhile serves the agent that is rolled out for it.
+
+    Raises InputError for a request during another, or after `close`.
+    """
 
     def __init__(self, channel: Connection) -> None:
         self._channel: Connection | None = channel
 
-    def __call__(self, kind: str, *what: Any, agent: Agent | None = None) -> Any:
+    def __call__(self, kind: str, *details: Any, agent: Agent | None = None) -> Any:
         channel, self._channel = self._channel, None
         if channel is None:
             raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
         try:
-            channel.send_bytes(pack([kind, agent is not None, *what]))
+            channel.send_bytes(pack([kind, agent is not None, *details]))
             return serve(channel, agent)
         finally:
             self._channel = channel
 
     def close(self) -> None:
-        """Fitting is over."""
+        """Refuse requests from now on: fitting is over."""
         self._channel = None
 
 
 def serve(channel: Connection, agent: Agent | None) -> Any:
-    """Be the agent for the other end, until it says that this is over; returns what it sends with that."""
+    """Call the agent as the other end asks, until its message `over`; returns the data of that message."""
     while True:
-        asked, *given = channel.recv()
-        if asked == "over":
-            return given[0]
-        if asked == "refused":
-            raise InputError(given[0])
-        if asked == "reset":
-            given = [[np.random.default_rng(seed) for seed in given[0]]]
-        answer = getattr(agent, asked)(*given)
-        channel.send_bytes(pack(["done", answer if asked in ANSWERED else None, time.process_time()]))
+        call, *arguments = channel.recv()
+        if call == "over":
+            return arguments[0]
+        if call == "refused":
+            raise InputError(arguments[0])
+        if call == "reset":
+            arguments = [[np.random.default_rng(seed) for seed in arguments[0]]]
+        result = getattr(agent, call)(*arguments)
+        channel.send_bytes(pack(["done", result if call in RETURNING else None, time.process_time()]))
 
 
 def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
-    """Fit, then be the agent until the channel is closed."""
+    """Fit the method, then serve its agent until the connection is closed."""
     from deconfounded.deconf.given import Given
     from deconfounded.deconf.method import Method
     from deconfounded.envs.support import outside
     from deconfounded.experts.store import save
 
-    def say(*what: Any) -> None:
-        with contextlib.suppress(OSError):  # nobody listens any more
-            channel.send_bytes(pack(list(what)))
+    def send(*message: Any) -> None:
+        with contextlib.suppress(OSError):  # the other end is gone
+            channel.send_bytes(pack(list(message)))
 
     try:
         fit, ask, rngs = outside.find("method", reference), ChannelAsk(channel), [np.random.default_rng(about["rng"])]
@@ -85,20 +88,20 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
         ask.close()
         if not isinstance(agent, Agent):
             raise InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
-        say("fitted")
+        send("fitted")
         while True:
             folder, described = serve(channel, agent)
             try:
                 save(agent, folder, **described)
-                say("done", "", time.process_time())
+                send("done", "", time.process_time())
             except Exception as error:
-                say("done", error_line(error), time.process_time())
-    except (Exception, SystemExit) as error:  # or the other end is gone, and nobody hears it
-        say("failed", error_line(error))
+                send("done", error_line(error), time.process_time())
+    except (Exception, SystemExit) as error:  # among them that the other end is gone
+        send("failed", error_line(error))
 
 
 def _end_with_parent() -> None:
-    """Standard input is open as long as the parent lives. It is read without Python's locks, which forks inherit."""
+    """End with the parent, when standard input closes. It is read without Python's locks, which forks inherit."""
     while os.read(0, 1):
         pass
     if hasattr(os, "killpg"):
@@ -107,14 +110,14 @@ def _end_with_parent() -> None:
 
 
 def main() -> None:
-    """Connect to the run that started this process, and serve it."""
+    """Connect to the run that started this process, and serve its requests."""
     line = b""
     while not line.endswith(b"\n") and (more := os.read(0, 65536)):
         line += more
-    begun, sys.stdin = json.loads(line), open(os.devnull, encoding="utf-8")  # noqa: SIM115
-    sys.path[:] = begun["path"]
+    settings, sys.stdin = json.loads(line), open(os.devnull, encoding="utf-8")  # noqa: SIM115
+    sys.path[:] = settings["path"]
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(AttributeError):  # characters that the output's encoding lacks are escaped
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-    with Client(begun["address"], authkey=bytes.fromhex(begun["key"])) as channel:
-        live(begun["reference"], channel, channel.recv())
+    with Client(settings["address"], authkey=bytes.fromhex(settings["key"])) as channel:
+        live(settings["reference"], channel, channel.recv())

@@ -1,4 +1,4 @@
-"""What a method declares: the data that it uses, its version, and its amounts by kind of task and by preset."""
+"""A method's declaration: the data that it uses, its version, and its configuration by kind of task and preset."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from deconfounded.deconf.core.sizes import MANY, WIDE
+from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent
 
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
 USES = {
     "demonstrations": "expert trials, without theta",
     "exploration": "roll-outs of a behaviour that is blind to theta",
-    "queries": "what the expert would do at each step of such a roll-out",
+    "queries": "the expert's action at each step of such a roll-out",
     "theta": "the theta of each demonstration, in training",
 }
-ENVIRONMENT = "environment"  # what evaluation steps, and the expert: for the suite's own references alone
+ENVIRONMENT = "environment"  # the environments of evaluation, and the expert: for the suite's references alone
 
-Ways = Mapping[str, Callable[[Any], Agent]]
-"""Further ways of deploying a trained agent, by name."""
+Deployments = Mapping[str, Callable[[Any], Agent]]
+"""Further deployments of a trained agent, by name."""
 
 
 @dataclass(frozen=True)
 class Method:
     """A method's declaration, made by `uses`.
 
-    uses: of USES. version: raised by hand when the method's numbers change. cost: the CPU seconds of training, about,
-    where blind BC has 1; for the remaining time of a run alone. on_control, on_bandit: its configuration where
-    actions are continuous, and where they are discrete (None: the same). smoke, smoke_bandit: changes to these in the
-    preset `smoke`; paper: its configuration on the bandit in the preset `paper`. many: changes where much is observed,
-    from the configuration. ways: further ways of deploying its agent, each scored. exact: an exact reference policy.
+    uses: of USES. version: raised by hand when the method's numbers change. cost: CPU time of training relative to
+    blind BC, for estimates of remaining time. on_control, on_bandit: its configuration where actions are continuous,
+    and where they are discrete (None: the same). smoke, smoke_bandit: changes to these in the preset `smoke`; paper:
+    its configuration on the bandit in the preset `paper`. large: changes for large observations, given the
+    configuration. deployments: further deployments of its agent, each scored. exact: an exact reference policy.
     reference: path/file.py:function of a method from outside.
     """
 
@@ -46,19 +46,19 @@ class Method:
     smoke: Mapping[str, Any] = field(default_factory=dict)
     smoke_bandit: Mapping[str, Any] = field(default_factory=dict)
     paper: Any = None
-    many: Callable[[Any], dict[str, Any]] | None = None
-    ways: Ways = field(default_factory=dict)
+    large: Callable[[Any], dict[str, Any]] | None = None
+    deployments: Deployments = field(default_factory=dict)
     exact: bool = False
     reference: str = ""
 
     @property
     def learned(self) -> bool:
-        """Whether it is trained, on data."""
+        """Whether it is trained on data."""
         return bool(self.uses or self.reference) and ENVIRONMENT not in self.uses
 
     @property
     def tier(self) -> str:
-        """The paper's tier: 1, demonstrations; 2, exploration too; 3, queries of the expert. Or what else it sees."""
+        """The paper's tier: 1, demonstrations; 2, exploration too; 3, queries; or "sees theta", or "reference"."""
         if not self.learned:
             return "sees theta" if self.uses and not self.exact else "reference"
         if "theta" in self.uses:
@@ -66,7 +66,7 @@ class Method:
         return "3" if "queries" in self.uses else "2" if "exploration" in self.uses else "1"
 
     def amounts(self, preset: str, task: Task, device: str) -> dict[str, Any]:
-        """Its configuration on a task, under a preset, as plain values; empty if it has none."""
+        """The configuration on a task, in a preset, as plain values; empty if there is none."""
         discrete = task.n_actions > 0
         config = self.on_bandit if discrete and self.on_bandit is not None else self.on_control
         if config is None:
@@ -76,13 +76,13 @@ class Method:
         if preset == "paper" and discrete and self.paper is not None:
             config = self.paper
         values = asdict(config)
-        given: dict[str, Any] = {"device": device, "drifts": task.drifts}
-        if len(task.observation) >= MANY:
-            given |= {"width": WIDE, **(self.many(config) if self.many else {})}
-        return values | {key: value for key, value in given.items() if key in values}
+        changes: dict[str, Any] = {"device": device, "drifts": task.drifts}
+        if len(task.observation) >= LARGE_OBSERVATION:
+            changes |= {"width": WIDE, **(self.large(config) if self.large else {})}
+        return values | {key: value for key, value in changes.items() if key in values}
 
     def config(self, values: Mapping[str, Any]) -> Any:
-        """The configuration of these values; None if the method has none."""
+        """A configuration of these values; None if the method has none."""
         return None if self.on_control is None else type(self.on_control)(**values)
 
 
@@ -92,8 +92,7 @@ Fit = TypeVar("Fit", bound="Callable[[Given], Agent]")
 def uses(*kinds: str, **declared: Any) -> Callable[[Fit], Fit]:
     """Declare a method: `@uses("demonstrations")` above `def fit(given: Given) -> Agent`.
 
-    kinds: some of USES. declared: further fields of Method, which stands in `fit.method`. Raises InputError for
-    anything else.
+    kinds: of USES. declared: further fields of Method, which becomes `fit.method`. Raises InputError for others.
     """
     check_uses(kinds)
     try:
@@ -110,6 +109,6 @@ def uses(*kinds: str, **declared: Any) -> Callable[[Fit], Fit]:
 
 
 def check_uses(kinds: Iterable[str]) -> None:
-    """Raises InputError for what is neither one of USES nor ENVIRONMENT."""
+    """Raises InputError for kinds other than USES and ENVIRONMENT."""
     if wrong := [kind for kind in kinds if kind not in (*USES, ENVIRONMENT)]:
         raise InputError(f"a method uses {wrong[0]!r}; it may use {', '.join(USES)}")

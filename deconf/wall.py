@@ -1,7 +1,7 @@
 """The process of a method from outside, `python -m deconfounded.deconf.wall`, which a run starts (engine/guest.py).
 
-There are no tasks, experts, benchmarks or simulators in it, and importing them is refused. This prevents accidental
-leakage, and what a method could do with a page of code; a process of the same user is still no prison.
+It holds no tasks, experts, benchmarks or simulators, and refuses to import them. This prevents accidental leakage and
+simple attacks, not all: the process has the rights of its user.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ def _within(name: str, modules: tuple[str, ...]) -> bool:
 
 
 def _refusal(name: str) -> ImportError:
-    why = "a method from outside has the data that it declares, and no tasks, experts or simulators"
-    return ImportError(f"{name} cannot be imported here: {why}")
+    reason = "a method from outside has the data that it declares, and no tasks, experts or simulators"
+    return ImportError(f"{name} cannot be imported here: {reason}")
 
 
 class Wall(MetaPathFinder):
-    """Refuses to import what a method from outside does not get."""
+    """Refuses to import closed modules."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> None:
         """None, for the next finder. Raises ImportError for a closed module."""
@@ -40,7 +40,7 @@ class Wall(MetaPathFinder):
 
 
 class ClosedPackage(ModuleType):
-    """The package of environments without its contents; what is open of it can be imported."""
+    """The package of environments without its contents; its open modules can be imported."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -48,8 +48,8 @@ class ClosedPackage(ModuleType):
         raise _refusal(f"{self.__name__}.{name}")
 
 
-def close_the_door() -> None:
-    """From now on this process refuses closed modules."""
+def refuse_imports() -> None:
+    """Refuse closed modules in this process from now on."""
     name = f"{PACKAGE}.envs"
     package = ClosedPackage(name)
     package.__path__ = [str(Path(__file__).resolve().parents[1] / "envs")]
@@ -58,7 +58,7 @@ def close_the_door() -> None:
 
 
 if __name__ == "__main__":
-    close_the_door()  # before anything else of this package is imported
+    refuse_imports()  # before anything else of this package is imported
     from deconfounded.deconf.guest import main
 
     main()

@@ -1,4 +1,4 @@
-"""What a guest sends home: json and plain arrays as bytes, so that reading them runs none of the guest's code."""
+"""Messages of a guest: json and plain arrays as bytes, so that reading them runs none of the guest's code."""
 
 from __future__ import annotations
 
@@ -11,50 +11,50 @@ from deconfounded.envs.support.errors import InputError
 
 
 def pack(value: Any) -> bytes:
-    """None, booleans, numbers, strings, lists, dictionaries, arrays of numbers. Raises InputError for anything else."""
+    """Encode None, booleans, numbers, strings, lists, dictionaries and arrays. Raises InputError for other types."""
     arrays: list[bytes] = []
 
-    def plain(thing: Any) -> Any:
-        if thing is None or isinstance(thing, bool | str):
-            return thing
-        if isinstance(thing, int | np.integer) and not isinstance(thing, bool):
-            return int(thing)
-        if isinstance(thing, float | np.floating):
-            return float(thing)
-        if isinstance(thing, list | tuple):
-            return [plain(one) for one in thing]
-        if isinstance(thing, dict):
-            return {str(key): plain(one) for key, one in thing.items()}
+    def plain(part: Any) -> Any:
+        if part is None or isinstance(part, bool | str):
+            return part
+        if isinstance(part, int | np.integer):
+            return int(part)
+        if isinstance(part, float | np.floating):
+            return float(part)
+        if isinstance(part, list | tuple):
+            return [plain(item) for item in part]
+        if isinstance(part, dict):
+            return {str(key): plain(item) for key, item in part.items()}
         try:
-            array = np.ascontiguousarray(thing)
+            array = np.ascontiguousarray(part)
         except Exception:
             array = np.empty(0, object)
         if array.dtype.kind not in "biuf":
-            raise InputError(f"it gave {type(thing).__name__}; it must be numbers, or arrays of them")
+            raise InputError(f"it gave {type(part).__name__}; it must be numbers, or arrays of them")
         arrays.append(array.tobytes())
-        return {"array": array.dtype.str, "shape": list(np.shape(thing)), "bytes": len(arrays[-1])}
+        return {"array": array.dtype.str, "shape": list(np.shape(part)), "bytes": len(arrays[-1])}
 
     head = json.dumps(plain(value)).encode()
     return b"".join([len(head).to_bytes(8, "little"), head, *arrays])
 
 
 def unpack(data: bytes) -> Any:
-    """What `pack` was given, tuples as lists. Raises InputError for anything else."""
+    """Decode the bytes of `pack`, tuples as lists. Raises InputError for other bytes."""
     try:
         size = int.from_bytes(data[:8], "little")
         at = 8 + size
 
-        def whole(thing: Any) -> Any:
+        def whole(part: Any) -> Any:
             nonlocal at
-            if isinstance(thing, list):
-                return [whole(one) for one in thing]
-            if isinstance(thing, dict) and set(thing) == {"array", "shape", "bytes"}:
-                kind = np.dtype(str(thing["array"]))
-                if kind.kind not in "biuf":
-                    raise ValueError(kind)
-                at += int(thing["bytes"])
-                return np.frombuffer(data[at - int(thing["bytes"]) : at], kind).reshape(thing["shape"]).copy()
-            return {key: whole(one) for key, one in thing.items()} if isinstance(thing, dict) else thing
+            if isinstance(part, list):
+                return [whole(item) for item in part]
+            if isinstance(part, dict) and set(part) == {"array", "shape", "bytes"}:
+                dtype = np.dtype(str(part["array"]))
+                if dtype.kind not in "biuf":
+                    raise ValueError(dtype)
+                at += int(part["bytes"])
+                return np.frombuffer(data[at - int(part["bytes"]) : at], dtype).reshape(part["shape"]).copy()
+            return {key: whole(item) for key, item in part.items()} if isinstance(part, dict) else part
 
         return whole(json.loads(data[8 : 8 + size]))
     except (ValueError, TypeError, KeyError, UnicodeDecodeError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""The core: equations by hand, beliefs, data types, and each method on data small enough for a test."""
+"""The core: equations against numbers by hand, beliefs, data types, and methods on little data."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from deconfounded.deconf.equations import (
     posterior_policy,
     reparametrise,
 )
-from deconfounded.deconf.exact import LEFT_OUT, ExactAgent, Grid
-from deconfounded.deconf.methods import cloning, deconfounded, deconfounded_offline, naive_rnn
+from deconfounded.deconf.exact import PRUNE_BELOW, ExactAgent, Grid
+from deconfounded.deconf.methods import deconfounded, deconfounded_offline, memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials
@@ -79,10 +79,10 @@ class TestEquations:
     @pytest.mark.parametrize("kind", [np.array, torch.tensor])
     def test_belief_update(self, kind: Callable[[Any], Any]) -> None:
         """Eq. (5): .25 * .5 and .75 * .2 over their sum; Eq. (3): times .1 and .4 of the action as well."""
-        belief, dynamics, acted = (kind(np.log(p)) for p in ([0.25, 0.75], [0.5, 0.2], [0.1, 0.4]))
-        told, deluded = belief_update(belief, dynamics), belief_update(belief, dynamics, acted)
-        np.testing.assert_allclose(np.exp(np.asarray(told)), [0.125 / 0.275, 0.15 / 0.275])
-        np.testing.assert_allclose(np.exp(np.asarray(deluded)), [0.0125 / 0.0725, 0.06 / 0.0725])
+        belief, dynamics, actions = (kind(np.log(p)) for p in ([0.25, 0.75], [0.5, 0.2], [0.1, 0.4]))
+        p_int, p_cond = belief_update(belief, dynamics), belief_update(belief, dynamics, actions)
+        np.testing.assert_allclose(np.exp(np.asarray(p_int)), [0.125 / 0.275, 0.15 / 0.275])
+        np.testing.assert_allclose(np.exp(np.asarray(p_cond)), [0.0125 / 0.0725, 0.06 / 0.0725])
 
     def test_offline_loss(self) -> None:
         """Eq. (7): two trajectories of (-1 - 2) + (-3 - 4) and (-1 - 1), KL 5 and 7, beta .5: (12.5 + 5.5) / 2."""
@@ -136,7 +136,7 @@ class TestBeliefs:
             memories.append(memory)
         torch.testing.assert_close(torch.stack(memories, 2), belief(data), rtol=1e-4, atol=1e-4)
 
-    def test_dead_steps_tell_nothing(self, kind: type[Belief], name: str) -> None:
+    def test_masked_steps_change_nothing(self, kind: type[Belief], name: str) -> None:
         belief, data, _ = self.make(kind, name)
         step = data[:, :, 0]
         step.mask = torch.zeros_like(step.mask)
@@ -144,7 +144,7 @@ class TestBeliefs:
         torch.testing.assert_close(belief.update(memory, step), memory)
 
     def test_order(self, kind: type[Belief], name: str) -> None:
-        """The evidence belief does not care for the order of transitions; the GRU's does (so the check can fail)."""
+        """The evidence belief does not depend on the order of transitions; the GRU's does (so the check can fail)."""
         belief, data, _ = self.make(kind, name)
         shortest = int(data.mask.sum(2).min())
         turned = data[:, :, torch.arange(shortest - 1, -1, -1)]
@@ -174,12 +174,12 @@ def test_one_bit_is_embedded_as_any_observation() -> None:
     torch.testing.assert_close(embedding.obs(batch.obs), embedding.embed_obs(scaler(batch.obs)), rtol=1e-5, atol=1e-6)
 
 
-def test_gru_starts_out_remembering() -> None:
-    """Two histories that part in their first 10 steps are told apart after 30 more; with torch's gates they are not."""
+def test_gru_remembers_before_training() -> None:
+    """Memories of histories that differ in the first 10 steps differ after 30 more; with torch's gates they do not."""
     batch, signature, scaler, draws = _bandit_batch(8)
     other = Batch(*(x.clone() for x in batch.tensors))
     other.action[:, :, :10] = (other.action[:, :, :10] + 1) % 5
-    left = {}
+    remaining = {}
     ours, torchs = (GruMemory(64, signature, scaler, draws) for _ in range(2))
     for layer in (module for module in torchs.modules() if isinstance(module, Linear)):
         bound = layer.weight.shape[1] ** -0.5
@@ -188,9 +188,9 @@ def test_gru_starts_out_remembering() -> None:
     for name, memory in (("ours", ours), ("torch", torchs)):
         runs = [memory(x, memory.start(8)) for x in (batch, other)]
         gap = (runs[0] - runs[1]).norm(dim=-1).mean((0, 1))
-        left[name] = (gap[40] / gap[10]).item()
-    assert left["ours"] > 0.2
-    assert left["torch"] < 0.02
+        remaining[name] = (gap[40] / gap[10]).item()
+    assert remaining["ours"] > 0.2
+    assert remaining["torch"] < 0.02
 
 
 @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
@@ -208,7 +208,7 @@ def test_discrete_belief_one_step_at_a_time(name: str) -> None:
         assert (memory - model.start(len(data))).abs().max() > 0.1
 
 
-def test_discrete_loss_deals_trials_into_histories() -> None:
+def test_discrete_loss_splits_trials_into_histories() -> None:
     """Six steps, of which the second trial has four: histories of 1, 2, 4 and 8 steps, every so many steps apart."""
     draws = Draws([np.random.default_rng(0)], "cpu")
     trials, _ = demonstrations("slippery_cartpole", 2)
@@ -218,16 +218,16 @@ def test_discrete_loss_deals_trials_into_histories() -> None:
     with torch.no_grad():
         log_next = model.dynamics.log_prob(data.obs, data.action, data.next_obs)[0].double().numpy()
         loss = model.loss(data, None, 0.0, draws).item()
-    hands = [[[0], [1], [2], [3], [4], [5]], [[0, 4], [1, 5], [2], [3]], [[0, 2, 4], [1, 3, 5]], [[0, 1, 2, 3, 4, 5]]]
+    splits = [[[0], [1], [2], [3], [4], [5]], [[0, 4], [1, 5], [2], [3]], [[0, 2, 4], [1, 3, 5]], [[0, 1, 2, 3, 4, 5]]]
     totals = []
-    for histories in hands:
+    for histories in splits:
         real = [(trial, [t for t in steps if t < (6, 4)[trial]]) for trial in (0, 1) for steps in histories]
         totals.append(sum(np.log(np.exp(log_next[trial, steps].sum(0)).mean()) for trial, steps in real))
     assert loss == pytest.approx(-np.mean(totals) / 10, rel=1e-5)
 
 
 def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
-    """Tier 1: two latents, dynamics that pay the same, a policy that takes the latent's arm: no correlation is left."""
+    """Tier 1: two latents with the same dynamics, a policy that pulls its latent's arm: no correlation of the two."""
     trials, _ = demonstrations("bandit", 6, 1)
     data, signature = Batch.of(trials, 1), Signature.of(trials)
     obs, change = scalers(data)
@@ -263,7 +263,7 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
 
 @pytest.mark.parametrize(("asked", "read"), [(4, 4), (50, 10)])
 def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So many different ones of each trial, or all, which stand for the trial; others at each update."""
+    """A random subset of each trial's steps, or all of them, weighted to the trial's length; another at each update."""
     seen: list[Tensor] = []
     weights: list[Tensor] = []
 
@@ -287,13 +287,13 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
     assert all(weight.sum(-1).tolist() == [[pytest.approx(10)] * 2] for weight in weights)
 
 
-def test_synthetic_episodes_end_where_no_expert_acted() -> None:
-    """Tier 1: what leaves the range of the expert's observations begins anew; padding is not part of that range."""
+def test_synthetic_episodes_end_outside_the_expert_range() -> None:
+    """Tier 1: an episode ends where it leaves the range of the expert's observations, of which padding is no part."""
     trials, _ = demonstrations("tilted_cartpole", 4)
     signature, draws = Signature.of(trials), Draws([np.random.default_rng(s) for s in (0, 1)], "cpu")
     obs = trials.obs.copy()
     mask = trials.mask.copy()
-    mask[:, :, -2:], obs[:, :, -2:] = False, 1e3  # no one acted in these
+    mask[:, :, -2:], obs[:, :, -2:] = False, 1e3  # padding
     trials = Trials(obs, trials.action, mask)
     data, starts = Batch.of(trials, 2), torch.tensor(obs[:, :, 0]).reshape(2, -1, signature.obs)
     model = VariationalModel("evidence", 1, 8, signature, *scalers(data), draws)
@@ -374,42 +374,42 @@ class TestExact:
         assert (belief * near).sum(-1).mean() < 0.6
 
     @pytest.mark.parametrize("conditional", [False, True])
-    def test_left_out_values(self, conditional: bool) -> None:
-        """Along the agent's own trials its belief is that of the full grid, to .01 in total variation on average.
+    def test_pruned_values(self, conditional: bool) -> None:
+        """In the agent's trials its belief is that of the full grid, to .01 in total variation on average.
 
-        And what it simulates is less than a third of the grid. Bit for bit the full grid's, where nothing is left out.
+        A small share of the grid is simulated. Where nothing is pruned, the bits are those of the full grid.
         """
         env = envs.BatchEnv(envs.get("tilted_cartpole"), 24)
         agent = ExactAgent(env, policy.load(env.task), conditional, k=21)
         grid, gaps, simulated = agent.grid, [], []
-        some, outcome = grid.log_dynamics, grid._simulator.outcome
+        log_dynamics, outcome = grid.log_dynamics, grid._simulator.outcome
 
         def spy(state: Array, action: Array, next_state: Array, log_belief: Array | None = None) -> Array:
-            whole = some(state, action, next_state)
+            whole = log_dynamics(state, action, next_state)
             simulated.clear()
-            found = some(state, action, next_state, log_belief)
+            pruned = log_dynamics(state, action, next_state, log_belief)
             assert log_belief is not None
-            told.append(simulated[0] / whole.size)
+            shares.append(simulated[0] / whole.size)
             if (log_belief == log_belief[:1, :1]).all():
-                np.testing.assert_array_equal(found, whole)
-            one, other = (np.exp(belief_update(log_belief, x)) for x in (found, whole))
-            gaps.append(np.abs(one - other).sum(-1).mean() / 2)
-            return found
+                np.testing.assert_array_equal(pruned, whole)
+            beliefs = [np.exp(belief_update(log_belief, x)) for x in (pruned, whole)]
+            gaps.append(np.abs(beliefs[0] - beliefs[1]).sum(-1).mean() / 2)
+            return pruned
 
         def count(state: Array, action: Array, rows: Any = None) -> Array:
             simulated.append(len(state))
             return outcome(state, action, rows)
 
-        told: list[float] = []
+        shares: list[float] = []
         grid.log_dynamics = spy  # type: ignore[method-assign]
         grid._simulator.outcome = count  # type: ignore[method-assign]
         run_trials(env, agent, 2, seed=0)
         assert np.mean(gaps) < 0.01
-        assert told[0] == 1
-        assert np.mean(told) < (0.15 if conditional else 0.4)
+        assert shares[0] == 1
+        assert np.mean(shares) < (0.15 if conditional else 0.4)
 
-    def test_values_left_out_come_back(self) -> None:
-        """Thirty steps of one theta, then many of another, which had been left out: in the end it has the mass."""
+    def test_pruned_values_come_back(self) -> None:
+        """Thirty steps under one theta, then many under another, which had been pruned: in the end it has the mass."""
         task = envs.get("tilted_cartpole")
         env = envs.BatchEnv(task, 16)
         grid = Grid(env, policy.load(task), 21)
@@ -427,11 +427,11 @@ class TestExact:
             env.step(action)
             belief = belief_update(belief, grid.log_dynamics(state, action, env.state, belief))
             if t == 29:
-                assert np.median(np.exp(belief)[:, 14]) < LEFT_OUT
+                assert np.median(np.exp(belief)[:, 14]) < PRUNE_BELOW
         assert np.exp(belief)[:, 13:16].sum(-1).mean() > 0.9
 
     def test_probe_reads_the_posterior(self) -> None:
-        """R^2 of theta in what the exact interventional policy knows after an episode is near 1; in noise it is not."""
+        """R^2 of theta in the exact interventional belief after an episode is near 1; in noise it is not."""
         env = envs.BatchEnv(envs.get("tilted_cartpole"), 64)
         agent = ExactAgent(env, policy.load(env.task), conditional=False, k=21)
         run_trials(env, agent, 1, seed=0)
@@ -441,26 +441,26 @@ class TestExact:
         assert measure.probe(np.random.default_rng(0).standard_normal((64, 1)), theta)[0] < 0.3
 
     def test_probe_of_many_features(self) -> None:
-        """As many as trials to fit it to: of noise it reads nothing, of a few good ones among noise nearly all."""
+        """With as many features as trials: R^2 is near 0 for noise, and near 1 for a few good features among noise."""
         rng = np.random.default_rng(0)
         theta, noise = rng.standard_normal((128, 1)), rng.standard_normal((128, 64))
         good = np.c_[noise[:, 16:], theta + 0.3 * rng.standard_normal((128, 16))]
         assert -0.2 < measure.probe(noise, theta)[0] < 0.2
         assert measure.probe(good, theta)[0] > 0.8
-        rare = np.r_[1e-40 * rng.random((64, 1)), rng.random((64, 1)) < 0.1]  # such as p(k) where k is seldom needed
+        rare = np.r_[1e-40 * rng.random((64, 1)), rng.random((64, 1)) < 0.1]  # such as p(k) of a rare k
         assert measure.probe(np.c_[good, rare], theta)[0] > 0.8
 
 
 class TestMethods:
-    """Each method learns what it can from a little data; margins are wide, seeds fixed."""
+    """Methods learn from little data; margins are wide, seeds fixed."""
 
     def test_bandit_oracle_and_blind(self) -> None:
         trials, env = demonstrations("bandit", 500, 1)
-        encode, config = env.task.encode_theta, cloning.CloningConfig(updates=300)
+        encode, config = env.task.encode_theta, memoryless_bc.MemorylessConfig(updates=300)
         score = envs.BatchEnv(env.task, 500)
         rng = np.random.default_rng
-        oracle = cloning.train(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
-        blind = cloning.train(trials, config, rng(0))
+        oracle = memoryless_bc.train(trials, config, rng(0), encode(env.theta)[:, None], lambda: encode(score.theta))
+        blind = memoryless_bc.train(trials, config, rng(0))
         assert run_trials(score, oracle, 1, 3).returns.mean() == pytest.approx(60, abs=2)
         assert run_trials(score, blind, 1, 3).returns.mean() == pytest.approx(20, abs=2)
 
@@ -498,21 +498,21 @@ class TestMethods:
         [name for name, about in METHODS.items() if about.learned and name != "deconfounded_gru"] + ["paper"],
     )
     def test_seeds_do_not_touch_each_other(self, name: str, method: str) -> None:
-        """A seed's agent acts alike, bit for bit, whether it was trained alone or second of three."""
+        """A seed's agent acts alike, bit for bit, trained alone and as the second of three."""
         settings = tiny_preset()
         if method == "paper":  # deconfounded as in that preset: its belief, fresh trials each round
             method = "deconfounded"
             settings = replace(settings, fresh=4).configured("deconfounded", model="gru", accumulate=False)
-        task, found = envs.get(name), []
+        task, actions = envs.get(name), []
         for seeds in ((5,), (4, 5, 6)):
             context = Context(task, settings, seeds)
             agent = fit(context, method)
             trials = run_trials(context.env, agent, task.episodes, list(seeds)).trials
-            found.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
-        np.testing.assert_array_equal(*found)
+            actions.append(trials.action[4:8] if len(seeds) > 1 else trials.action)
+        np.testing.assert_array_equal(*actions)
 
     def test_changes_are_scaled_by_all_data(self) -> None:
-        """Experts may move a hundred times as far in a step as random actions do: the model's targets stay small."""
+        """Expert trials may change a hundred times as much in a step as exploration: the model's targets stay small."""
         rng = np.random.default_rng(0)
         slow, fast = (
             Trials(step * rng.standard_normal((8, 1, 21, 2)), np.zeros((8, 1, 20, 1)), np.ones((8, 1, 20), bool))

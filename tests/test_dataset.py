@@ -14,7 +14,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import data
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
 from deconfounded.deconf.methods import naive_rnn
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets, policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset

@@ -1,4 +1,4 @@
-"""Diagnosis: what cannot be judged is told in a line, figures lead to the verdict they deserve, and all of it runs."""
+"""Diagnosis: bad input is refused in one line, figures lead to their verdicts, and the commands run."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
-from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[1]
 TINY = Amounts(
     rivals=2,
     dreams=4,
-    cloning=CloningConfig(updates=5, batch=64),
+    cloning=MemorylessConfig(updates=5, batch=64),
     naive=RecurrentConfig(updates=6, batch=4),
     offline=OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4, offline_steps=16),
     exploring=DeconfoundedConfig(inference_updates=5, inference_batch=4, inference_steps=32),
@@ -43,55 +43,55 @@ def trials(n: int = 24, episodes: int = 2, steps: int = 3, seed: int = 0) -> Tri
 
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("given", "told"),
+        ("given", "message"),
         [
             (lambda: trials(1, 1), "1 trial given; at least 24 are needed"),
             (lambda: trials(5), "5 trials given; at least 24 are needed"),
             (lambda: trials(steps=1), "every episode is of one step"),
         ],
     )
-    def test_too_little(self, given, told: str) -> None:
-        with pytest.raises(InputError, match=told):
+    def test_too_little(self, given, message: str) -> None:
+        with pytest.raises(InputError, match=message):
             diagnose.check(given(), None, DiagnoseConfig())
 
     def test_constant_actions(self) -> None:
-        some = trials()
+        data = trials()
         with pytest.raises(InputError, match="every action is the same"):
-            diagnose.check(Trials(some.obs, 0 * some.action + 0.5, some.mask), None, DiagnoseConfig())
+            diagnose.check(Trials(data.obs, 0 * data.action + 0.5, data.mask), None, DiagnoseConfig())
 
     def test_nan(self) -> None:
-        some = trials()
+        data = trials()
         with pytest.raises(InputError, match="NaN"):
-            Trials(some.obs * np.nan, some.action, some.mask)
+            Trials(data.obs * np.nan, data.action, data.mask)
 
-    def test_another_world(self) -> None:
-        some, other = trials(), trials(seed=1)
+    def test_other_observations(self) -> None:
+        expert, other = trials(), trials(seed=1)
         wider = Trials(np.concatenate([other.obs] * 2, -1), other.action, other.mask)
         with pytest.raises(InputError, match="exploration has other observations"):
-            diagnose.check(some, wider, DiagnoseConfig())
+            diagnose.check(expert, wider, DiagnoseConfig())
 
     def test_exploration_is_checked_too(self) -> None:
         with pytest.raises(InputError, match="5 trials of exploration given"):
             diagnose.check(trials(), trials(5), DiagnoseConfig())
 
     def test_exploration_elsewhere(self) -> None:
-        some, other = trials(), trials(seed=1)
+        expert, other = trials(), trials(seed=1)
         away = Trials(other.obs + 99, other.action, other.mask)
         with pytest.raises(InputError, match="where the expert goes for"):
-            diagnose.check(some, away, DiagnoseConfig())
+            diagnose.check(expert, away, DiagnoseConfig())
 
     def test_command(self, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
         """One line and exit code 2: no file, no trials in it, too few."""
         trials(5).save(tmp_path / "few.npz")
         (tmp_path / "junk.npz").write_bytes(b"junk")
-        for name, told in (("none.npz", "there is no"), ("junk.npz", "no trials could"), ("few.npz", "5 trials given")):
+        for name, line in (("none.npz", "there is no"), ("junk.npz", "no trials could"), ("few.npz", "5 trials given")):
             monkeypatch.setattr("sys.argv", ["diagnose", "--trials", str(tmp_path / name), "--out", str(tmp_path)])
             with pytest.raises(SystemExit) as stopped:
                 run_command(command.main)
             assert stopped.value.code == 2
-            said = capsys.readouterr().err
-            assert told in said
-            assert said.count("\n") == 1
+            error = capsys.readouterr().err
+            assert line in error
+            assert error.count("\n") == 1
 
 
 CLEAR = Findings(
@@ -119,32 +119,32 @@ class TestJudge:
         ("changes", "verdict", "tier", "then"),
         [
             ({}, "confounded", 2, diagnose.EXPLORE),
-            (ALONE, "cannot tell", None, diagnose.TRY),
-            ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.TRY),
-            ({"shown": 0.05, "explained": -0.1}, "confounded", 3, diagnose.ASK),
-            ({"shown": 0.05, "explained": 0.05}, "confounded", 3, diagnose.ASK),
+            (ALONE, "cannot tell", None, diagnose.EXPLORE_FIRST),
+            ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.EXPLORE_FIRST),
+            ({"shown": 0.05, "explained": -0.1}, "confounded", 3, diagnose.QUERY),
+            ({"shown": 0.05, "explained": 0.05}, "confounded", 3, diagnose.QUERY),
             ({"shown": 0.05}, "confounded", 2, diagnose.EXPLORE),
             ({"explained": -0.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"shown": -0.5}, "cannot tell", None, diagnose.WIDER),
+            ({"shown": -0.5}, "cannot tell", None, diagnose.EXPLORE_MORE),
             ({"stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
             ({"strayed": 1.1}, "confounded", 2, diagnose.EXPLORE),
             ({"stakes": 1.1, "strayed": 1.4}, "not confounded", 1, diagnose.CLONE),
-            ({"stakes": 1.1, "strayed": 1.4, "unlike": 5.0}, "cannot tell", None, diagnose.WIDER),
-            ({"stakes": 1.1, "strayed": 1.4, "explained": -0.1}, "cannot tell", None, diagnose.WIDER),
-            ({"shown": -5.0, "explained": -5.0}, "cannot tell", None, diagnose.WIDER),
-            ({"memory": -1.0}, "cannot tell", None, diagnose.MORE),
-            ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE),
+            ({"stakes": 1.1, "strayed": 1.4, "unlike": 5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"stakes": 1.1, "strayed": 1.4, "explained": -0.1}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"shown": -5.0, "explained": -5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"memory": -1.0}, "cannot tell", None, diagnose.MORE_TRIALS),
+            ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE_TRIALS),
             ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
             ({"naive": 0.95, "latent": 1.0}, "confounded", 2, diagnose.EXPLORE),
             ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
-            ({"memory": 0.001, "shown": -0.002}, "cannot tell", None, diagnose.VARY),
-            ({"memory": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY),
-            ({"latent": 0.1, "latent_judged": -0.2}, "cannot tell", None, diagnose.MORE),
+            ({"memory": 0.001, "shown": -0.002}, "cannot tell", None, diagnose.VARY_LATENT),
+            ({"memory": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY_LATENT),
+            ({"latent": 0.1, "latent_judged": -0.2}, "cannot tell", None, diagnose.MORE_TRIALS),
         ],
     )
     def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: diagnose.Next) -> None:
-        found = diagnose.judge([CLEAR._replace(**changes)] * 3)
-        assert (found.verdict, found.tier, found.next) == (verdict, tier, then)
+        diagnosis = diagnose.judge([CLEAR._replace(**changes)] * 3)
+        assert (diagnosis.verdict, diagnosis.tier, diagnosis.next) == (verdict, tier, then)
 
     def test_refits_that_disagree(self) -> None:
         """No confident verdict where refits lie on both sides of what decides."""
@@ -159,50 +159,50 @@ class TestJudge:
         assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
-    def test_what_is_no_number(self) -> None:
+    def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: unlike is"):
             diagnose.judge([CLEAR, CLEAR._replace(unlike=float("nan"))])
 
     def test_figures(self) -> None:
-        found = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4, shown=0.5)]).found
-        assert found["naive"] == pytest.approx((0.3, 0.2, 0.4))
-        assert found["ratio"] == pytest.approx((175, 100, 250))
-        assert "explored" not in diagnose.judge([CLEAR._replace(**ALONE)]).found
+        figures = diagnose.judge([CLEAR, CLEAR._replace(naive=0.4, shown=0.5)]).figures
+        assert figures["naive"] == pytest.approx((0.3, 0.2, 0.4))
+        assert figures["ratio"] == pytest.approx((175, 100, 250))
+        assert "explored" not in diagnose.judge([CLEAR._replace(**ALONE)]).figures
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
     task = envs.get("bandit")
     env = envs.BatchEnv(task, n)
-    shown = run_trials(env, ExpertAgent(env, policy.load(task)), task.episodes, 0).trials
-    return shown, run_trials(env, RandomAgent(task.action_space), task.episodes, 1).trials
+    expert = run_trials(env, ExpertAgent(env, policy.load(task)), task.episodes, 0).trials
+    return expert, run_trials(env, RandomAgent(task.action_space), task.episodes, 1).trials
 
 
 @pytest.mark.parametrize("make", [_bandit, lambda: (trials(), trials(seed=1))], ids=["discrete", "continuous"])
 def test_measures(make) -> None:
     """Figures come out finite, for both kinds of actions, and the same again from the same seed."""
-    shown, explored = make()
-    once, again = (measures.measure(shown, explored, TINY, np.random.default_rng(0)) for _ in range(2))
-    assert once == again
-    assert np.isfinite(once).all()
-    alone = measures.measure(shown, None, TINY, np.random.default_rng(0))
+    expert, explored = make()
+    first, second = (measures.measure(expert, explored, TINY, np.random.default_rng(0)) for _ in range(2))
+    assert first == second
+    assert np.isfinite(first).all()
+    alone = measures.measure(expert, None, TINY, np.random.default_rng(0))
     assert {alone.explained, alone.explored, alone.shown, alone.acted} == {None}
     assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
 
 
-def test_memory_is_found() -> None:
-    """Actions that a hidden sign decides: memory tells them, by log 2 a step but for the first."""
+def test_gain_by_memory() -> None:
+    """Actions that depend on a hidden sign: a memory gains log 2 nats a step, except for the first."""
     rng = np.random.default_rng(0)
     shape = (64, 1, 20)
     sign = rng.integers(2, size=(64, 1, 1, 1)) * np.ones((*shape, 1))
     obs, amounts = (
         rng.normal(size=(64, 1, 21, 1)),
         Amounts(
-            **{**vars(TINY), "cloning": CloningConfig(updates=200), "naive": RecurrentConfig(updates=150, chunk=20)}
+            **{**vars(TINY), "cloning": MemorylessConfig(updates=200), "naive": RecurrentConfig(updates=150, chunk=20)}
         ),
     )
     hidden = Trials(obs, sign, np.ones(shape, bool), 2)
-    found = measures.measure(hidden, None, amounts, np.random.default_rng(0))
-    assert found.memory == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
+    findings = measures.measure(hidden, None, amounts, np.random.default_rng(0))
+    assert findings.memory == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
     chance = Trials(obs, rng.integers(2, size=(*shape, 1)), np.ones(shape, bool), 2)
     assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory < 0.02
 
@@ -210,23 +210,23 @@ def test_memory_is_found() -> None:
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A page that needs no other file, a json that says the same; a second time nothing is measured again."""
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
-    for name, some in zip(("expert", "explored"), _bandit(), strict=True):
-        some.save(tmp_path / f"{name}.npz")
-    asked = ["--trials", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
-    monkeypatch.setattr("sys.argv", ["diagnose", *asked, "--out", str(tmp_path / "out")])
+    for name, data in zip(("expert", "explored"), _bandit(), strict=True):
+        data.save(tmp_path / f"{name}.npz")
+    options = ["--trials", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
+    monkeypatch.setattr("sys.argv", ["diagnose", *options, "--out", str(tmp_path / "out")])
     command.main()
     first = capsys.readouterr().out
-    told = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    assert told["verdict"].upper() in first
-    assert set(told["found"]) == {*Findings._fields, "gap", "gap_judged", "ratio"}
+    written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert written["verdict"].upper() in first
+    assert set(written["found"]) == {*Findings._fields, "gap", "gap_judged", "ratio"}
     page = (tmp_path / "out" / "index.html").read_text()
-    assert told["reasons"][0] in html.unescape(page)
+    assert written["reasons"][0] in html.unescape(page)
     assert not re.search(r"(src|href)=\"(?!data:)", page)
     assert first.count("measured in") == 2
     command.main()
     assert "measured in" not in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["found"] == told["found"]
-    monkeypatch.setattr("sys.argv", ["diagnose", *asked[:2], "--out", str(tmp_path / "alone")])
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["found"] == written["found"]
+    monkeypatch.setattr("sys.argv", ["diagnose", *options[:2], "--out", str(tmp_path / "alone")])
     command.main()
     assert "explored" not in json.loads((tmp_path / "alone" / "diagnosis.json").read_text())["found"]
 

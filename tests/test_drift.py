@@ -1,4 +1,4 @@
-"""Latents that walk from episode to episode: their distribution, the exact filter, and how learned beliefs forget."""
+"""Latents that drift from episode to episode: their distribution, the exact filter, and how learned beliefs forget."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from deconfounded.experts.rollout import ExpertAgent, run_trials, thetas
 
 
 class Walking(TiltedCartpole):
-    """tilted_cartpole, whose tilt walks."""
+    """tilted_cartpole with a drifting tilt."""
 
     latents = (envs.Latent("tilt", "rad", -0.3, 0.3, drift=0.15),)
 
@@ -80,7 +80,7 @@ def test_the_exact_filter_spreads_between_episodes() -> None:
 
 
 class Average(LatentModel):
-    """Knows theta ~ N(0, 1) from readings theta + N(0, 1): memory (their sum, their number), exact Gaussian beliefs."""
+    """Exact beliefs about theta ~ N(0, 1) from readings theta + N(0, 1), whose sum and number are the memory."""
 
     def __init__(self, draws: Draws) -> None:
         super().__init__(draws)
@@ -100,12 +100,12 @@ class Average(LatentModel):
     last = belief = sample = point = loss = None  # type: ignore[assignment]
 
 
-def test_how_much_to_keep_is_seen_without_theta() -> None:
-    """Of thetas that stay, nearly all is kept; of thetas drawn anew, nothing; each seed decides for itself."""
+def test_kept_share_is_chosen_without_theta() -> None:
+    """Nearly 1 for constant thetas, 0 for thetas drawn anew at each episode; a share for each seed."""
     generator, b, e, t = torch.Generator().manual_seed(0), 400, 6, 5
-    stays = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
+    constant = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
     anew = torch.randn(b, e, 1, generator=generator)
-    theta = torch.stack([stays, anew]).reshape(2, b * e, 1, 1).expand(2, b * e, t, 1)
+    theta = torch.stack([constant, anew]).reshape(2, b * e, 1, 1).expand(2, b * e, t, 1)
     readings = theta + torch.randn(theta.shape, generator=generator)
     episodes = Batch(readings, readings, readings, torch.ones(2, b * e, t))
     model = Average(Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
@@ -116,10 +116,10 @@ def test_how_much_to_keep_is_seen_without_theta() -> None:
 
 @pytest.mark.parametrize("kind", ["evidence", "discrete"])
 def test_forgetting(kind: str) -> None:
-    """What is kept whole stays as it was, to the bit; of what is not kept, nothing; and in between, in between."""
+    """A share of 1 leaves the memory as it was, a share of 0 gives the initial one; .5 is in between."""
     draws = Draws([np.random.default_rng(0)], "cpu")
     unit = Scaler(draws.normal(50, 2), torch.ones(1, 50))
-    model = models.new(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
+    model = models.new_model(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
     step = Batch(draws.normal(4, 2), draws.normal(4, 1), draws.normal(4, 2), torch.ones(1, 4))
     memory = model.update(model.start(4), step)
     assert torch.equal(model.forget(memory), memory) or kind == "discrete"

@@ -21,7 +21,7 @@ from deconfounded.benchmarks.studies import paper
 from deconfounded.benchmarks.studies.paper import FigureJob
 from deconfounded.deconf.methods import naive_rnn, references
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts.rollout import Agent
 
 

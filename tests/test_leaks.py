@@ -1,4 +1,4 @@
-"""What nobody may be told, and what must not quietly change: each of these faults was once planted and not noticed."""
+"""Theta does not leak, and protocols do not change: each test fails on a fault that others had not noticed."""
 
 from __future__ import annotations
 
@@ -166,7 +166,7 @@ class TestData:
             raise KeyboardInterrupt
 
         if method in ("naive_obs", "palr"):
-            monkeypatch.setattr(modules[method], "clone_by_chunks", lambda kind, *given: spy(*given))
+            monkeypatch.setattr(modules[method], "train_recurrent", lambda kind, *given: spy(*given))
         else:
             monkeypatch.setattr(modules[method], "train", spy)
         context = Context(task, tiny_preset(), [0])
@@ -214,8 +214,8 @@ class TestData:
         same = {stream(purpose, seed) for purpose in (DEMOS, EXPLORATION, EVALUATION) for seed in range(100)}
         assert len(same) == 300
 
-    def test_the_oracle_is_told_the_truth(self) -> None:
-        """On the bandit it pulls the best arm as the expert does, 60 of 100, with four standard errors."""
+    def test_the_oracle_is_given_theta(self) -> None:
+        """On the bandit it pulls the best arm as often as the expert, 60 of 100, to four standard errors."""
         preset = replace(tiny_preset(), expert_trials=400, eval_trials=200)
         preset = preset.configured("oracle_bc", updates=300, batch=1024)
         context = Context(envs.get("bandit"), preset, [0])
@@ -224,7 +224,7 @@ class TestData:
 
 
 def make(kind: str, name: str = CONTROL) -> tuple[LatentModel, Batch, Draws, DeconfoundedAgent]:
-    """An untrained model of two seeds, expert trials, and the agent that stands on it."""
+    """An untrained model of two seeds, expert trials, and the model's agent."""
     env = envs.BatchEnv(envs.get(name), 6)
     trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 2, 1).trials
     data, draws = Batch.of(trials, 2), Draws([np.random.default_rng(i) for i in range(2)], "cpu")
@@ -249,16 +249,16 @@ class TestLatents:
             assert (first != second).all()
 
     def test_deployment_draws_theta_hat(self, kind: str) -> None:
-        """Of 400 histories without a transition it has the prior's spread, and another value at the next step."""
+        """Over 400 empty histories it has the prior's mean and std, and another value at the next step."""
         model, _, _, agent = make(kind)
         agent.begin(800)
         agent.reset([np.random.default_rng(i) for i in range(2)])
         first, second = agent.latent(), agent.latent()
         assert (first != second).any()
-        once = DeconfoundedAgent(model, agent.policy, "episode")
-        once.begin(800)
-        once.reset([np.random.default_rng(i) for i in range(2)])
-        assert torch.equal(once.latent(), once.latent())
+        per_episode = DeconfoundedAgent(model, agent.policy, "episode")
+        per_episode.begin(800)
+        per_episode.reset([np.random.default_rng(i) for i in range(2)])
+        assert torch.equal(per_episode.latent(), per_episode.latent())
         mean, std = (1 / 3, (2 / 9) ** 0.5) if kind == "discrete" else (None, None)
         if kind == "evidence":
             mean, std = 0.0, 1.0
@@ -267,15 +267,15 @@ class TestLatents:
             torch.testing.assert_close(first.std(1), torch.full((2, 3), std), rtol=0, atol=4 * std / 20)
 
     def test_memory_outlives_the_episode(self, kind: str) -> None:
-        """What an agent knows is the same before and after a reset within a trial, and nothing when a trial begins."""
+        """The memory stays in a reset within a trial, and is empty when a trial begins."""
         *_, agent = make(kind)
         env = envs.BatchEnv(envs.get(CONTROL), 4)
         run_trials(env, agent, 1, [0, 1])
-        known = agent.features().copy()
+        memory = agent.features().copy()
         agent.reset([np.random.default_rng(i) for i in range(2)])
-        np.testing.assert_array_equal(agent.features(), known)
+        np.testing.assert_array_equal(agent.features(), memory)
         agent.begin(4)
-        assert (agent.features() != known).any()
+        assert (agent.features() != memory).any()
 
 
 def test_naive_memory_outlives_the_episode() -> None:
@@ -283,11 +283,11 @@ def test_naive_memory_outlives_the_episode() -> None:
     agent = fit(context, "naive_rnn")
     assert isinstance(agent, LearnedAgent)
     run_trials(context.env, agent, 1, [0])
-    known = agent.features()
-    assert known is not None
-    known = known.copy()
+    memory = agent.features()
+    assert memory is not None
+    memory = memory.copy()
     agent.reset([np.random.default_rng(0)])
-    np.testing.assert_array_equal(agent.features(), known)
+    np.testing.assert_array_equal(agent.features(), memory)
     agent.begin(4)
     assert not agent.features().any()
 
@@ -324,7 +324,7 @@ def test_offline_kl_is_of_the_posterior_from_the_prior(monkeypatch: pytest.Monke
 
 
 def watch_betas(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Grows by the beta of each update of a model."""
+    """A list that records the beta of each update of a model."""
     betas: list[float] = []
     learn = models.LatentModel.learn
 
@@ -337,7 +337,7 @@ def watch_betas(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def fitted(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> tuple[LatentModel, list[float]]:
-    """A model trained on next to nothing, and the beta of each of its updates."""
+    """A model after a few updates, and their betas."""
     betas = watch_betas(monkeypatch)
     agent = fit(Context(envs.get(CONTROL), tiny_preset().configured("deconfounded", **changes), [0]), "deconfounded")
     assert isinstance(agent, DeconfoundedAgent)
@@ -346,7 +346,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> tuple[LatentModel
 
 @pytest.mark.parametrize("warm_up", [0.5, 0.0])
 def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Linearly from 0 over the warm-up's share of all updates, and then it stays."""
+    """Linearly from 0 over the warm-up's share of all updates; then it is constant."""
     _, betas = fitted(monkeypatch, inference_updates=4, warm_up=warm_up, beta=0.1)
     rising = [0, 0.025, 0.05, 0.075] if warm_up else [0.1] * 4
     assert betas == pytest.approx([*rising, 0.1, 0.1, 0.1, 0.1])

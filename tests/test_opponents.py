@@ -1,4 +1,4 @@
-"""Each opponent does what it is there for: looks away from its actions, sees all the past, practises blindly."""
+"""Opponents: past actions are hidden or dropped, transformers are causal, GAIL's environments hide theta."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.gail import Discriminator, GailAgent, GailConfig
-from deconfounded.deconf.methods.naive_dropout import DroppingAgent
+from deconfounded.deconf.methods.gail_ppo import SequencePolicy, new_ppo
+from deconfounded.deconf.methods.naive_dropout import ActionDropoutAgent
 from deconfounded.deconf.methods.naive_obs import ObsAgent, ObsMemory
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
-from deconfounded.deconf.methods.practice import WholePolicy, new_ppo
 from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from deconfounded.experts.train import train
@@ -47,7 +47,7 @@ def streams(n: int = 1) -> Draws:
 
 
 def random_batch(draws: Draws, trials: int = 3, steps: int = 7) -> Batch:
-    """Trials as they could be: what follows a step is the next one's observation."""
+    """Random trials, with next observations that are those of the next step."""
     obs = draws.normal(trials, steps + 1, 2)
     action = 2 * draws.uniform(trials, steps, 1) - 1
     return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(len(draws), trials, steps))
@@ -62,7 +62,7 @@ def scaler(batch: Batch) -> Scaler:
 
 
 def test_tiers() -> None:
-    """What each may use is what it says: theta is seen by rma alone."""
+    """Tiers follow from declared data: rma alone sees theta."""
     tiers = {name: METHODS[name].tier for name in NEW}
     assert tiers == {
         **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr"), "1"),
@@ -72,15 +72,15 @@ def test_tiers() -> None:
     assert not set(DEFAULT) & set(NEW)
 
 
-class TestActionsAside:
-    def test_naive_obs_does_not_hear_of_its_actions(self) -> None:
-        """Its memory is the same whatever was done; naive_rnn's is not."""
+class TestPastActions:
+    def test_naive_obs_does_not_read_actions(self) -> None:
+        """Its memory does not depend on actions; naive_rnn's does."""
         draws = streams(2)
         batch = random_batch(draws)
         for kind, same in ((ObsMemory, True), (GruMemory, False)):
             memory = kind(8, FLAT, scaler(batch), draws)
-            one, other = (memory(b, memory.start(3))[:, :, -1] for b in (batch, other_actions(batch)))
-            assert torch.equal(one, other) == same
+            first, second = (memory(b, memory.start(3))[:, :, -1] for b in (batch, other_actions(batch)))
+            assert torch.equal(first, second) == same
 
     def test_naive_obs_acts_alike(self) -> None:
         draws = streams()
@@ -96,20 +96,20 @@ class TestActionsAside:
         np.testing.assert_array_equal(*chosen)
 
     def test_dropout_is_for_training_alone(self) -> None:
-        """Two losses differ, and what is left of an action is 0 or twice as much; nothing is left out elsewhere."""
+        """In training losses are random, and actions are multiplied by 0 or 2; elsewhere none is dropped."""
         draws = streams()
         batch = random_batch(draws, 50, 40)
-        agent = DroppingAgent.new(8, FLAT, scaler(batch), draws)
+        agent = ActionDropoutAgent.new(8, FLAT, scaler(batch), draws)
         agent.dropout, state, seen = 0.5, agent.memory.start(50), []
         embed = agent.memory._embed
 
         def spy(given: Batch) -> torch.Tensor:
-            seen.append(agent.memory.kept)
+            seen.append(agent.memory.action_mask)
             return embed(given)
 
         agent.memory._embed = spy  # type: ignore[method-assign]
-        one, other = (agent.loss(batch, batch.action, state)[0] for _ in range(2))
-        assert (one != other).all()
+        first, second = (agent.loss(batch, batch.action, state)[0] for _ in range(2))
+        assert (first != second).all()
         assert seen[0] is not None
         assert seen[0].unique().tolist() == [0, 2]
         assert seen[0].mean().item() == pytest.approx(1, abs=0.1)  # 2,000 draws; four standard errors
@@ -120,22 +120,22 @@ class TestActionsAside:
 
 
 class TestPalr:
-    def test_what_leaks_is_penalised(self) -> None:
-        """x = y tells all of y; what both have from z alone is no leakage; with neither there is none."""
+    def test_leakage_is_penalised(self) -> None:
+        """HSCIC is large for x = y, and small where x and y depend on each other through z alone, or not at all."""
         noise = streams().normal(3, 200, 2)[0]
         z, y = noise[0], noise[0] + noise[1]
-        found = {
+        values = {
             "leaks": hscic(y, y, z, 1e-2),
             "by z alone": hscic(noise[0] + noise[2], y, z, 1e-2),
             "nothing": hscic(noise[2], y, z, 1e-2),
         }
-        assert found["leaks"] > 5 * found["by z alone"]
-        assert found["leaks"] > 5 * found["nothing"]
-        assert min(found.values()) > -1e-4  # a squared distance
+        assert values["leaks"] > 5 * values["by z alone"]
+        assert values["leaks"] > 5 * values["nothing"]
+        assert min(values.values()) > -1e-4  # a squared distance
 
-    def test_training_takes_it_away(self) -> None:
-        """A memory that may tell of its last action, and need not: with the penalty it does less."""
-        left = []
+    def test_training_reduces_leakage(self) -> None:
+        """A memory need not depend on the last action: with the penalty it depends less."""
+        leakage = []
         for penalty in (0.0, 30.0):
             draws = streams()
             batch = random_batch(draws, 8, 20)
@@ -146,10 +146,10 @@ class TestPalr:
                 optimizer.step(agent.loss(batch, batch.action, agent.memory.start(8))[0])
             with torch.no_grad():
                 states = agent.memory(batch, agent.memory.start(8))[:, :, :-1]
-                left.append(agent.leakage(states, batch, batch.action).item())
-        assert left[1] < 0.75 * left[0]  # of so few samples, some dependence is always seen
+                leakage.append(agent.leakage(states, batch, batch.action).item())
+        assert leakage[1] < 0.75 * leakage[0]  # with few samples, the estimate is never 0
 
-    def test_no_penalty_in_what_is_reported(self) -> None:
+    def test_no_penalty_in_the_reported_loss(self) -> None:
         draws = streams()
         batch = random_batch(draws)
         agent = PalrAgent.new(8, FLAT, scaler(batch), draws)
@@ -166,19 +166,19 @@ def transformer(batch: Batch, window: int, layers: int = 2) -> TransformerAgent:
 
 class TestTransformer:
     def test_is_causal(self) -> None:
-        """What comes later changes nothing of what was known before; the past does."""
+        """Features do not depend on later tokens, but on earlier ones."""
         batch = random_batch(streams(2))
         agent = transformer(batch, 7)
         changed = Batch(*(x.clone() for x in batch.tensors))
         changed.obs[:, :, 4:] += 1
         changed.action[:, :, 3:] *= -1
         changed.next_obs[:, :, 3:] += 1
-        one, other = (agent.net(agent.tokens(b)) for b in (batch, changed))
-        torch.testing.assert_close(one[:, :, :4], other[:, :, :4], rtol=0, atol=1e-6)
-        assert (one[:, :, 4:] - other[:, :, 4:]).abs().amax(-1).min() > 1e-3
+        first, second = (agent.net(agent.tokens(b)) for b in (batch, changed))
+        torch.testing.assert_close(first[:, :, :4], second[:, :, :4], rtol=0, atol=1e-6)
+        assert (first[:, :, 4:] - second[:, :, 4:]).abs().amax(-1).min() > 1e-3
 
     def test_cache_is_the_full_pass(self) -> None:
-        """Step by step, over resets and waiting, as all at once over the steps that took place; to 1e-5."""
+        """Step by step, with resets and masked steps, features are those of a pass over the real steps; to 1e-5."""
         draws = streams(2)
         batch = random_batch(draws, 3, 12)
         agent = transformer(batch, 12)
@@ -194,7 +194,7 @@ class TestTransformer:
             with torch.no_grad():
                 agent.choose(now.obs)
             expected = torch.stack([full[s, range(3), at[s]] for s in range(2)])
-            torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+            torch.testing.assert_close(agent._features, expected, rtol=0, atol=1e-5)
             goes = ((~waits[:, :, t]) & (at < 11)).float()
             agent.remember(Batch(now.obs, now.action, now.next_obs, goes))
             at += goes.long()
@@ -204,7 +204,7 @@ class TestTransformer:
         assert seen > 40
 
     def test_window(self) -> None:
-        """With one layer, what is known after 20 steps is what the last 8 tokens say, wherever they are."""
+        """With one layer, features after 20 steps are those of the last 8 tokens, at any position."""
         batch = random_batch(streams(2), 3, 20)
         agent = transformer(batch, 8, layers=1)
         agent.begin(6)
@@ -214,7 +214,7 @@ class TestTransformer:
                 agent.choose(batch.obs[:, :, t])
             agent.remember(batch[:, :, t])
         expected = agent.net(agent.tokens(batch)[:, :, -8:])[:, :, -1]
-        torch.testing.assert_close(agent._known, expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(agent._features, expected, rtol=0, atol=1e-5)
 
     def test_held_out_loss_is_the_mean_over_steps(self) -> None:
         batch = random_batch(streams(), 40)
@@ -231,7 +231,7 @@ class TestMean:
 
     @pytest.mark.parametrize("kind", ["gru", "evidence"])
     def test_acts_on_the_mean(self, kind: str) -> None:
-        """No draw: it is the belief's mean each time, and in training too, as the memory has it at that step."""
+        """The latent is the belief's mean, without a draw, and in training that of the same step."""
         draws = streams(2)
         batch = random_batch(draws)
         agent = self.agent(draws, batch, kind)
@@ -264,7 +264,7 @@ class TestMean:
         torch.testing.assert_close(losses[1] - losses[0], expected, rtol=1e-3, atol=1e-5)
 
     def test_a_latent_predicts_steps_ahead(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Of the k-th step from now: with changes that grow by one a step and a model that says 0, errors are known."""
+        """Errors are known for changes that grow by 1 a step and a model that predicts 0."""
         steps, ahead = 12, 4
         obs = torch.arange(steps + 1.0).cumsum(0).reshape(1, 1, -1, 1).expand(1, 2, -1, 2)  # changes 1, 2, ...
         batch = Batch(obs[:, :, :-1], torch.zeros(1, 2, steps, 1), obs[:, :, 1:], torch.ones(1, 2, steps))
@@ -274,20 +274,20 @@ class TestMean:
         monkeypatch.setattr(model.dynamics, "forward", lambda obs, *rest: torch.zeros_like(obs)[..., None, :])
         monkeypatch.setattr(model.dynamics, "change", torch.nn.Identity())
         config = MeanConfig(beta=0.0, ahead=ahead, inference_steps=20_000)
-        found = deconfounded_mean.inference_loss(model, batch, config, draws).item()
+        loss = deconfounded_mean.inference_loss(model, batch, config, draws).item()
         pairs = [(t + k + 1) ** 2 for t in range(steps) for k in range(ahead) if t + k < steps]
-        assert found == pytest.approx(ahead * np.mean(pairs), rel=0.03)
+        assert loss == pytest.approx(ahead * np.mean(pairs), rel=0.03)
 
 
 def made(method: str, task: str = CONTROL, seeds: tuple[int, ...] = (0,), monitor: Monitor | None = None) -> Agent:
-    """Trained on next to nothing, and handed what it declares that it uses."""
+    """An agent after a few updates, from the data that its method declares."""
     context = Context(envs.get(task), tiny_preset(), seeds, monitor)
     return fit(context, method)
 
 
 class TestRma:
-    def test_what_it_is_told_is_theta(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """On the bandit: in the trials it is told of, the arm called best pays out 3 times in 4, others 1 in 4."""
+    def test_its_targets_are_theta(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """On the bandit the best arm by its targets pays 3 times in 4, others 1 in 4."""
         handed: list[Any] = []
 
         def spy(*given: Any) -> Any:
@@ -307,15 +307,15 @@ class TestRma:
         assert context.monitor.budget["exploration_trials"] == [100, 100]
         assert context.monitor.budget["thetas"] == [104, 104]
 
-    def test_labels_lie_along_the_steps(self) -> None:
-        """Each step's theta is its episode's, though episodes end early."""
+    def test_targets_at_steps(self) -> None:
+        """A step's theta is its episode's, though episodes end early."""
         mask = np.array([[[1, 0, 0], [1, 1, 0]]], bool)
         theta = np.array([[[0.1], [0.2]]])
         trials = Trials(np.zeros((1, 2, 4, 1)), np.zeros((1, 2, 3, 1)), mask)
-        assert rma.along(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
+        assert rma.per_step(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
 
     def test_the_student_sees_no_theta(self) -> None:
-        """Deployed, it is told nothing: a history makes it act alike under every theta."""
+        """In deployment it acts alike after the same history under every theta."""
         agent = made("rma")
         chosen = []
         for theta in (-1, 1):
@@ -331,15 +331,15 @@ class TestRma:
         np.testing.assert_array_equal(*chosen)
 
 
-def practice(n: int = 3, task: str = CONTROL) -> tuple[Any, Vector]:
-    """What GAIL practises in, and the environments behind it."""
-    from deconfounded.deconf.methods.practice import Practice
+def gail_env(n: int = 3, task: str = CONTROL) -> tuple[Any, Vector]:
+    """GAIL's vector environment, and the environments behind it."""
+    from deconfounded.deconf.methods.gail_ppo import TrialVecEnv
 
     context = Context(envs.get(task), tiny_preset(), [0])
     provider, width = Provider(context, ["exploration"], context.rngs), len(context.task.observation)
     environments = Environments(provider, provider("environments", 0, n), n)
     none: Callable[..., NDArray[np.float32]] = lambda obs, action, then: np.zeros(len(obs), np.float32)  # noqa: E731
-    made = Practice(environments, context.task.action_space, np.zeros(width), np.ones(width), none)
+    made = TrialVecEnv(environments, context.task.action_space, np.zeros(width), np.ones(width), none)
     return made, provider._vectors[0]
 
 
@@ -347,14 +347,14 @@ class TestGail:
     def test_the_agent_is_what_ppo_trained(self) -> None:
         """Step by step the same distribution of actions as Stable-Baselines3's policy; to 1e-5."""
         for task in (CONTROL, "bandit"):
-            (env, _), config = practice(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
+            (env, _), config = gail_env(4, task), GailConfig(width=8, envs=4, steps=16, minibatch=16, epochs=1)
             ppo = new_ppo(env, config, 0)
             trials = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0).trials
             signature = Signature.of(trials)
             obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))
             obs.std.fill_(1)
             agent = GailAgent.blank({"width": 8}, signature, obs, streams())
-            agent.take(0, ppo.policy)
+            agent.load_policy(0, ppo.policy)
             agent.begin(4)
             agent.reset([np.random.default_rng(0)])
             state = tuple(torch.zeros(1, 4, 8) for _ in range(2))
@@ -383,12 +383,12 @@ class TestGail:
         lstm, state = torch.nn.LSTM(3, 5), tuple(torch.randn(1, 4, 5, generator=draws) for _ in range(2))
         found, calls = [], list[object]()
         lstm.register_forward_hook(lambda *call: calls.append(call))
-        for policy in (WholePolicy, WholePolicy.__base__):
+        for policy in (SequencePolicy, SequencePolicy.__base__):
             lstm.zero_grad()
             out, after = policy._process_sequence(features, state, starts, lstm)
             (out.sum() + after[1].sum()).backward()
             found.append([out, *after, *(weight.grad.clone() for weight in lstm.parameters())])
-            if policy is WholePolicy:
+            if policy is SequencePolicy:
                 assert len(calls) == (7 if any(i % 7 for i in begin) else 1)
         torch.testing.assert_close(*found, rtol=0, atol=1e-5)
 
@@ -408,9 +408,9 @@ class TestGail:
             assert (rewards[1] < 0).mean() > 0.9
             np.testing.assert_allclose(rewards[0], net(expert)[i].detach(), atol=1e-5)
 
-    def test_practice_is_blind_to_theta(self) -> None:
-        """What is observed is the task's own observation, the action before, and whether an episode begins."""
-        vec, behind = practice()
+    def test_its_environments_hide_theta(self) -> None:
+        """Its observation is the task's, the previous action, and a flag of an episode's start."""
+        vec, behind = gail_env()
         obs, width = vec.reset(), len(envs.get(CONTROL).observation)
         plain = envs.BatchEnv(envs.get(CONTROL), 3)
         np.testing.assert_array_equal(obs[:, :width], plain.reset(behind.seeds))
@@ -424,8 +424,8 @@ class TestGail:
         assert infos == [{}] * 3
 
     def test_a_trial_is_an_episode_of_ppo(self) -> None:
-        """theta stays, and is another one as soon as `done` says so, after as many episodes as the task has."""
-        vec, behind = practice()
+        """theta changes when `done` is true, after as many episodes as the task has, and at no other step."""
+        vec, behind = gail_env()
         vec.reset()
         episodes, theta, ended = np.zeros(3, int), behind.batch.theta.copy(), 0
         for action in 2 * np.random.default_rng(0).random((400, 3, 1)) - 1:
@@ -442,7 +442,7 @@ class TestGail:
         assert behind.context.monitor.budget["exploration_trials"] == [3 + ended]
 
     def test_interactions_are_counted(self) -> None:
-        """Two rounds of 32 steps in 2 environments, for each seed; and none is left of the task's own reward."""
+        """Two rounds of 32 steps in 2 environments, for each seed; global generators are restored."""
         monitor = Monitor()
         state, numbers = torch.get_rng_state(), np.random.get_state()[1].copy()  # noqa: NPY002
         made("gail", seeds=(0, 1), monitor=monitor)
@@ -475,11 +475,11 @@ def test_no_rounds_is_one_line(method: str) -> None:
 
 
 class Unplugged(Monitor):
-    """Keeps what training needs to go on; the first time, training ends when it has been saved `lasts` times."""
+    """Keeps a checkpoint; the first training is interrupted when it has been saved `lasts` times."""
 
     def __init__(self, lasts: int) -> None:
         super().__init__()
-        self.lasts, self.kept, self.on = lasts, None, True
+        self.lasts, self.kept = lasts, None
         self.kept: Training | None
 
     def save(self, state: Callable[[], Training]) -> None:
@@ -493,22 +493,22 @@ class Unplugged(Monitor):
 
 
 @pytest.mark.parametrize("method", NEW)
-def test_interrupted_training_goes_on(method: str) -> None:
-    """What went on after its first checkpoint acts, bit for bit, as what was never interrupted; loaded, it does too."""
+def test_interrupted_training_resumes(method: str) -> None:
+    """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one."""
     monitor, task = Unplugged(1), envs.get("bandit")
     with pytest.raises(KeyboardInterrupt):
         made(method, "bandit", monitor=monitor)
-    found: list[Array] = []
+    actions: list[Array] = []
     whole = made(method, "bandit")
     assert isinstance(whole, LearnedAgent)
     for agent in (whole, made(method, "bandit", monitor=monitor), type(whole).from_state(*whole.state())):
-        found.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1).trials.action)
-    np.testing.assert_array_equal(found[1], found[0])
-    np.testing.assert_array_equal(found[2], found[0])
+        actions.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1).trials.action)
+    np.testing.assert_array_equal(actions[1], actions[0])
+    np.testing.assert_array_equal(actions[2], actions[0])
 
 
 @pytest.mark.parametrize("method", NEW)
-def test_one_seed_of_two_is_kept(method: str) -> None:
+def test_a_seed_of_two_alone(method: str) -> None:
     agent = made(method, seeds=(0, 1))
     assert isinstance(agent, LearnedAgent)
     env = envs.BatchEnv(envs.get(CONTROL), 4)

@@ -31,7 +31,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import naive_rnn
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
 from deconfounded.experts import policy, store
@@ -578,7 +578,7 @@ class TestSaved:
         (tmp_path / "agent.json").write_text("{")
         with pytest.raises(envs.InputError, match="is damaged"):
             deconfounded.load(tmp_path)
-        about = {"class": "deconfounded.deconf.methods.recurrent:RecurrentAgent", "settings": {}}
+        about = {"class": "deconfounded.deconf.methods.sequence_bc:RecurrentAgent", "settings": {}}
         for arrays, says in (
             (None, "is of no agent"),
             ("0" * 64, r"agent\.safetensors is damaged, or of another agent"),

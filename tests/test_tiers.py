@@ -14,9 +14,9 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.exact import ExactAgent, Grid
-from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
@@ -89,8 +89,8 @@ def test_who_sees_theta_can_clone(name: str) -> None:
     expert, encode = policy.load(env.task), env.task.encode_theta
     trials = run_trials(env, ExpertAgent(env, expert), env.task.episodes, seed=1).trials
     own, shown = envs.BatchEnv(env.task, N), encode(thetas(env.task, 64, env.task.episodes, 1))
-    config = CloningConfig(updates=1500)
-    oracle = cloning.train(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
+    config = MemorylessConfig(updates=1500)
+    oracle = memoryless_bc.train(trials, config, np.random.default_rng(0), shown, lambda: encode(own.theta))
     assert scores(own, oracle)[-1] > 0.9
 
 

@@ -112,13 +112,13 @@ from functools import partial
 from deconfounded import __main__ as entrance
 from deconfounded.deconf.diagnosis import diagnose
 from deconfounded.deconf.diagnosis.measures import Amounts
-from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
-from deconfounded.deconf.methods.recurrent import RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 
 offline = OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4)
-networks = CloningConfig(updates=5), RecurrentConfig(updates=6, batch=4), offline, DeconfoundedConfig()
+networks = MemorylessConfig(updates=5), RecurrentConfig(updates=6, batch=4), offline, DeconfoundedConfig()
 diagnose.DiagnoseConfig = partial(diagnose.DiagnoseConfig, refits=1, amounts=Amounts(.25, 2, 4, *networks))
 for line in sys.argv[1].splitlines():
     sys.argv = ["deconf", *line.split()]

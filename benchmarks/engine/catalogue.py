@@ -49,7 +49,7 @@ def add(reference: str) -> str:
     where, _, function = reference.rpartition(":")
     stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
     name = re.sub(r"[^A-Za-z0-9_]", "_", stem if function == "fit" else f"{stem}_{function}")
-    made = replace(fit.method, reference=outside.absolute(reference), version=0, exact=False, ways={})
+    made = replace(fit.method, reference=outside.absolute(reference), version=0, exact=False, deployments={})
     taken = {"all", "demonstrations", *labels(methods.METHODS)}
     if name in taken or METHODS.outside.setdefault(name, made).reference != made.reference:
         raise envs.InputError(f"method {reference!r} would be called {name}, which there is already; rename its file")
@@ -58,7 +58,7 @@ def add(reference: str) -> str:
 
 def labels(names: Iterable[str]) -> list[str]:
     """What the agents of methods are called in tables, by way of deployment."""
-    return [label(name, way) for name in names for way in ("", *METHODS[name].ways)]
+    return [label(name, way) for name in names for way in ("", *METHODS[name].deployments)]
 
 
 def label(method: str, deployment: str) -> str:

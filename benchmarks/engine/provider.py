@@ -171,4 +171,4 @@ def fit(context: Context, name: str) -> Agent:
 
 def deployed(name: str, agent: Agent) -> dict[str, Agent]:
     """The agent by its way of deployment: under the empty name as it is, then the method's further ways."""
-    return {"": agent, **{way: deploy(agent) for way, deploy in METHODS[name].ways.items()}}
+    return {"": agent, **{way: deploy(agent) for way, deploy in METHODS[name].deployments.items()}}

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 
 from deconfounded.benchmarks.output.colours import colour
 from deconfounded.benchmarks.output.index import template
-from deconfounded.deconf.diagnosis.diagnose import FINE, LITTLE, STAKES, Diagnosis, Figure
+from deconfounded.deconf.diagnosis.diagnose import GOOD, NEGLIGIBLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
 
 Rows = dict[str, tuple[Figure, str]]
@@ -25,107 +25,107 @@ Rows = dict[str, tuple[Figure, str]]
 WIDE = 30  # times the threshold: what is further off goes on a logarithmic axis
 
 
-def write(found: Diagnosis, about: dict[str, Any], folder: Path) -> str:
+def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     """Both files; returns what to print."""
-    code = _code(found, about)
+    code = _code(diagnosis, about)
     made = {
-        "verdict": found.verdict,
-        "tier": found.tier,
-        "reasons": list(found.reasons),
-        "next": {"advice": found.next.advice, "code": code},
-        "found": {key: figure._asdict() for key, figure in found.found.items()},
+        "verdict": diagnosis.verdict,
+        "tier": diagnosis.tier,
+        "reasons": list(diagnosis.reasons),
+        "next": {"advice": diagnosis.next.advice, "code": code},
+        "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
-    findings = [(title, text, _encoded(draw)) for title, text, draw in _findings(found)]
-    page = template("diagnosis.html.jinja").render(diagnosis=found, findings=findings, code=code, about=about)
+    findings = [(title, text, _encoded(draw)) for title, text, draw in _findings(diagnosis)]
+    page = template("diagnosis.html.jinja").render(diagnosis=diagnosis, findings=findings, code=code, about=about)
     write_atomically(folder / "index.html", page + "\n")
-    reasons = "\n".join(found.reasons)
+    reasons = "\n".join(diagnosis.reasons)
     how = f"\n\n{code}" if code else ""
-    return f"{found.verdict.upper()}\n{reasons}\nNext: {found.next.advice}{how}\n-> {folder / 'index.html'}"
+    return f"{diagnosis.verdict.upper()}\n{reasons}\nNext: {diagnosis.next.advice}{how}\n-> {folder / 'index.html'}"
 
 
-def _code(found: Diagnosis, about: dict[str, Any]) -> str:
+def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     """Lines of Python that do what is to be done next, if a method does it."""
-    if not found.next.fit:
+    if not diagnosis.next.fit:
         return ""
     source = about["trials"]["from"]
     read = f"Trials.{'from_minari' if Path(source).is_dir() else 'load'}(Path({source!r}))"
-    method = found.next.fit.partition(".")[0]
+    method = diagnosis.next.fit.partition(".")[0]
     return f"""from pathlib import Path
 import numpy as np
 from deconfounded.deconf.methods import {method}
 from deconfounded.experts.rollout import Trials
 
 trials = {read}
-agent = {found.next.fit}
+agent = {diagnosis.next.fit}
 agent.save("agent")
 """
 
 
-def _findings(found: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
+def _findings(diagnosis: Diagnosis) -> list[tuple[str, str, Callable[[Axes], None]]]:
     """Title, two sentences, and what to draw."""
-    figure = found.found
+    figure = diagnosis.figures
     memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
     stakes, strayed = figure["stakes"], figure["strayed"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
-    whence = "Exploration would show how much of that the world's answers tell, and how much past actions alone."
+    source = "Exploration would show how much of that is evidence of the dynamics, and how much of past actions alone."
     if "explained" in figure:
-        world = figure["explained"]
-        predictors["the world's answers"] = (world, colour("interventional"))
-        whence = (
-            f"A latent that is read off the world's answers alone tells {world} of it (below 0, less than the present"
-            " observation does). What is left memory reads off the expert's past actions, for the most part, and a"
-            " clone that acts by itself learns nothing from its own."
+        explained = figure["explained"]
+        predictors["latent from dynamics"] = (explained, colour("interventional"))
+        source = (
+            f"A latent that is inferred from the dynamics alone accounts for {explained} of it (below 0: it predicts"
+            " less well than the present observation). The rest is, for the most part, evidence of the expert's past"
+            " actions, and a clone's own actions are no evidence."
         )
     sections: list[tuple[str, str, Callable[[Axes], None]]] = [
         (
-            "Is there a hidden context, and where does it show?",
-            f"Memory of a trial predicts the expert's action {memory} nats a step better than the present observation"
-            f" alone; {LITTLE} is nothing. {whence}",
-            lambda axes: _bars(axes, predictors, "nats a step over the present observation", LITTLE),
+            "Is there a latent, and where is its evidence?",
+            f"A memory of the trial predicts the expert's action {memory} nats a step better than the present"
+            f" observation alone; {NEGLIGIBLE} is negligible. {source}",
+            lambda axes: _bars(axes, predictors, "nats a step over the present observation", NEGLIGIBLE),
         ),
     ]
     if "explored" in figure:
-        met, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
-        told: Rows = {
-            "world, in exploration": (met, colour("interventional")),
-            "world, where the expert went": (shown, colour("expert")),
+        explored, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
+        evidence: Rows = {
+            "dynamics, in exploration": (explored, colour("interventional")),
+            "dynamics, in expert trials": (shown, colour("expert")),
             "the expert's actions": (acted, colour("naive_rnn")),
         }
         sections.append(
             (
-                "Does the world tell it?",
-                f"A trial's own latent makes what the world answers {met} nats a step more likely than another trial's"
-                f" in exploration, whose actions are blind to it, and {shown} where the expert went. If the latter is"
-                f" below {LITTLE}, and explains next to none of the actions, expert trials do not say which latent was"
-                f" theirs. The expert's actions tell it by {acted} nats a step, {figure['ratio']} times as much: so"
-                " sure is a clone that takes its own actions for the expert's.",
-                lambda axes: _bars(axes, told, "nats a step", LITTLE),
+                "Are the dynamics evidence of it?",
+                f"A trial's own latent makes next observations {explored} nats a step more likely than another trial's"
+                f" in exploration, whose actions do not depend on it, and {shown} in expert trials. If the latter is"
+                f" below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do not"
+                f" identify it. The expert's actions are evidence of it by {acted} nats a step, {figure['ratio']} times"
+                " as much: this is the false confidence of a clone that takes its own actions for the expert's.",
+                lambda axes: _bars(axes, evidence, "nats a step", NEGLIGIBLE),
             )
         )
-    ways: Rows = {
-        "among those who know": (stakes, colour("expert")),
-        "from that very expert's": (strayed, colour("expert")),
+    deviations: Rows = {
+        "from all with right latents": (stakes, colour("expert")),
+        "paired by latent and start": (strayed, colour("expert")),
     }
     sections.append(
         (
             "What is at stake?",
-            f"In the learned dynamics, the ways of one who acts on another latent are {stakes} times as strange, among"
-            f" those of experts who know theirs, as by chance, and {strayed} times as far from those of the expert who"
-            f" knows it; below {STAKES} that may be chance. Dreams are {figure['unlike']} times as strange as data.",
-            lambda axes: _bars(axes, ways, "ways of the mistaken one, times chance", STAKES),
+            f"In the learned dynamics, trajectories of an expert policy given a wrong latent deviate {stakes} times as"
+            f" much as by chance from those given right latents, and {strayed} times as much when paired by latent and"
+            f" start; below {STAKES} that may be chance. Trajectories in the learned dynamics deviate from the data's"
+            f" {figure['unlike']} times as much as by chance.",
+            lambda axes: _bars(axes, deviations, "deviation under a wrong latent, times chance", STAKES),
         )
     )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
-    scores: Rows = {who: (figure[key], colour(hue)) for who, key, hue in actors}
-    scores |= {f"{who}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for who, key, hue in actors}
+    scores: Rows = {actor: (figure[key], colour(hue)) for actor, key, hue in actors}
+    scores |= {f"{actor}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for actor, key, hue in actors}
     sections.append(
         (
             "What will it cost?",
-            f"Between one who acts on another latent, 0, and the expert who knows it, 1, a naive clone scores {naive}"
-            f" by where it goes, and one that infers the latent from the world {latent}. Eq. (1) is the same by what"
-            " they do, as that expert judges it.",
-            lambda axes: _bars(axes, scores, "predicted score, last episode", FINE),
+            f"From 0 for the expert policy given a wrong latent to 1 for the right one, a naive clone scores {naive} by"
+            f" trajectories, and a policy that infers the latent from the dynamics {latent}. Eq. (1) scores actions.",
+            lambda axes: _bars(axes, scores, "predicted score, last episode", GOOD),
         )
     )
     return sections

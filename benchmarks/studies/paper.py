@@ -32,7 +32,7 @@ from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
-from deconfounded.deconf.methods.recurrent import RecurrentAgent
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts import policy

@@ -65,7 +65,7 @@ def by_steps(steps: int) -> dict[str, float]:
     from deconfounded.deconf.core.models import VariationalModel
     from deconfounded.deconf.core.monitor import Monitor
     from deconfounded.deconf.core.nets import Adam, scalers
-    from deconfounded.deconf.methods.recurrent import Cloner, RecurrentAgent, RecurrentConfig
+    from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
     from deconfounded.experts.rollout import Trials
 
     rng = np.random.default_rng(0)
@@ -76,10 +76,10 @@ def by_steps(steps: int) -> dict[str, float]:
     scaled = scalers(data)
     model, config = VariationalModel("evidence", 4, 64, signature, *scaled, draws), RecurrentConfig()
     optimizer, agent = Adam([model], 1e-3), RecurrentAgent.new(config.width, signature, scaled[0], draws)
-    cloner = Cloner(agent, config, steps, Monitor())
+    trainer = RecurrentTrainer(agent, config, steps, Monitor())
     timed = {
         "an update of the belief": lambda: model.learn(optimizer, data, 1024, 1e-3, draws),
-        "a pass of the RNN": lambda: cloner.learn(data, data.action),
+        "a pass of the RNN": lambda: trainer.learn(data, data.action),
     }
     return stepping.seconds(timed, time.process_time)
 

@@ -47,25 +47,26 @@ TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
 
 
-def right(task: envs.Task, certified: bool, told: Diagnosis) -> bool:
+def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
     """Whether a diagnosis says what is so; of a certified task, that Tier 2 cures it.
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
-    from deconfounded.deconf.diagnosis.diagnose import VARY
+    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
-        return bool(told.verdict == "confounded" and told.tier == 3)
-    alike = task.name == "nothing_hidden" and told.next is VARY
-    return bool(alike or (told.verdict, told.tier) == (("confounded", 2) if certified else ("not confounded", 1)))
+        return bool(diagnosis.verdict == "confounded" and diagnosis.tier == 3)
+    alike = task.name == "nothing_hidden" and diagnosis.next is VARY_LATENT
+    expected = ("confounded", 2) if certified else ("not confounded", 1)
+    return bool(alike or (diagnosis.verdict, diagnosis.tier) == expected)
 
 
-def predicted(told: Diagnosis) -> float:
+def predicted(diagnosis: Diagnosis) -> float:
     """The gap that Tier 2 could close, in scores; 0 where nothing is confounded, or alike, or queries are needed."""
-    from deconfounded.deconf.diagnosis.diagnose import VARY
+    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
-    nothing = told.verdict == "not confounded" or told.tier == 3 or told.next is VARY
-    return 0.0 if nothing else told.found["gap"].value
+    nothing = diagnosis.verdict == "not confounded" or diagnosis.tier == 3 or diagnosis.next is VARY_LATENT
+    return 0.0 if nothing else diagnosis.figures["gap"].value
 
 
 def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:
@@ -86,8 +87,8 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
         Trials.load(file, made_of)
     except envs.InputError:
         rngs = context.rngs  # once: each exploration draws thetas of its own
-        wanderer = exploration.fit(shown, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
-        joined([context.explore(agent, rngs) for agent in (None, wanderer)]).save(file, made_of)
+        policy = exploration.fit(shown, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
+        joined([context.explore(agent, rngs) for agent in (None, policy)]).save(file, made_of)
     return folder / f"demonstrations-{SEED}.npz", file
 
 
@@ -141,23 +142,23 @@ def main() -> None:
         task, source = envs.get(known[name]), CASES[known[name]]
         folder = args.out / task.name
         folder.mkdir(parents=True, exist_ok=True)
-        told, _ = run(*data(task, source, folder), 0, folder / "diagnosis", f"deconf validate --tasks {name}")
+        diagnosis, _ = run(*data(task, source, folder), 0, folder / "diagnosis", f"deconf validate --tasks {name}")
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
         row = {
             "case": name,
             "task": task.name,
             "certified": certified,
-            "verdict": told.verdict,
-            "tier": told.tier,
-            "right": right(task, certified, told),
-            "predicted": predicted(told),
+            "verdict": diagnosis.verdict,
+            "tier": diagnosis.tier,
+            "right": right(task, certified, diagnosis),
+            "predicted": predicted(diagnosis),
             "measured": scores["deconfounded"] - scores["naive_rnn"],
-            "found": {key: figure._asdict() for key, figure in told.found.items()},
+            "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
         rows = {one["case"]: one for one in validation.rows(kept)} | {name: row}
         write_json(kept, [rows[case] for case in known if case in rows])
-        print(f"{task.name}: {told.verdict}, {'right' if row['right'] else 'WRONG'}")
+        print(f"{task.name}: {diagnosis.verdict}, {'right' if row['right'] else 'WRONG'}")
     validation.picture(validation.rows(kept), kept.with_suffix(".png"))
     print(f"{validation.told(validation.rows(kept))} -> {kept.parent}")
 

@@ -1,1 +1,1 @@
-"""What several methods share: data, networks, beliefs, models, agents."""
+"""Data, networks, beliefs, models and agents that several methods share."""

@@ -1,4 +1,4 @@
-"""What fitting a method and deploying it have in common: the monitor of training, and the agent of S seeds."""
+"""Checkpoints of training, and the agent of S seeds that learned methods return."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.data import Batch, Draws, Signature, listed
+from deconfounded.deconf.core.data import Batch, Draws, Signature, as_generators
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import ActionHead, Scaler
 from deconfounded.envs.streams import Array
@@ -23,20 +23,20 @@ from deconfounded.experts.rollout import Agent, State
 
 
 class Stateful(Protocol):
-    """A network, an optimizer, or random numbers."""
+    """A network, an optimizer, or streams of random numbers."""
 
     def state_dict(self) -> dict[str, Any]: ...
     def load_state_dict(self, state: dict[str, Any], /) -> Any: ...
 
 
 class Checkpoint:
-    """The parts of a training run, to be left with its monitor and put back as they were."""
+    """Saves the parts of a training run with its monitor, and restores them."""
 
     def __init__(self, monitor: Monitor, rngs: Sequence[np.random.Generator], **parts: Stateful) -> None:
         self.monitor, self.rngs, self.parts = monitor, rngs, parts
 
     def save(self, **rest: Any) -> None:
-        """rest: what else is needed to go on."""
+        """Save parts and generators. rest: whatever else resuming needs."""
         self.monitor.save(
             lambda: {
                 "rngs": [rng.bit_generator.state for rng in self.rngs],
@@ -46,7 +46,7 @@ class Checkpoint:
         )
 
     def load(self) -> Training | None:
-        """Put the parts back; returns the rest. None, and nothing is touched, if nothing was saved."""
+        """Restore the parts and return the rest; None, without any change, if nothing was saved."""
         if (state := self.monitor.load()) is None:
             return None
         for rng, before in zip(self.rngs, state["rngs"], strict=True):
@@ -57,14 +57,14 @@ class Checkpoint:
 
 
 def ramp(done: int, until: float) -> float:
-    """Rises from 0 to 1."""
+    """A linear warm-up from 0 to 1, over `until` updates."""
     return min(1.0, done / until) if until else 1.0
 
 
 class LearnedAgent(Agent):
     """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers.
 
-    Raises InputError where it is used out of order: `begin`, then `reset`, then `act` and `observe`.
+    Calls go in the order `begin`, `reset`, `act`, `observe`; otherwise they raise InputError.
     """
 
     def __init__(self, policy: ActionHead) -> None:
@@ -80,12 +80,14 @@ class LearnedAgent(Agent):
         self._draws = Draws([], self.device)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        given = listed(rngs)
+        generators = as_generators(rngs)
         if not self._n:
             raise InputError("reset was called before begin; begin(n) says how many trials there are")
-        if len(given) != self.seeds:
-            raise InputError(f"an agent of {self.seeds} seeds was given {len(given)} generators; it needs one for each")
-        self._draws = Draws(given, self.device)
+        if len(generators) != self.seeds:
+            raise InputError(
+                f"an agent of {self.seeds} seeds was given {len(generators)} generators; it needs one for each"
+            )
+        self._draws = Draws(generators, self.device)
 
     @torch.no_grad()
     def act(self, obs: NDArray[np.float32]) -> Array:
@@ -112,20 +114,20 @@ class LearnedAgent(Agent):
         self.remember(Batch.step(self._tensor(obs), action, next_obs, alive))
 
     def remember(self, step: Batch) -> None:
-        """Take note of a transition; agents without memory need nothing here."""
+        """Update the memory with a transition of each trial; nothing, for agents without memory."""
 
     @abstractmethod
     def parts(self) -> dict[str, nn.Module]:
-        """Its networks."""
+        """Networks by name."""
 
     @abstractmethod
     def shape(self) -> dict[str, Any]:
-        """What `blank` needs, beside the signature, to make networks of the same shape."""
+        """Sizes from which `blank` makes networks of the same shape."""
 
     @classmethod
     @abstractmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> LearnedAgent:
-        """An agent with those networks, that knows nothing."""
+        """An untrained agent with networks of that shape."""
 
     def state(self) -> State:
         settings = {"seeds": self.seeds, "signature": asdict(self.policy.signature), "shape": self.shape()}
@@ -135,9 +137,9 @@ class LearnedAgent(Agent):
     @classmethod
     def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LearnedAgent:
         signature, seeds = Signature(**settings["signature"]), settings["seeds"]
-        nothing = torch.zeros(seeds, 2, signature.obs)
+        zeros = torch.zeros(seeds, 2, signature.obs)
         draws = Draws([np.random.default_rng(0) for _ in range(seeds)], "cpu")
-        agent = cls.blank(settings["shape"], signature, Scaler(nothing, nothing[..., 0] + 1), draws)
+        agent = cls.blank(settings["shape"], signature, Scaler(zeros, zeros[..., 0] + 1), draws)
         for name, part in agent.parts().items():
             own = {key.removeprefix(f"{name}."): x for key, x in arrays.items() if key.startswith(f"{name}.")}
             part.load_state_dict({key: torch.tensor(x) for key, x in own.items()})
@@ -145,11 +147,11 @@ class LearnedAgent(Agent):
         return agent
 
     def of_seed(self, i: int) -> LearnedAgent:
-        """The agent of the i-th seed, by itself, on the CPU."""
+        """The agent of the i-th seed alone, on the CPU."""
         settings, arrays = self.state()
-        own = {key: x[i : i + 1] if x.ndim else x for key, x in arrays.items()}  # what is stacked, is over seeds
+        own = {key: x[i : i + 1] if x.ndim else x for key, x in arrays.items()}  # the first axis is of seeds
         return self.from_state({**settings, "seeds": 1}, own)
 
     def save(self, folder: Path | str) -> None:
-        """Keep it in a folder, for `deconfounded.load`."""
+        """Save the agent in a folder, for `deconfounded.load`."""
         store.save(self, Path(folder))

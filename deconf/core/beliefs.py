@@ -16,11 +16,11 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.gru import GruScan
 from deconfounded.deconf.core.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
 
-FEW = 16  # products of actions and changes, that evidence may read beside both
+MAX_PRODUCTS = 16  # of actions and changes, as inputs of the evidence network
 
 
 class Belief(nn.Module, ABC):
-    """q_phi and the prior p(theta_hat), a Gaussian in each of D dimensions: N(0, 1) until `set_prior`."""
+    """q_phi(theta_hat | tau) and the prior p(theta_hat), a diagonal Gaussian: N(0, 1) until `set_prior`."""
 
     inputs: Inputs
     prior_mean: Tensor
@@ -34,13 +34,13 @@ class Belief(nn.Module, ABC):
     def set_prior(self, theta_hat: Tensor) -> None:
         """Fit the prior to latents [S, B, D] inferred on whole trials (empirical Bayes).
 
-        Without it, early samples are spread over more of the latent space than there is data for.
+        With N(0, 1) instead, early samples cover more of the latent space than the data does.
         """
         self.prior_mean.copy_(theta_hat.mean(1))
         self.prior_std.copy_(theta_hat.std(1, correction=0).clamp(min=0.05))
 
     def prior(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std, shaped to go with [S, ..., D]."""
+        """Mean and std, broadcast against [S, ..., D]."""
         return per_seed(self.prior_mean, like), per_seed(self.prior_std, like)
 
     @abstractmethod
@@ -53,7 +53,7 @@ class Belief(nn.Module, ABC):
 
     @abstractmethod
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory after one more transition each (step without a time axis); kept where its mask is 0."""
+        """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
 
     @abstractmethod
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -64,15 +64,15 @@ class EvidenceBelief(Belief):
     """The order-free belief: a sum of evidence over transitions, read by a small network.
 
     Given theta the dynamics are Markov, so that p(theta | tau) depends on the *set* of transitions alone: log p(theta |
-    tau) is a sum with one term for each. So is the memory: one cumulative sum, no recurrence. The network reads the
+    tau) is a sum with a term for each. So is the memory: a cumulative sum, without recurrence. The network reads the
     sum divided by the count and by its square root, and the logarithm of the count, so that its inputs keep their
-    size however long the trial. Without a transition, q is the prior. A trial longer than training's can be counts as
-    one of that length with the same mean evidence: the belief then grows no surer, but nothing is new to the network.
+    scale for trials of any length. Without a transition, q is the prior. A trial that is longer than those of training
+    counts as one of that length with the same mean evidence, so that inputs stay in the range of training.
 
-    The evidence starts out whitened, so that its sum wanders about 0 and theta shows as a drift. Left as it comes, its
-    common part grows with the count and drowns what theta changes: Eq. (6) then stays for long on the plateau where the
-    latent is ignored. So it does where theta shows in what an action changes, and in nothing else (a motor that turns
-    the other way): a network must first find that product. Where these products are few, it is handed them.
+    The evidence is whitened at first, so that its sum is a random walk about 0 and theta shows as its drift. Otherwise
+    its common part grows with the count, and Eq. (6) stays for long on the plateau where the latent is ignored. It
+    stays there too where theta shows only in the product of action and change (a motor that turns the other way). Where
+    these products are few, they are inputs of the network.
     """
 
     longest: Tensor
@@ -83,7 +83,7 @@ class EvidenceBelief(Belief):
         super().__init__(latent, draws)
         self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
         products = signature.obs * signature.action_features
-        self.products = products if products <= FEW else 0
+        self.products = products if products <= MAX_PRODUCTS else 0
         inputs = 2 * signature.obs + signature.action_features + self.products
         self.evidence = mlp(inputs, width, self.width, draws)
         self.whiten = Whitener(self.width, draws)
@@ -91,7 +91,7 @@ class EvidenceBelief(Belief):
         self.register_buffer("longest", torch.tensor(0.0))
 
     def _terms(self, batch: Batch) -> Tensor:
-        """What each transition adds to the memory, [..., M]: its evidence and a one; zero where the mask is."""
+        """Increments of the memory [..., M], one a transition: its evidence and a count of 1; 0 where the mask is 0."""
         change = self.change(batch.next_obs - batch.obs)
         action = self.inputs.action(batch.action)
         inputs = [self.inputs.obs(batch.obs), action, change]
@@ -119,16 +119,15 @@ class EvidenceBelief(Belief):
         n = 1 + count
         mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()
-        none, (prior_mean, prior_std) = count == 0, self.prior(mean)
-        return torch.where(none, prior_mean, mean), torch.where(none, prior_std, std)
+        empty, (prior_mean, prior_std) = count == 0, self.prior(mean)
+        return torch.where(empty, prior_mean, mean), torch.where(empty, prior_std, std)
 
 
 class GruMemory(nn.Module):
     """A GRU (Cho et al., 2014) over embedded transitions (s, a, s'): the history encoder of appendix D.
 
-    It starts out remembering: its gates keep memories for 1 to 100 steps (Tallec and Ollivier, 2018). With torch's
-    initialisation a memory lasts two steps, theta hardly shows in it, and one seed of five of `dagger` never learns to
-    tell it.
+    Gates are initialised for time constants of 1 to 100 steps (Tallec and Ollivier, 2018). With torch's initialisation
+    a memory lasts two steps, and one seed of five of `dagger` never learns to infer theta.
     """
 
     def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
@@ -155,16 +154,16 @@ class GruMemory(nn.Module):
         return GruScan.apply(self._embed(batch), memory, self.recurrent.weight, self.recurrent.bias, batch.mask)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory [S, N, W] after one more transition each; kept where its mask is 0."""
+        """Memory [S, N, W] after one more transition; unchanged where its mask is 0."""
         return self(step[:, :, None], memory)[:, :, -1]
 
 
 class GruBelief(Belief):
     """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
 
-    Its inputs start out of unit size: He's initialisation for the observations' embedding, action embeddings of about
-    1, and a tanh's gain for what enters the GRU. Without that, Eq. (6) stays for thousands of updates on the plateau
-    where the latent is ignored. (The memories of policies go without: dagger then learns less well at the fork.)
+    Its inputs are initialised to unit scale: He's initialisation for the observations' embedding, action embeddings of
+    about 1, and a tanh's gain for the GRU's input. Otherwise Eq. (6) stays for thousands of updates on the plateau
+    where the latent is ignored. (Not so for the memories of policies: with it, dagger is worse on `forked_path`.)
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Data of S seeds side by side: their random numbers, and their trials as tensors with a leading axis of S."""
+"""Random numbers and trials of S seeds side by side, as tensors with a leading axis of S."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Source = Trials | Callable[[], Trials]
 """Trials, or a function that draws fresh ones; in as many equal groups as there are seeds."""
 
 
-def listed(rng: Rngs) -> list[np.random.Generator]:
-    """The generators, one a seed. Raises InputError for anything else, a number, say."""
+def as_generators(rng: Rngs) -> list[np.random.Generator]:
+    """The list of generators, one a seed. Raises InputError for anything else, such as a number."""
     rngs = [rng] if isinstance(rng, np.random.Generator) else rng
-    if not isinstance(rngs, Sequence) or not all(isinstance(one, np.random.Generator) for one in rngs):
+    if not isinstance(rngs, Sequence) or not all(isinstance(item, np.random.Generator) for item in rngs):
         raise InputError(f"random numbers were to come from {rng!r}; give np.random.default_rng(0), or a list of such")
     return list(rngs)
 
 
-def drawn(source: Source) -> Trials:
-    """The trials, or fresh ones. Raises InputError for anything else, None, say."""
+def trials_of(source: Source) -> Trials:
+    """The trials of a source: the same each time, or fresh ones. Raises InputError for anything else, None, say."""
     trials = source() if callable(source) else source
     if not isinstance(trials, Trials):
         raise InputError(f"trials were {trials!r}; they must be Trials, or a function that returns Trials")
@@ -50,13 +50,13 @@ class Draws:
         return len(self._streams)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Where the streams stand."""
+        """The generators' states."""
         return {str(i): stream.get_state() for i, stream in enumerate(self._streams)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Go on from there."""
+        """Restore the generators' states."""
         for i, stream in enumerate(self._streams):
-            stream.set_state(state[str(i)].cpu())  # wherever it was loaded to
+            stream.set_state(state[str(i)].cpu())  # checkpoints may be on a GPU
 
     def uniform(self, *shape: int) -> Tensor:
         """U(0, 1) [S, *shape]."""
@@ -66,8 +66,8 @@ class Draws:
         """N(0, 1) [S, *shape]."""
         return torch.stack([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
 
-    def below(self, high: int, *shape: int) -> Tensor:
-        """Whole numbers 0 .. high - 1, [S, *shape]."""
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Uniform integers 0 .. high - 1, [S, *shape]."""
         return torch.stack([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
 
 
@@ -82,8 +82,8 @@ class Signature:
 
     @staticmethod
     def of(trials: Trials) -> Signature:
-        """Read off data. Observations that hold only 0 and 1 are modelled as Bernoulli, others as Gaussian."""
-        trials = drawn(trials)
+        """The signature of trials. Observations that are all 0 or 1 are modelled as Bernoulli, others as Gaussian."""
+        trials = trials_of(trials)
         binary = bool(np.isin(trials.obs, (0, 1)).all())
         return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
 
@@ -104,7 +104,7 @@ class Signature:
 
 
 def take(x: Tensor, index: Tensor) -> Tensor:
-    """x [S, M, ...] at each seed's own indices [S, K] -> [S, K, ...]."""
+    """x [S, M, ...] at each seed's indices [S, K] -> [S, K, ...]."""
     return x[torch.arange(len(index), device=index.device)[:, None], index]
 
 
@@ -135,7 +135,7 @@ class Batch:
     @staticmethod
     def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
         """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
-        trials = drawn(trials)
+        trials = trials_of(trials)
         if len(trials) % seeds:
             raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
         mask = trials.mask.reshape(len(trials), -1)
@@ -166,19 +166,19 @@ class Batch:
         return Batch(*(x[index] for x in self.tensors))
 
     def trials(self, index: Tensor) -> Batch:
-        """Seed s's trials index[s], [S, K]."""
+        """Trials index[s] of each seed s, [S, K]."""
         return Batch(*(take(x, index) for x in self.tensors))
 
     def steps(self, index: Tensor) -> Batch:
-        """Seed s's steps index[s] [S, K], as `draw_steps` counts them; without a time axis."""
+        """Steps index[s] [S, K] of each seed s, indices as in `draw_steps`; without a time axis."""
         return Batch(*(take_steps(x, index) for x in self.tensors))
 
     @cached_property
-    def _counted(self) -> Tensor:
+    def _step_count(self) -> Tensor:
         return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
 
     def joined(self, other: Batch) -> Batch:
-        """The trials of both; the shorter ones are padded."""
+        """The trials of both batches, padded to the same length."""
         steps = max(self.mask.shape[2], other.mask.shape[2])
 
         def padded(x: Tensor) -> Tensor:
@@ -189,27 +189,27 @@ class Batch:
         )
 
     def beginnings(self, update: int, shortest: float) -> Batch:
-        """The first n steps of every trial, n log-uniform between a share of them and all, over updates 0, 1, 2, ...
+        """The first n steps of every trial; over updates 0, 1, 2, ... n is log-uniform between a share of them and all.
 
-        What is known of theta in deployment is the beginning of a trial, and most is learned early in it: long ones are
-        needed, but not in every update, where they would take most of the time. n is the same for all seeds, so that
-        none depends on another's: it follows the golden ratio's multiples, modulo 1, and not a random number.
+        In deployment beliefs are about beginnings of trials, and most is learned there. Long sequences are needed, but
+        not in every update, where they would take most of the time. n follows the golden ratio's multiples, modulo 1,
+        and is the same for all seeds: a random number would make seeds depend on each other.
         """
         golden = (5**0.5 - 1) / 2
         return self[:, :, : max(1, round(self.mask.shape[2] * shortest ** (golden * update % 1)))]
 
     def draw_trials(self, k: int | None, draws: Draws) -> Batch:
-        """k trials of each seed, uniformly and with replacement; None: all, as they are."""
-        return self if k is None else self.trials(draws.below(len(self), k))
+        """k trials of each seed, uniformly, with replacement; None: all."""
+        return self if k is None else self.trials(draws.integers(len(self), k))
 
     def draw_steps(self, k: int | None, draws: Draws) -> Tensor:
         """k steps that took place, uniformly, as indices [S, k] into the B T of each seed; None: all, padding too."""
         if k is None:
             return torch.arange(self.mask[0].numel(), device=self.mask.device).expand(len(self.mask), -1)
-        counted = self._counted
-        count = counted[:, -1:]
+        cumulative = self._step_count
+        count = cumulative[:, -1:]
         nth = (draws.uniform(k).double() * count).long().clamp(max=count - 1) + 1
-        return torch.searchsorted(counted, nth)
+        return torch.searchsorted(cumulative, nth)
 
     def __len__(self) -> int:
         return self.mask.shape[1]

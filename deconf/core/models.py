@@ -1,4 +1,4 @@
-"""Latent-variable models of the dynamics: what infers theta_hat from a history, and is trained on exploration.
+"""Latent-variable models of the dynamics, which infer theta_hat from a history. They are trained on exploration.
 
 Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a, theta_hat), trained on Eq. (6). Discrete: K models of the
 dynamics, and exact Bayesian inference over which one it is (footnote 4).
@@ -23,9 +23,9 @@ BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
 
 
 class LatentModel(nn.Module, ABC):
-    """Infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
+    """A model that infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
 
-    `kept` [S] is the share of a memory that is left when an episode ends: 1, but where theta drifts.
+    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts.
     """
 
     kind: str
@@ -48,7 +48,7 @@ class LatentModel(nn.Module, ABC):
 
     @abstractmethod
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory after one more transition each (step without a time axis); kept where its mask is 0."""
+        """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
 
     @abstractmethod
     def last(self, batch: Batch) -> Tensor:
@@ -64,15 +64,15 @@ class LatentModel(nn.Module, ABC):
 
     @abstractmethod
     def point(self, belief: Tensor) -> Tensor:
-        """What the belief says in one point: its mean, or its probabilities; for probes."""
+        """A point estimate, for probes: the belief's mean, or its probabilities."""
 
     @abstractmethod
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
-        """log p_psi(s' | s, a, theta_hat) [S, N] of a step (no time axis), under what the memory [S, N, M] says."""
+        """log p_psi(s' | s, a, theta_hat) [S, N] of a step (no time axis), under the belief of the memory [S, N, M]."""
 
     @abstractmethod
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """[S], to minimise, on trials [S, B, T]; steps: how many of them to predict, None for all."""
+        """The loss [S] on trials [S, B, T]. steps: how many of them are predicted; None: all."""
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
@@ -87,7 +87,7 @@ class LatentModel(nn.Module, ABC):
 
 
 class VariationalModel(LatentModel):
-    """The paper's: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
+    """The paper's model: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
 
     def __init__(
         self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
@@ -123,26 +123,26 @@ class VariationalModel(LatentModel):
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         index = batch.draw_steps(steps, draws)
-        real = batch.steps(index)
+        transitions = batch.steps(index)
         memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
         mean, std = self.encoder.posterior(take(memories, index))
-        return self.bound(real, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
+        return self.bound(transitions, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
 
-    def bound(self, real: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
-        """The negative of Eq. (6) [S], of steps [S, K]: beliefs N(mean, std^2) about each, latents drawn from them."""
-        log_next = self.dynamics.log_prob(real.obs, real.action, real.next_obs, theta_hat)[..., 0]
+    def bound(self, steps: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
+        """The negative of Eq. (6) [S], of steps [S, K], beliefs N(mean, std^2) and latents drawn from these."""
+        log_next = self.dynamics.log_prob(steps.obs, steps.action, steps.next_obs, theta_hat)[..., 0]
         kl = gaussian_kl(mean, std, *self.encoder.prior(mean))
-        return inference_loss(log_next, kl, beta, real.mask)
+        return inference_loss(log_next, kl, beta, steps.mask)
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         self.encoder.set_prior(self.sample(belief, draws))
 
 
 class DiscreteModel(LatentModel):
-    """theta_hat is one of K, one-hot; p_psi(s' | s, a, k) is fitted to the exact marginal likelihood.
+    """A mixture of K models: theta_hat is one-hot, and p_psi(s' | s, a, k) maximises the exact marginal likelihood.
 
     The memory is the log-belief, updated by Bayes' rule: Eq. (5) with a learned model, without encoder or bound.
-    p(k) is uniform, so that each k stands for an equal share of p(theta); fitted, whichever k is ahead takes more.
+    p(k) is uniform, so that each k stands for an equal share of p(theta); a fitted prior lets one k take over.
     """
 
     kind = "discrete"
@@ -184,10 +184,10 @@ class DiscreteModel(LatentModel):
         return torch.logsumexp(memory + self._evidence(step), -1)
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """The mean over histories of n = 1, 2, 4, ... steps: a trial of T is dealt, step by step, into T / n of them.
+        """The mean loss on histories of n = 1, 2, 4, ... steps: a trial of T steps is split into T / n of them.
 
-        What is dealt is a history under the same theta; of a trial that ended early it is shorter. Of whole long trials
-        alone, whichever k happens to be best at the start claims every one, and the others never learn.
+        Each takes every (T / n)-th step, and so is under a single theta. With whole long trials alone, the k that is
+        best at first claims every trial, and the others never learn.
         """
         log_next, mask = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs), batch.mask
         doublings = (mask.shape[2] - 1).bit_length()
@@ -196,15 +196,15 @@ class DiscreteModel(LatentModel):
         prior = self.start(1)[:, 0]
         losses = []
         for i in range(doublings + 1):
-            dealt, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
-            losses.append(marginal_loss(prior, dealt, real))
+            histories, real = (x.unflatten(2, (2**i, -1)).transpose(2, 3).flatten(1, 2) for x in (log_next, mask))
+            losses.append(marginal_loss(prior, histories, real))
         return torch.stack(losses).mean(0)
 
 
-def new(
+def new_model(
     kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
 ) -> LatentModel:
-    """`evidence`, `gru` or `discrete`, untrained. Raises InputError for another kind."""
+    """An untrained model: `evidence`, `gru` or `discrete`. Raises InputError for another kind."""
     if kind == "discrete":
         return DiscreteModel(latent, width, signature, obs, change, draws)
     if kind not in BELIEFS:
@@ -214,6 +214,6 @@ def new(
 
 @torch.no_grad()
 def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
-    """q_phi(theta_hat_H | tau) of whole trials, [S, B, P]; so many at a time, for the sake of memory."""
+    """Beliefs q_phi(theta_hat_H | tau) after whole trials, [S, B, P]; in parts of so many, to save memory."""
     indices = torch.arange(len(trials), device=trials.mask.device).split(part)
     return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))

@@ -1,4 +1,4 @@
-"""What training reports to, and where it leaves what it needs to go on after an interruption."""
+"""The monitor of training: progress, checkpoints, and the amounts of data used."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ Training = dict[str, Any]
 
 
 class Monitor:
-    """What training reports to, and where it leaves what it needs to go on after an interruption. This one is deaf.
+    """Receives the progress and the checkpoints of training. This base class keeps neither.
 
-    `budget` counts the data that each seed used, by kind; whoever makes the data tells by `spend`.
+    `budget`: the data that each seed has used, by kind; what makes the data counts it with `spend`.
     """
 
     def __init__(self) -> None:
         self.budget: dict[str, list[int]] = {}
 
-    def spend(self, kind: str, each: Sequence[int]) -> None:
-        """Each seed used so much more of a kind of data."""
-        before = self.budget.get(kind, [0] * len(each))
-        self.budget[kind] = [int(a + b) for a, b in zip(before, each, strict=True)]
+    def spend(self, kind: str, amounts: Sequence[int]) -> None:
+        """Add each seed's amount of a kind of data to the budget."""
+        before = self.budget.get(kind, [0] * len(amounts))
+        self.budget[kind] = [int(a + b) for a, b in zip(before, amounts, strict=True)]
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
-        """Updates done, updates in all, losses by name (the mean over seeds), and the agent so far, if it can act."""
+        """Report updates done and in all, losses by name (means over seeds), and the agent so far, if it can act."""
 
     def save(self, state: Callable[[], Training]) -> None:
-        """Training could go on from here, given `state()`."""
+        """Offer a checkpoint, `state()`, from which training can resume."""
 
     def load(self) -> Training | None:
-        """What was saved, if training was interrupted."""
+        """The checkpoint of an interrupted training, or None."""
         return None

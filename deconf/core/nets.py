@@ -1,7 +1,7 @@
 """Networks of S seeds side by side: layers, Adam, scaling to unit size, and heads for actions and observations.
 
-S seeds train in one program: every parameter has a leading axis of S, and so has every tensor. Seeds share nothing, so
-that one's numbers are the same, bit for bit, whatever runs beside it.
+S seeds train in one program: every parameter and every tensor has a leading axis of S. Seeds share nothing, so that a
+seed's numbers are the same, bit for bit, whatever runs beside it.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.envs.support.errors import InputError
 
-SMALL = 16**3  # multiplications; torch gives oneDNN a product of more than that
+ONEDNN_ABOVE = 16**3  # multiplications: torch hands larger products to oneDNN
 
 
 def prepare_torch() -> None:
-    """One thread, since the networks are small; and float32 products by oneDNN where that is sure to keep float32.
+    """Set one thread, since the networks are small, and oneDNN for float32 products where it keeps float32.
 
-    MKL leaves AVX-512 unused on AMD, where oneDNN takes half its time. What asks for oneDNN also allows it bfloat16,
-    which it uses if there is AMX: there, and on processors without AVX-512, torch's own choice stands.
+    On AMD, MKL does not use AVX-512, and oneDNN takes half the time. The setting that selects oneDNN also allows it
+    bfloat16, which it uses where there is AMX: there, and on processors without AVX-512, torch's default stays.
     """
     torch.set_num_threads(1)
-    has = torch.cpu.get_capabilities()
-    if has.get("avx512_f") and not has.get("amx_bf16"):
+    capabilities = torch.cpu.get_capabilities()
+    if capabilities.get("avx512_f") and not capabilities.get("amx_bf16"):
         torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
 
 
@@ -37,17 +37,17 @@ prepare_torch()
 
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
-    """[S, F] -> [S, 1, ..., 1, F], to go with tensors [S, ..., F]."""
+    """[S, F] -> [S, 1, ..., 1, F], to broadcast against tensors [S, ..., F]."""
     return statistic.reshape(len(statistic), *[1] * (like.dim() - 2), -1)
 
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
-    """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O]: a seed's bits are the same whatever is stacked on it."""
+    """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
     seeds, inputs, outputs = weight.shape
-    # Stacked, small products could be more than that, and those of vectors go another way in MKL: then other bits.
-    if seeds > 1 and (rows.shape[1] * inputs * outputs <= SMALL or min(inputs, outputs) == 1):
-        each = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
-        return torch.cat([torch.baddbmm(*one) for one in each])
+    # A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors: bits would differ.
+    if seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1):
+        by_seed = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
+        return torch.cat([torch.baddbmm(*operands) for operands in by_seed])
     return torch.baddbmm(bias, rows, weight)
 
 
@@ -66,7 +66,7 @@ class Linear(nn.Module):
 
 
 def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:
-    """Two hidden layers with ReLU."""
+    """An MLP with two hidden layers and ReLU."""
     return nn.Sequential(
         Linear(inputs, width, draws),
         nn.ReLU(),
@@ -77,7 +77,7 @@ def mlp(inputs: int, width: int, outputs: int, draws: Draws) -> nn.Sequential:
 
 
 class Adam:
-    """Adam over stacked parameters, each seed's gradient clipped to norm 1, optionally cooled along a cosine."""
+    """Adam over stacked parameters, each seed's gradient clipped to norm 1; with `updates`, cosine decay."""
 
     def __init__(self, modules: Iterable[nn.Module], learning_rate: float, updates: int | None = None) -> None:
         modules = list(modules)
@@ -87,22 +87,22 @@ class Adam:
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
 
     def state_dict(self) -> dict[str, Any]:
-        """Moments and schedule."""
+        """States of Adam and of the schedule."""
         schedule = {} if self._schedule is None else self._schedule.state_dict()
         return {"adam": self._adam.state_dict(), "schedule": schedule}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
+        """Restore both."""
         self._adam.load_state_dict(state["adam"])
         if self._schedule is not None:
             self._schedule.load_state_dict(state["schedule"])
 
     def step(self, loss: Tensor) -> None:
-        """One update on losses [S]. Raises InputError, which names the update, where it would make parameters NaN."""
+        """Take one step on losses [S]. Raises InputError, which names the update, where parameters would become NaN."""
         self._adam.zero_grad()
         loss.sum().backward()
         with torch.no_grad():
-            # Summed one by one: a sum over a stack takes another order for one seed than for several.
+            # Parameter by parameter: a sum over a stack of them has another order for one seed than for several.
             squares = torch.as_tensor(
                 sum(p.grad.flatten(1).square().sum(1) for p in self.parameters if p.grad is not None)
             )
@@ -135,7 +135,7 @@ def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Scaler(nn.Module):
-    """(x - mean) / std, fitted to data [S, ..., F] where mask is 1, once; columns that hardly vary keep their size."""
+    """Standardises by mean and std of data [S, ..., F] where mask is 1; columns that hardly vary keep their scale."""
 
     mean: Tensor
     std: Tensor
@@ -152,12 +152,12 @@ class Scaler(nn.Module):
 
 
 def scalers(data: Batch) -> tuple[Scaler, Scaler]:
-    """Of the observations, and of their changes in a step."""
+    """Scalers of the observations, and of their changes in a step."""
     return Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
 
 
 class Inputs(nn.Module):
-    """Observations and actions as networks take them: scaled, and one-hot if discrete."""
+    """Preprocessing of networks' inputs: observations standardised, discrete actions one-hot."""
 
     def __init__(self, signature: Signature, obs: Scaler) -> None:
         super().__init__()
@@ -183,7 +183,7 @@ class Embedding(Inputs):
         self.embed_action = Linear(signature.action_features, 32, draws)
 
     def obs(self, obs: Tensor) -> Tensor:
-        if self.signature.binary and self.signature.obs == 1:  # one bit has two embeddings: do not compute them by row
+        if self.signature.binary and self.signature.obs == 1:  # of one bit there are two embeddings: computed once
             zero, one = self.embed_obs(self.scaler(obs.new_tensor([[0.0], [1.0]]).expand(len(obs), 2, 1))).unbind(1)
             return torch.lerp(per_seed(zero, obs), per_seed(one, obs), obs)
         return self.embed_obs(self.scaler(obs))
@@ -193,10 +193,10 @@ class Embedding(Inputs):
 
 
 class Whitener(nn.Module):
-    """Features to mean 0 and standard deviation 1: by each batch's own in the first updates, by running means after.
+    """Standardises features: by each batch's moments in the first updates, by running moments afterwards.
 
-    Batch normalisation (Ioffe and Szegedy, 2015) that ends early: it is there to get training off the ground. For good,
-    it would do harm, since exploration and expert trials have different moments.
+    Batch normalisation (Ioffe and Szegedy, 2015) that ends early: it is needed at the start of training alone, and the
+    moments of exploration and of expert trials differ.
     """
 
     mean: Tensor
@@ -204,21 +204,21 @@ class Whitener(nn.Module):
 
     def __init__(self, features: int, draws: Draws, updates: int = 300, momentum: float = 0.05) -> None:
         super().__init__()
-        self.left, self.momentum = updates, momentum
+        self.updates_left, self.momentum = updates, momentum
         self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
         self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
 
     def get_extra_state(self) -> Tensor:
-        return torch.tensor(self.left)
+        return torch.tensor(self.updates_left)
 
     def set_extra_state(self, state: Tensor) -> None:
-        self.left = int(state)
+        self.updates_left = int(state)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
-        """[S, ..., F], of which those count where mask [S, ...] is 1."""
+        """x [S, ..., F]; moments are taken where mask [S, ...] is 1."""
         mean, variance = self.mean, self.variance
-        if self.training and self.left > 0:
-            self.left -= 1
+        if self.training and self.updates_left > 0:
+            self.updates_left -= 1
             mean, variance = moments(x, mask)
             self.mean.lerp_(mean.detach(), self.momentum)
             self.variance.lerp_(variance.detach(), self.momentum)
@@ -226,7 +226,7 @@ class Whitener(nn.Module):
 
 
 class ActionHead(nn.Module):
-    """Features -> a distribution over actions: categorical, or Gaussian with a learned std for each input."""
+    """A distribution over actions given features: categorical, or Gaussian with mean and std from the network."""
 
     def __init__(self, features: int, width: int, signature: Signature, draws: Draws) -> None:
         super().__init__()
@@ -245,7 +245,7 @@ class ActionHead(nn.Module):
         return torch.distributions.Normal(mean, std, validate_args=False).log_prob(action).sum(-1)
 
     def sample(self, features: Tensor, draws: Draws) -> Tensor:
-        """Action [S, N, A]; continuous ones are clipped to [-1, 1]."""
+        """Draw actions [S, N, A]; continuous actions are clipped to [-1, 1]."""
         if self.signature.actions:
             return sample_index(F.softmax(self.net(features), -1), draws)[..., None].float()
         mean, std = self._gaussian(features)
@@ -253,16 +253,16 @@ class ActionHead(nn.Module):
 
 
 def sample_index(probs: Tensor, draws: Draws) -> Tensor:
-    """One index [S, ...] from each row of probabilities [S, ..., K]."""
+    """Draw an index [S, ...] from each row of probabilities [S, ..., K]."""
     cumulative = probs.cumsum(-1)
     u = draws.uniform(*probs.shape[1:-1], 1) * cumulative[..., -1:]
     return (u > cumulative).sum(-1).clamp(max=probs.shape[-1] - 1)
 
 
 class DynamicsHead(nn.Module):
-    """p_psi(s' | s, a, theta_hat): Bernoulli, or Gaussian about s + change, with one std a coordinate.
+    """p_psi(s' | s, a, theta_hat): Bernoulli, or Gaussian with mean s + change and a learned std for each coordinate.
 
-    `inputs` may be shared with other networks. copies: how many models of the dynamics to predict with at once.
+    `inputs` may be shared with other networks. copies: the number of models of the dynamics, in one network.
     """
 
     def __init__(self, latent: int, width: int, inputs: Inputs, change: Scaler, draws: Draws, copies: int = 1) -> None:
@@ -289,7 +289,7 @@ class DynamicsHead(nn.Module):
         return (-0.5 * z**2 - log_std).sum(-1) - 0.5 * z.shape[-1] * float(np.log(2 * np.pi))
 
     def sample(self, obs: Tensor, action: Tensor, theta_hat: Tensor, draws: Draws) -> Tensor:
-        """s' ~ p_psi [S, N, O]."""
+        """Draw s' ~ p_psi [S, N, O]."""
         out = self(obs, action, theta_hat)[..., 0, :]
         if self.signature.binary:
             return (draws.uniform(*out.shape[1:]) < torch.sigmoid(out)).float()

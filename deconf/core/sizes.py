@@ -1,4 +1,4 @@
-"""How large networks are, by how much is observed, and what configurations can hold."""
+"""Sizes of networks, by the width of observations, and the values that configurations can hold."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import get_args, get_type_hints
 
 from deconfounded.envs.support.errors import InputError
 
-MANY, WIDE = 16, 128  # from so many observed numbers on, all methods' networks on control are so wide
-SPACIOUS = 8  # dimensions of theta_hat there: with 4, one seed of three read it less well on ant_goal and the walker
+LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
+LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker
 
 
 class Configuration:

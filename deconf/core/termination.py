@@ -1,4 +1,4 @@
-"""When episodes end early, learned: p(over | s'). A fall ends one, or a stone at rest; the horizon is no such end."""
+"""A termination model, p(terminated | s'), for rollouts in learned dynamics. The horizon is no termination."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ from deconfounded.experts.rollout import Trials
 UPDATES, ROWS, WIDTH, RATE = 600, 1024, 32, 3e-3
 
 
-class Endings:
-    """p(over | s'), of one seed."""
+class TerminationModel:
+    """p(terminated | s'), of one seed."""
 
     def __init__(self, scaler: Scaler, draws: Draws) -> None:
         self.scaler = scaler
         self.net = mlp(len(scaler.mean[0]), WIDTH, 1, draws)
 
     def logit(self, obs: Tensor) -> Tensor:
-        """Log-odds [1, ...] that it is over where [1, ..., O] was come to."""
+        """Log-odds [1, ...] that the episode ends with next observations [1, ..., O]."""
         return self.net(self.scaler(obs))[..., 0]
 
 
-def arrivals(trials: Trials) -> tuple[Tensor, Tensor]:
-    """Observations [R, O] that steps came to, and whether the episode was over then, before its horizon [R]."""
+def labelled(trials: Trials) -> tuple[Tensor, Tensor]:
+    """Next observations [R, O] of all steps, and 1 where the episode ended there, before its horizon [R]."""
     mask = torch.tensor(trials.mask)
-    over = mask.clone()
-    over[..., :-1] &= ~mask[..., 1:]
-    over[..., -1] = False
-    came = torch.tensor(trials.obs, dtype=torch.float32)[:, :, 1:]
-    return came[mask], over[mask].float()
+    terminated = mask.clone()
+    terminated[..., :-1] &= ~mask[..., 1:]
+    terminated[..., -1] = False
+    next_obs = torch.tensor(trials.obs, dtype=torch.float32)[:, :, 1:]
+    return next_obs[mask], terminated[mask].float()
 
 
-def fit(data: Sequence[Trials], scaler: Scaler, draws: Draws) -> Endings | None:
-    """Of all trials that there are, whoever acted; None if no episode ended early."""
-    obs, over = (torch.cat(rows)[None] for rows in zip(*map(arrivals, data), strict=True))
-    if not over.any():
+def fit(data: Sequence[Trials], scaler: Scaler, draws: Draws) -> TerminationModel | None:
+    """A model fitted to trials of any behaviour; None if no episode ended early."""
+    obs, terminated = (torch.cat(rows)[None] for rows in zip(*map(labelled, data), strict=True))
+    if not terminated.any():
         return None
-    ends = Endings(scaler, draws)
-    optimizer = Adam([ends.net], RATE, UPDATES)
+    model = TerminationModel(scaler, draws)
+    optimizer = Adam([model.net], RATE, UPDATES)
     for _ in range(UPDATES):
-        index = draws.below(obs.shape[1], ROWS)
-        optimizer.step(F.binary_cross_entropy_with_logits(ends.logit(take(obs, index)), take(over, index)))
-    return ends
+        index = draws.integers(obs.shape[1], ROWS)
+        optimizer.step(F.binary_cross_entropy_with_logits(model.logit(take(obs, index)), take(terminated, index)))
+    return model

@@ -1,1 +1,1 @@
-"""Is data confounded? From expert trials and exploration alone."""
+"""Diagnosis of confounding, from expert trials and exploration alone."""

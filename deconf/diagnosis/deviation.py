@@ -1,4 +1,4 @@
-"""How strange one set of paths is to another: episodes in a few figures each, and how far these are from the usual."""
+"""Deviation of trajectories from a reference set, by a few features of each episode, relative to chance."""
 
 from __future__ import annotations
 
@@ -7,59 +7,60 @@ from torch import Tensor
 
 from deconfounded.deconf.core.data import Batch
 
-PARTS = 6  # of an episode
-FAR = 9.0  # in squares of what is usual: further off is no stranger
+SEGMENTS = 6  # of an episode
+CLIP = 9.0  # of squared deviations, in squares of the unit
 
 
-def ways(episodes: Batch) -> Tensor:
-    """Where episodes [1, N, T] went, [N, T, O]; one that is over stays where it ended."""
-    path, mask = episodes.next_obs[0], episodes.mask[0]
-    index = torch.minimum(torch.arange(path.shape[1]), (mask.sum(1).long()[:, None] - 1).clamp(min=0))
-    return path.gather(1, index[..., None].expand_as(path))
+def trajectories(episodes: Batch) -> Tensor:
+    """Observations [N, T, O] after each step of episodes [1, N, T]; after an episode's end, its last one."""
+    obs, mask = episodes.next_obs[0], episodes.mask[0]
+    index = torch.minimum(torch.arange(obs.shape[1]), (mask.sum(1).long()[:, None] - 1).clamp(min=0))
+    return obs.gather(1, index[..., None].expand_as(obs))
 
 
-def strange(paths: Tensor, usual: Tensor, again: Tensor) -> Tensor:
-    """How far paths [N, T, O] are from usual ones [M, T, O], whichever: [F, O], 1 if no further than others of these.
+def deviation(paths: Tensor, reference: Tensor, repeat: Tensor) -> Tensor:
+    """Deviation [F, O] of trajectories [N, T, O] from a reference set [M, T, O], over that of a repeat: 1 is chance.
 
-    again: others of the usual kind. F figures of each coordinate: its mean over each of six parts of the episode, over
-    all of it, and its mean square. From the median of the usual ones, in squares of their median distance from it (as
-    of a normal distribution's std), of which more than 9 is 9.
+    F features of each coordinate: its mean over each of six segments and over all of the episode, and
+    its mean square. Squared deviations from the reference's median are in squares of its scaled median absolute
+    deviation (a normal distribution's std), and clipped at 9.
     """
-    known = _figures(usual)
-    centre = known.median(0).values
-    return _ratio(known, _figures(paths) - centre, _figures(again) - centre, known - centre)
+    features = _features(reference)
+    centre = features.median(0).values
+    return _ratio(features, _features(paths) - centre, _features(repeat) - centre, features - centre)
 
 
-def strayed(paths: Tensor, home: Tensor, again: Tensor) -> Tensor:
-    """How far paths [N, T, O] are from home, each from its own, over how far those of a second visit are: [F, O]."""
-    known = _figures(home)
-    return _ratio(known, _figures(paths) - known, _figures(again) - known, _figures(again) - known)
+def paired_deviation(paths: Tensor, reference: Tensor, repeat: Tensor) -> Tensor:
+    """Deviation [F, O] of each trajectory [N, T, O] from its own reference, over that of its repeat."""
+    features = _features(reference)
+    by_chance = _features(repeat) - features
+    return _ratio(features, _features(paths) - features, by_chance, by_chance)
 
 
-def oddest(strangeness: Tensor, chance: Tensor) -> float:
-    """In what shows it most, over the same by chance."""
-    return float(strangeness.max() / chance.max().clamp(min=1))
+def max_ratio(deviations: Tensor, chance: Tensor) -> float:
+    """The maximum of deviations [F, O], over the maximum by chance."""
+    return float(deviations.max() / chance.max().clamp(min=1))
 
 
-def back(off: Tensor, mistaken: Tensor) -> float:
-    """As a score, how far one strayed, beyond chance [F, O]: 1 is not, 0 as far as one who is mistaken; least squares.
+def excess_score(excess: Tensor, wrong: Tensor) -> float:
+    """A score of deviations beyond chance [F, O]: 1 for none, 0 for those under a wrong latent; by least squares.
 
-    The chance of both is to be measured apart: of one, its noise would be in both, and look like straying.
+    Chance has to be estimated for each separately: noise of a common estimate would correlate the two.
     """
-    known = mistaken.clamp(min=0)
-    lost = (known * off).sum() / known.square().sum().clamp(min=1e-6)
-    return float(1 - lost.clamp(0, 1))
+    weight = wrong.clamp(min=0)
+    share = (weight * excess).sum() / weight.square().sum().clamp(min=1e-6)
+    return float(1 - share.clamp(0, 1))
 
 
-def _ratio(known: Tensor, off: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
-    """Mean squares of two kinds of distances [N, F, O], in units of the usual ones; of what hardly varies, 1% of it."""
-    least = (0.01 * (known.amax(0) - known.amin(0))).clamp(min=1e-6)
+def _ratio(reference: Tensor, deviations: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
+    """The ratio of mean squares of two deviations [N, F, O], in units of the usual one, or of 1% of the range."""
+    least = (0.01 * (reference.amax(0) - reference.amin(0))).clamp(min=1e-6)
     unit = torch.maximum(1.48 * usual.abs().median(0).values, least)
-    far, near = ((some / unit).square().clamp(max=FAR).mean(0) for some in (off, by_chance))
-    return far / near.clamp(min=0.5)
+    numerator, denominator = ((x / unit).square().clamp(max=CLIP).mean(0) for x in (deviations, by_chance))
+    return numerator / denominator.clamp(min=0.5)
 
 
-def _figures(path: Tensor) -> Tensor:
+def _features(paths: Tensor) -> Tensor:
     """[N, T, O] -> [N, F, O]."""
-    whole = (path, path.square())
-    return torch.stack([part.mean(1) for part in (*path.tensor_split(min(PARTS, path.shape[1]), 1), *whole)], 1)
+    segments = paths.tensor_split(min(SEGMENTS, paths.shape[1]), 1)
+    return torch.stack([part.mean(1) for part in (*segments, paths, paths.square())], 1)

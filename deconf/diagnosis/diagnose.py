@@ -1,63 +1,63 @@
-"""Is this data confounded? From an expert's trials and some exploration: no theta, no simulator, no name of a task.
+"""A verdict on whether data is confounded, from expert trials and exploration, without theta or a simulator.
 
-`findings.measure` takes the figures, on several splits of the trials; here they are judged.
+`measures.measure` computes the figures on several splits of the trials; here they are judged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from deconfounded.deconf.core.data import Batch
-from deconfounded.deconf.diagnosis.latent import near
-from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
+from deconfounded.deconf.diagnosis.latent import in_range
+from deconfounded.deconf.diagnosis.measures import Amounts, Findings, Report, measure
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 Verdict = Literal["confounded", "not confounded", "cannot tell"]
-VERSION = 1  # raised when the same trials come to other figures
-LITTLE, SILENT = 0.1, 0.01  # nats a step: of memory, of the world
-WORSE = 0.2  # nats a step by which a clone may be worse for its memory
-FINE, GAP = 0.8, 0.15  # scores
+VERSION = 1  # raised when figures of the same trials change
+NEGLIGIBLE, NO_EVIDENCE = 0.1, 0.01  # nats a step: of memory, of the dynamics
+MISFIT = 0.2  # nats a step by which a memory may make a clone worse
+GOOD, SMALL_GAP = 0.8, 0.15  # scores
 STAKES = 1.5  # times chance
-LIKE = 4.0  # how strange dreams may be, among what happened, and be believed of what does not show
+MAX_UNLIKE = 4.0  # deviation of rollouts from the data, up to which the absence of stakes is believed
 
 
 class Next(NamedTuple):
-    """What to do, and lines of Python that do it with `trials`; explore and query are functions of your own world."""
+    """What to do, and a line of Python that does it with `trials`; explore and query are the user's functions."""
 
     advice: str
     fit: str = ""
 
 
 CLONE = Next(
-    "Clone it; memory does no harm here.",
+    "Clone the expert; a memory does no harm here.",
     "naive_rnn.train(trials, naive_rnn.RecurrentConfig(), np.random.default_rng(0))",
 )
 EXPLORE = Next(
-    "Tier 2, Algorithm 1: explore the world, blind to what the expert knows.",
+    "Tier 2, Algorithm 1: explore by a policy that does not see the latent.",
     "deconfounded.train(trials, explore, deconfounded.DeconfoundedConfig(), np.random.default_rng(0))",
 )
-ASK = Next(
-    "Tier 3: ask the expert what it would do in states that the clone comes to.",
+QUERY = Next(
+    "Tier 3: query the expert for its actions in states that the clone visits.",
     "dagger.train(query, dagger.DaggerConfig(), np.random.default_rng(0))",
 )
-TRY = Next(
-    "Explore a little, with a clone without memory that tries things (deconf/diagnosis/exploration.py), and diagnose"
-    " again; or try Tier 1, Algorithm 3, which needs no more.",
+EXPLORE_FIRST = Next(
+    "Explore a little, by a memoryless clone with some random actions (deconf/diagnosis/exploration.py), and diagnose"
+    " again; or try Tier 1, Algorithm 3, which needs no more data.",
     "deconfounded_offline.train(trials, deconfounded_offline.OfflineConfig(), np.random.default_rng(0))",
 )
-VARY = Next("Record trials under other circumstances too, and diagnose again.")
-WIDER = Next("Explore where the expert goes, by any behaviour that is blind to what it knows, and diagnose again.")
-MORE = Next("Record more trials of the same kind, and diagnose again.")
+VARY_LATENT = Next("Record trials under other latents too, and diagnose again.")
+EXPLORE_MORE = Next("Explore where the expert goes, by any policy that does not see the latent, and diagnose again.")
+MORE_TRIALS = Next("Record more trials of the same kind, and diagnose again.")
 
 
 @dataclass(frozen=True)
 class DiagnoseConfig:
-    """refits: independent splits of the trials; an interval is their range. least: trials, below which none is made."""
+    """refits: independent splits of the trials; an interval is their range. least: the number of trials required."""
 
     refits: int = 3
     least: int = 24
@@ -65,7 +65,7 @@ class DiagnoseConfig:
 
 
 class Figure(NamedTuple):
-    """Mean over refits, and their range."""
+    """The mean over refits, and their range."""
 
     value: float
     low: float
@@ -73,7 +73,7 @@ class Figure(NamedTuple):
 
     @staticmethod
     def of(refits: Sequence[float]) -> Figure:
-        """Of what each refit found."""
+        """The figure of the refits' values."""
         return Figure(sum(refits) / len(refits), min(refits), max(refits))
 
     def __str__(self) -> str:
@@ -82,15 +82,14 @@ class Figure(NamedTuple):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The verdict, what was found by name as in Findings, why, the tier that the data reaches, and what to do next.
+    """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.
 
-    Found is also the `gap`: what cloning is predicted to lose, in scores of where it goes; `gap_judged`, by Eq. (1);
-    and the `ratio` of what actions tell to what the world does. tier: of the paper; None if it is not known, or if
-    none does.
+    Figures are those of Findings, and three more. `gap`: the predicted loss by naive cloning, in scores by paired
+    deviation; `gap_judged`: by Eq. (1); `ratio`: the evidence of actions over that of dynamics, in expert trials.
     """
 
     verdict: Verdict
-    found: dict[str, Figure]
+    figures: dict[str, Figure]
     reasons: tuple[str, ...]
     tier: int | None
     next: Next
@@ -101,38 +100,35 @@ def diagnose(
     explore: Trials | None,
     config: DiagnoseConfig,
     rng: np.random.Generator,
-    tell: Callable[[float], None] = lambda share: None,
+    report: Report = lambda share: None,
 ) -> Diagnosis:
-    """Judge expert trials, and exploration of the same kind if there is some.
-
-    Raises InputError for data that cannot be judged at all.
-    """
+    """Judge expert trials, and exploration if there is any. Raises InputError for data that cannot be judged."""
     check(trials, explore, config)
-    found: list[Findings] = []
+    refits: list[Findings] = []
 
-    def told(share: float) -> None:
-        tell((len(found) + share) / config.refits)
+    def part(share: float) -> None:
+        report((len(refits) + share) / config.refits)
 
-    for one in rng.spawn(config.refits):
-        found.append(measure(trials, explore, config.amounts, one, told))
-    return judge(found)
+    for generator in rng.spawn(config.refits):
+        refits.append(measure(trials, explore, config.amounts, generator, part))
+    return judge(refits)
 
 
 def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> None:
-    """Raises InputError, in one line, for what cannot be judged."""
-    for kind, some in (("", trials), (" of exploration", explore)):
-        if some is None:
+    """Raises InputError for data that cannot be judged."""
+    for kind, data in (("", trials), (" of exploration", explore)):
+        if data is None:
             continue
-        if len(some) < config.least:
+        if len(data) < config.least:
             raise InputError(
-                f"{len(some)} trial{'s' * (len(some) > 1)}{kind} given; at least {config.least} are needed, each"
+                f"{len(data)} trial{'s' * (len(data) > 1)}{kind} given; at least {config.least} are needed, each"
                 " under a theta of its own, so that some can be held out"
             )
-        acted = some.action[some.mask]
-        if (acted == acted[0]).all():
+        actions = data.action[data.mask]
+        if (actions == actions[0]).all():
             raise InputError(f"every action{kind} is the same; there is nothing to learn, and nothing to judge")
-        if some.mask.sum(-1).max() < 2:
-            raise InputError(f"every episode{kind} is of one step; a world that answers nothing tells nothing")
+        if data.mask.sum(-1).max() < 2:
+            raise InputError(f"every episode{kind} is of one step; no dynamics can be learned from it")
     if explore is not None and (explore.obs.shape[-1], explore.action.shape[-1], explore.actions) != (
         trials.obs.shape[-1],
         trials.action.shape[-1],
@@ -140,88 +136,95 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
     ):
         raise InputError("exploration has other observations or actions than the expert's trials; both must be alike")
     if explore is not None:
-        near(Batch.of(trials, 1), Batch.of(explore, 1))
+        in_range(Batch.of(trials, 1), Batch.of(explore, 1))
 
 
 def judge(refits: Sequence[Findings]) -> Diagnosis:
     """The verdict, and why. Raises InputError if a figure is not finite."""
-    found = {}
-    for key, each in zip(Findings._fields, zip(*refits, strict=True), strict=True):
-        if values := [value for value in each if value is not None]:
+    figures = {}
+    for key, column in zip(Findings._fields, zip(*refits, strict=True), strict=True):
+        if values := [value for value in column if value is not None]:
             if not np.isfinite(values).all():
                 raise InputError(
                     f"learning failed: {key} is {values}; are there outliers, or scales that differ a lot?"
                 )
-            found[key] = Figure.of(values)
-    gap = found["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
-    judged = found["gap_judged"] = Figure.of([refit.latent_judged - refit.naive_judged for refit in refits])
-    memory, stakes, strayed, unlike = (found[key] for key in ("memory", "stakes", "strayed", "unlike"))
-    naive, latent = found["naive"], found["latent"]
-    explored = found.get("explored")
+            figures[key] = Figure.of(values)
+    gap = figures["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
+    judged = figures["gap_judged"] = Figure.of([refit.latent_judged - refit.naive_judged for refit in refits])
+    memory, stakes, strayed, unlike = (figures[key] for key in ("memory", "stakes", "strayed", "unlike"))
+    naive, latent = figures["naive"], figures["latent"]
+    explored = figures.get("explored")
     if explored is not None:
-        found["ratio"] = Figure.of([(refit.acted or 0.0) / max(refit.shown or 0.0, SILENT) for refit in refits])
-    said = [f"Memory adds {memory} nats a step to what the present observation tells of the expert's action."]
+        ratios = [(refit.acted or 0.0) / max(refit.shown or 0.0, NO_EVIDENCE) for refit in refits]
+        figures["ratio"] = Figure.of(ratios)
+    reasons = [
+        f"A memory improves the prediction of the expert's action by {memory} nats a step over the present observation."
+    ]
 
-    def told(verdict: Verdict, tier: int | None, why: str, then: Next) -> Diagnosis:
-        return Diagnosis(verdict, found, (*said, why), tier, then)
+    def conclude(verdict: Verdict, tier: int | None, reason: str, advice: Next) -> Diagnosis:
+        return Diagnosis(verdict, figures, (*reasons, reason), tier, advice)
 
-    if memory.low < -WORSE:
-        why = "With memory it was cloned the worse: the recurrent clone did not fit, and that says nothing."
-        return told("cannot tell", None, why, MORE)
-    if memory.low <= LITTLE:
-        if memory.high > LITTLE:
-            return told("cannot tell", None, "That may be nothing, or something: more trials would settle it.", MORE)
-        if explored is not None and found["shown"].low > SILENT:
-            why = "The world differs from trial to trial, and the expert acts on nothing that a clone does not see."
-            return told("not confounded", 1, why, CLONE)
-        why = (
-            "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. In the"
-            " circumstances of these trials a clone misses nothing; of others they tell nothing."
+    if memory.low < -MISFIT:
+        reason = "It makes the prediction worse: the recurrent clone did not fit, so that nothing follows."
+        return conclude("cannot tell", None, reason, MORE_TRIALS)
+    if memory.low <= NEGLIGIBLE:
+        if memory.high > NEGLIGIBLE:
+            reason = "That may be zero or not; more trials would decide."
+            return conclude("cannot tell", None, reason, MORE_TRIALS)
+        if explored is not None and figures["shown"].low > NO_EVIDENCE:
+            reason = (
+                "The dynamics differ between trials, but the expert acts on nothing that its clone does not observe."
+            )
+            return conclude("not confounded", 1, reason, CLONE)
+        reason = (
+            "The expert acts alike in all trials: there is no latent, or it was the same in all of them. Under this"
+            " latent a clone misses nothing; about others the trials say nothing."
         )
-        return told("cannot tell", None, why, VARY)
-    said.append(
-        "The expert acts on something that the present observation does not show. In the learned dynamics, an expert"
-        f" who is told another latent goes other ways: {stakes} times as strange, among those of experts who know"
-        f" theirs, as by chance, and {strayed} times as far from where the one who knows it goes. Between these two, 0"
-        f" and 1, a naive clone scores {naive} by where it goes, and one that infers the latent from the world"
-        f" {latent}; by what they do, Eq. (1), {found['naive_judged']} and {found['latent_judged']}."
+        return conclude("cannot tell", None, reason, VARY_LATENT)
+    reasons.append(
+        "The expert acts on something that the present observation does not show. In rollouts in the learned dynamics,"
+        f" trajectories of an expert policy given a wrong latent deviate from those given right ones {stakes} times as"
+        f" much as by chance, and {strayed} times as much when paired by latent and start. From 0 for the wrong latent"
+        f" to 1 for the right one, a naive clone scores {naive} by trajectories, and a policy that infers the latent"
+        f" from the dynamics {latent}; by actions, Eq. (1), {figures['naive_judged']} and {figures['latent_judged']}."
     )
     if explored is None:
-        why = (
-            "But these were learned from expert trials alone, which hold nearly one action for each observation and"
-            " latent: what an action does, and what the latent does, cannot be told apart there."
+        reason = (
+            "But the dynamics were learned from expert trials alone, which hold nearly one action for each observation"
+            " and latent: effects of actions and of the latent cannot be separated there."
         )
-        return told("cannot tell", None, why, TRY)
-    shown, explained = found["shown"], found["explained"]
-    said.append(
-        f"The world tells it by {explored} nats a step in exploration, and by {shown} where the expert went; what it"
-        f" tells explains the expert's actions better than the present observation by {explained}. The actions tell it"
-        f" by {found['acted']} nats a step: {found['ratio']} times the world's evidence, for a clone that takes its own"
-        " actions for the expert's."
+        return conclude("cannot tell", None, reason, EXPLORE_FIRST)
+    shown, explained = figures["shown"], figures["explained"]
+    reasons.append(
+        f"The dynamics are evidence of the latent, by {explored} nats a step in exploration and {shown} in expert"
+        " trials; the latent inferred from them improves the prediction of the expert's actions by"
+        f" {explained} over the present observation. The actions are evidence of it by {figures['acted']} nats a step:"
+        f" {figures['ratio']} times as much, for a clone that takes its own actions for the expert's."
     )
-    if max(-shown.low, shown.value, explained.high) < LITTLE:
-        why = (
-            "Both are next to nothing, and what the world tells does not explain what the expert does: expert trials do"
-            " not say which latent was theirs, and no exploration helps. Ask what the expert would do where the clone"
-            " goes; if the world tells it nowhere, only a sensor does. (An expert that remembers, or whose noise lasts,"
-            " looks the same; asked, it shows that too.)"
+    if max(-shown.low, shown.value, explained.high) < NEGLIGIBLE:
+        reason = (
+            "In expert trials the evidence of the dynamics is next to zero, and so is what the latent explains: these"
+            " trials do not identify it, and no exploration helps. Query the expert in states that the clone visits; if"
+            " the dynamics are no evidence anywhere, a sensor is needed. (An expert with a memory, or with noise that"
+            " lasts, looks the same; queries tell these apart.)"
         )
-        return told("confounded", 3, why, ASK)
-    if shown.low <= SILENT:
-        return told("cannot tell", None, "The latter may be nothing, or something.", WIDER)
-    if max(stakes.high, strayed.high) < STAKES and unlike.value < LIKE and explained.low > 0:
-        why = "But who mistakes it comes about as the others do, and where they do; and so will a clone."
-        return told("not confounded", 1, why, CLONE)
-    if not any(one.value >= STAKES and one.low > 1 for one in (stakes, strayed)):
-        why = (
-            "The ways may be other ones by chance: either it hardly matters, or the dynamics are not known well enough"
-            f" where it does. (On the whole, ways in the learned ones are {unlike} times as strange as the data's.)"
+        return conclude("confounded", 3, reason, QUERY)
+    if shown.low <= NO_EVIDENCE:
+        reason = "The evidence in expert trials may be zero or not."
+        return conclude("cannot tell", None, reason, EXPLORE_MORE)
+    if max(stakes.high, strayed.high) < STAKES and unlike.value < MAX_UNLIKE and explained.low > 0:
+        reason = "But trajectories under a wrong latent hardly deviate; nor will a clone's."
+        return conclude("not confounded", 1, reason, CLONE)
+    if not any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, strayed)):
+        reason = (
+            "These deviations may be chance: the latent hardly matters, or the learned dynamics are poor where it does."
+            f" (Over all features, trajectories in them deviate {unlike} times as much from the data's as by chance.)"
         )
-        return told("cannot tell", None, why, WIDER)
-    if naive.low > FINE and max(gap.high, judged.high) < GAP:
-        return told("not confounded", 1, "The naive clone finds out by itself.", CLONE)
-    if max(gap.low, judged.low) <= 0 or max(gap.high, judged.high) < GAP:
-        return told("cannot tell", None, "The scores hardly differ; more of both would settle it.", MORE)
-    return told(
-        "confounded", 2, "A clone takes its own actions for evidence; what the world answers is better.", EXPLORE
-    )
+        return conclude("cannot tell", None, reason, EXPLORE_MORE)
+    if naive.low > GOOD and max(gap.high, judged.high) < SMALL_GAP:
+        return conclude("not confounded", 1, "The naive clone infers the latent by itself.", CLONE)
+    if max(gap.low, judged.low) <= 0 or max(gap.high, judged.high) < SMALL_GAP:
+        reason = "The scores hardly differ; more trials and more exploration would decide."
+        return conclude("cannot tell", None, reason, MORE_TRIALS)
+    reason = "A clone takes its own actions for evidence; inference from the dynamics does better."
+    return conclude("confounded", 2, reason, EXPLORE)

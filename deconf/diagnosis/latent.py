@@ -1,4 +1,4 @@
-"""A latent that explains an expert's trials: as what the world answers tells it, or as actions and answers do."""
+"""A latent that explains an expert's trials: inferred from the dynamics alone, or from actions and dynamics."""
 
 from __future__ import annotations
 
@@ -14,168 +14,167 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
-from deconfounded.deconf.diagnosis.learned_env import known_range
+from deconfounded.deconf.diagnosis.learned_env import valid_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
-from deconfounded.deconf.methods.cloning import CloningConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-LEAST = 0.02  # share of exploring steps that are where the expert goes
+MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
 
 
 class Explanation(NamedTuple):
-    """A model that infers latents, a policy given them, and the latents [1, N, D] of the trials it was learned on.
+    """A model that infers latents, a policy given latents, and the latents [1, N, D] of the trials of training.
 
-    actions: log-likelihood of half of the expert's held-out actions (`odd`), given latents of the other half, nats a
-    step.
-    acted: how much less it is given another trial's; explored, shown: the same of what the world answered, in
-    exploration, and where the expert went. None without exploration.
+    Nats a step, None without exploration. action_likelihood: log-likelihood of held-out expert actions at odd steps,
+    given the latent inferred from even steps. action_evidence: the same less that given another trial's latent;
+    exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
     """
 
     model: VariationalModel
     policy: ActionHead
     latents: Tensor
-    actions: float | None = None
-    acted: float | None = None
-    explored: float | None = None
-    shown: float | None = None
+    action_likelihood: float | None = None
+    action_evidence: float | None = None
+    exploration_evidence: float | None = None
+    expert_evidence: float | None = None
 
 
-def alone(shown: Trials, how: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
-    """Of expert trials: a latent that explains actions and answers, Eq. (7)."""
-    data = Batch.of(shown, 1)
-    model, _, policy = deconfounded_offline.explain(data, Signature.of(shown), how, draws, monitor)
+def from_expert_trials(trials: Trials, config: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
+    """Explain actions and dynamics of expert trials by one latent, Eq. (7)."""
+    data = Batch.of(trials, 1)
+    model, _, policy = deconfounded_offline.explain(data, Signature.of(trials), config, draws, monitor)
     return Explanation(model, policy, model.sample(final_belief(model, data), draws))
 
 
-def by_world(
+def from_dynamics(
     expert: tuple[Trials, Trials],
-    explored: tuple[Trials, Trials],
-    each: int,
+    exploration: tuple[Trials, Trials],
+    per_theta: int,
     exploring: DeconfoundedConfig,
-    cloning: CloningConfig,
+    cloning: MemorylessConfig,
     draws: Draws,
     monitor: Monitor,
 ) -> Explanation:
-    """A latent that explains what the world answers, Eq. (6), and a policy given it; of each, the second is held out.
+    """Explain the dynamics by a latent, Eq. (6), and clone a policy given it. Of both pairs, the second is held out.
 
-    Not on expert trials: these hold nearly one action for each observation and latent, so that what an action does and
-    what the latent does cannot be told apart. (On `swapped_lander`, of both, it learned that the engine does nothing.)
-    each: how many trials of either, side by side, may be of one theta. Raises InputError if exploration hardly comes to
-    where the expert goes.
+    The dynamics are learned from exploration: expert trials hold nearly one action for each observation and latent, so
+    that the effects of the two cannot be separated. (Trained on both, a model of `swapped_lander` ignored the engine.)
+    per_theta: how many successive trials may be under one theta. Raises InputError if exploration hardly covers the
+    range of the expert's observations.
     """
-    shown, held, tried, rest = (Batch.of(some, 1) for some in (*expert, *explored))
-    tried, rest = (near(shown, some) for some in (tried, rest))
-    model = _dynamics(tried, Signature.of(expert[0]), exploring, draws, monitor)
-    _refit_noise(model, tried, draws)
+    train, held_out, explored, explored_held_out = (Batch.of(x, 1) for x in (*expert, *exploration))
+    explored, explored_held_out = (in_range(train, x) for x in (explored, explored_held_out))
+    model = _train_dynamics(explored, Signature.of(expert[0]), exploring, draws, monitor)
+    _refit_noise(model, explored, draws)
 
-    def answers(some: Batch, latent: Tensor) -> Tensor:
-        return model.dynamics.log_prob(some.obs, some.action, some.next_obs, latent)[..., 0]
+    def log_next(batch: Batch, latent: Tensor) -> Tensor:
+        return model.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, latent)[..., 0]
 
-    def actions(some: Batch, latent: Tensor) -> Tensor:
-        return policy.log_prob(torch.cat([model.inputs.obs(some.obs), latent], -1), some.action)
+    def log_policy(batch: Batch, latent: Tensor) -> Tensor:
+        return policy.log_prob(torch.cat([model.inputs.obs(batch.obs), latent], -1), batch.action)
 
-    _, met = _told(answers, model, rest, each, draws)
-    _refit_noise(model, shown, draws)
-    policy = _conditional(model, shown, cloning, draws)
-    likely, acted = _told(actions, model, held, each, draws)
-    _, told = _told(answers, model, held, each, draws)
-    return Explanation(model, policy, model.sample(_belief(model, shown), draws), likely, acted, met, told)
+    _, exploration_evidence = _evidence(log_next, model, explored_held_out, per_theta, draws)
+    _refit_noise(model, train, draws)
+    policy = _train_policy(model, train, cloning, draws)
+    likelihood, action_evidence = _evidence(log_policy, model, held_out, per_theta, draws)
+    _, expert_evidence = _evidence(log_next, model, held_out, per_theta, draws)
+    latents = model.sample(_belief(model, train), draws)
+    return Explanation(model, policy, latents, likelihood, action_evidence, exploration_evidence, expert_evidence)
 
 
-def mean(x: Tensor, batch: Batch) -> float:
-    """Over all steps [1, B, T] that took place."""
+def step_mean(x: Tensor, batch: Batch) -> float:
+    """The mean of x [1, B, T] over the steps of a batch."""
     return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
 
 
-def odd(batch: Batch) -> Batch:
-    """Every other step, beginning with the second."""
+def odd_steps(batch: Batch) -> Batch:
+    """Every other step, from the second on."""
     return replace(batch, mask=batch.mask * (torch.arange(batch.mask.shape[2]) % 2))
 
 
 def _belief(model: VariationalModel, batch: Batch) -> Tensor:
-    """Of each trial [1, B, P], told by the other steps: half of them, as where it was learned."""
-    return final_belief(model, replace(batch, mask=batch.mask - odd(batch).mask))
+    """Beliefs [1, B, P] about each trial from its even steps: half of them, as in training."""
+    return final_belief(model, replace(batch, mask=batch.mask - odd_steps(batch).mask))
 
 
-def _along(batch: Batch, latents: Tensor) -> Tensor:
+def _per_step(batch: Batch, latents: Tensor) -> Tensor:
     """Each trial's latent [1, B, D] at each of its steps."""
     return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
 
 
-def _dynamics(
-    explored: Batch, signature: Signature, how: DeconfoundedConfig, draws: Draws, monitor: Monitor
+def _train_dynamics(
+    explored: Batch, signature: Signature, config: DeconfoundedConfig, draws: Draws, monitor: Monitor
 ) -> VariationalModel:
-    """Eq. (6), of sets: half of a trial's steps, drawn at random, tell the latent that predicts the other half.
+    """Eq. (6) on sets: the latent inferred from a random half of a trial's steps predicts the other half.
 
-    Not the beginning, with what comes next to predict, as in deployment: a latent of single episodes, learned so, told
-    how late in its episode a step is, and dreams begun with it were of no use.
+    The beginning of a trial and the steps after it, as in deployment, are no such halves: a latent of single episodes
+    then encodes the time in the episode, and rollouts that start with it are of no use.
     """
-    model = VariationalModel("evidence", how.latent, how.width, signature, *scalers(explored), draws)
-    optimizer = Adam([model], how.inference_rate, how.inference_updates)
-    for update in range(how.inference_updates):
-        batch = explored.draw_trials(how.inference_batch, draws)
-        batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, how.shortest)
+    model = VariationalModel("evidence", config.latent, config.width, signature, *scalers(explored), draws)
+    optimizer = Adam([model], config.inference_rate, config.inference_updates)
+    for update in range(config.inference_updates):
+        batch = explored.draw_trials(config.inference_batch, draws)
+        batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, config.shortest)
         half = draws.uniform(*batch.mask.shape[1:]) < 0.5
-        known, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
+        context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
         model.train()
-        belief = model.belief(model.last(known))
-        index = rest.draw_steps(how.inference_steps, draws)
-        real, trial = rest.steps(index), index // batch.mask.shape[2]
-        theta_hat, centre, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
-        beta = how.beta * ramp(update, how.warm_up * how.inference_updates)
-        loss = model.bound(real, centre, std, theta_hat, beta)
+        belief = model.belief(model.last(context))
+        index = rest.draw_steps(config.inference_steps, draws)
+        steps, trial = rest.steps(index), index // batch.mask.shape[2]
+        theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
+        beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
+        loss = model.bound(steps, mean, std, theta_hat, beta)
         model.eval()
         optimizer.step(loss)
-        monitor.update(update + 1, how.inference_updates, {"inference": loss.mean().item()})
+        monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model
 
 
-def near(data: Batch, explored: Batch) -> Batch:
-    """Explored trials without their steps from outside of the range in which dynamics are to hold."""
-    low, high = known_range(data)
+def in_range(expert: Batch, explored: Batch) -> Batch:
+    """Exploration trials, masked to the range in which the dynamics are valid. Raises InputError if little is left."""
+    low, high = valid_range(expert)
     inside = ((explored.obs >= low[:, None]) & (explored.obs <= high[:, None])).all(-1) * explored.mask
-    some = inside[0].sum(-1) > 0
-    if (share := float(inside.sum() / explored.mask.sum())) < LEAST or some.sum() < 2:
+    kept = inside[0].sum(-1) > 0
+    if (share := float(inside.sum() / explored.mask.sum())) < MIN_COVERAGE or kept.sum() < 2:
         raise InputError(
-            f"exploration was where the expert goes for {share:.1%} of its steps; {LEAST:.0%} are needed, in several"
-            " trials: explore by a behaviour that stays nearer"
+            f"exploration was where the expert goes for {share:.1%} of its steps; {MIN_COVERAGE:.0%} are needed, in"
+            " several trials: explore by a behaviour that stays nearer"
         )
-    return replace(explored, mask=inside)[:, some.nonzero()[:, 0]]
+    return replace(explored, mask=inside)[:, kept.nonzero()[:, 0]]
 
 
 @torch.no_grad()
 def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
-    """Noise of the size it has in these trials: what is learned last, and falls and the like swell it."""
-    head, latents = model.dynamics, _along(data, model.sample(_belief(model, data), draws))
+    """Set the noise to the residuals' size in these trials: falls and the like inflate what training estimates."""
+    head, latents = model.dynamics, _per_step(data, model.sample(_belief(model, data), draws))
     if not model.inputs.signature.binary:
-        off = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
-        square = masked_mean(off.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
-        head.log_std.copy_(0.5 * square.clamp(min=1e-12).log())
+        residual = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
+        variance = masked_mean(residual.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
+        head.log_std.copy_(0.5 * variance.clamp(min=1e-12).log())
 
 
 @torch.no_grad()
-def _told(
-    log_prob: Callable[[Batch, Tensor], Tensor], model: VariationalModel, data: Batch, each: int, draws: Draws
+def _evidence(
+    log_prob: Callable[[Batch, Tensor], Tensor], model: VariationalModel, data: Batch, per_theta: int, draws: Draws
 ) -> tuple[float, float]:
-    """How likely trials' odd steps are given latents inferred from the others, nats a step; and how much more so than
-    given that of the trial `each` on.
+    """Log-likelihood of odd steps given the latent of the even ones, and its excess over that given another trial's.
 
-    log_prob: of steps [1, B, T], given latents [1, B, T, D].
+    Nats a step. log_prob: of steps [1, B, T] given latents [1, B, T, D]. The other trial is `per_theta` before.
     """
-    rest, latents = odd(data), model.sample(_belief(model, data), draws)
-    own, other = (mean(log_prob(rest, _along(rest, latent)), rest) for latent in (latents, latents.roll(each, 1)))
+    odd, latents = odd_steps(data), model.sample(_belief(model, data), draws)
+    own, other = (step_mean(log_prob(odd, _per_step(odd, x)), odd) for x in (latents, latents.roll(per_theta, 1)))
     return own, own - other
 
 
-def _conditional(model: VariationalModel, data: Batch, how: CloningConfig, draws: Draws) -> ActionHead:
+def _train_policy(model: VariationalModel, data: Batch, config: MemorylessConfig, draws: Draws) -> ActionHead:
     """A policy, cloned given the latents that a model infers from the trials."""
-    policy = ActionHead(model.inputs.obs_width + model.latent, how.width, model.inputs.signature, draws)
+    policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.signature, draws)
     agent, belief = DeconfoundedAgent(model, policy), _belief(model, data)
-    optimizer = Adam([policy], how.learning_rate, how.updates)
-    for _ in range(how.updates):
-        optimizer.step(agent.loss(data, belief, how.batch, draws))
+    optimizer = Adam([policy], config.learning_rate, config.updates)
+    for _ in range(config.updates):
+        optimizer.step(agent.loss(data, belief, config.batch, draws))
     return policy

@@ -1,4 +1,4 @@
-"""What cloning will cost, seen in learned dynamics: actors go about there under latents drawn from the data."""
+"""The learned environment: rollouts of policies in learned dynamics, under latents inferred from the data."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, extent, take
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, sample_index
-from deconfounded.deconf.core.termination import Endings
+from deconfounded.deconf.core.termination import TerminationModel
 from deconfounded.deconf.equations import belief_update
 
 
@@ -26,18 +26,18 @@ class Actor(Protocol):
     def remember(self, step: Batch) -> None: ...
 
 
-class Expert:
-    """A latent-conditional policy: of latents [S, N, D], one a trial, that it holds for true."""
+class LatentPolicy:
+    """The latent-conditional policy, an actor that is given the latents [S, N, D] of its trials, right or wrong."""
 
     def __init__(self, model: VariationalModel, policy: ActionHead, theta_hat: Tensor) -> None:
         self.model, self.policy, self.theta_hat = model, policy, theta_hat
 
     def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
-        """It remembers nothing."""
+        """Start trials; there is no memory."""
         self._draws = Draws(rngs, "cpu")
 
     def features(self, obs: Tensor, latent: Tensor) -> Tensor:
-        """What the policy reads."""
+        """Features for the policy."""
         return torch.cat([self.model.inputs.obs(obs), latent], -1)
 
     def choose(self, obs: Tensor) -> Tensor:
@@ -47,13 +47,13 @@ class Expert:
         pass
 
     def point(self, obs: Tensor, latent: Tensor) -> Tensor:
-        """The mean action [..., A], or log-probabilities of discrete ones."""
+        """The mean action [..., A], or log-probabilities of discrete actions."""
         out = self.policy.net(self.features(obs, latent))
         return torch.log_softmax(out, -1) if self.policy.signature.actions else out.chunk(2, -1)[0].clamp(-1, 1)
 
 
-class Filter(Expert):
-    """Eq. (5) over K latents of the data [S, K, D]: posterior sampling under a belief that reads dynamics alone."""
+class PosteriorSampler(LatentPolicy):
+    """Posterior sampling over K candidate latents [S, K, D], under a belief from the dynamics alone, Eq. (5)."""
 
     def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
         super().begin(n, rngs)
@@ -62,26 +62,21 @@ class Filter(Expert):
 
     def log_next(self, step: Batch) -> Tensor:
         """log p(s' | s, a, theta_hat_k) [..., K] of steps [S, ...]."""
-        every, latent = self._every(step)
-        return self.model.dynamics.log_prob(every.obs, every.action, every.next_obs, latent)[..., 0]
-
-    def _every(self, step: Batch) -> tuple[Batch, Tensor]:
-        """Each step under each latent."""
         shape = (*step.mask.shape, self.theta_hat.shape[1])
         latent = self.theta_hat.reshape(len(self.theta_hat), *[1] * (step.mask.dim() - 1), *self.theta_hat.shape[1:])
         obs, action, next_obs = (x[..., None, :].expand(*shape, -1) for x in step.tensors[:3])
-        return Batch(obs, action, next_obs, step.mask), latent.expand(*shape, -1)
+        return self.model.dynamics.log_prob(obs, action, next_obs, latent.expand(*shape, -1))[..., 0]
 
     def choose(self, obs: Tensor) -> Tensor:
-        drawn = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))
-        return self.policy.sample(self.features(obs, drawn), self._draws)
+        latent = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))
+        return self.policy.sample(self.features(obs, latent), self._draws)
 
     def remember(self, step: Batch) -> None:
         self.log_belief = belief_update(self.log_belief, self.log_next(step) * step.mask[..., None])
 
 
-class Clone:
-    """A learned agent, as an actor; its memory goes on over episodes."""
+class AgentActor:
+    """A learned agent as an actor; its memory outlives episodes."""
 
     def __init__(self, agent: LearnedAgent) -> None:
         self.agent = agent
@@ -97,90 +92,88 @@ class Clone:
         self.agent.remember(step)
 
 
-def farther(rivals: Tensor, known: Tensor, draws: Draws) -> Tensor:
-    """For each of known ones [S, N] of latents [S, K, D], another, of the half that is farther from it."""
-    half = max(1, rivals.shape[1] // 2)
-    far = torch.cdist(rivals, rivals).argsort(-1, descending=True)[..., :half]
-    return take(far, known).gather(-1, draws.below(half, known.shape[1])[..., None])[..., 0]
-
-
-def seen_range(*data: Batch) -> tuple[Tensor, Tensor]:
+def observed_range(*data: Batch) -> tuple[Tensor, Tensor]:
     """Least and largest observation [S, 1, O] of trials [S, B, T]."""
-    ends = [extent(obs, batch.mask) for batch in data for obs in (batch.obs, batch.next_obs)]
-    low, high = (torch.stack(values) for values in zip(*ends, strict=True))
+    extents = [extent(obs, batch.mask) for batch in data for obs in (batch.obs, batch.next_obs)]
+    low, high = (torch.stack(values) for values in zip(*extents, strict=True))
     return low.amin(0), high.amax(0)
 
 
-def known_range(held: Batch) -> tuple[Tensor, Tensor]:
-    """Least and largest observation [S, 1, O] for which dynamics are to hold: the data, and half its range beyond."""
-    low, high = seen_range(held)
+def valid_range(expert: Batch) -> tuple[Tensor, Tensor]:
+    """The range [S, 1, O] in which dynamics are taken to be valid: the data's, and half of it beyond on either side."""
+    low, high = observed_range(expert)
     margin = (0.5 * (high - low)).clamp(min=1e-3)
     return low - margin, high + margin
 
 
-class World:
-    """Learned dynamics under latents [S, N, D], and the expert who knows them, as a judge.
+class LearnedEnv:
+    """Learned dynamics under the latents [S, N, D] of a reference policy, which also measures errors of actions.
 
-    held: expert trials [S, B, T], in whose known_range the dynamics hold, and from whose starts episodes begin; all
-    trials that there are say what is ever observed, beyond which no dream goes: a sensor may reach no further. ends:
-    where an episode is over before its horizon, more likely than not.
+    expert: trials [S, B, T] whose valid_range holds, and from whose first observations episodes start. data: all
+    trials, whose range bounds observations, as a sensor may. Episodes end where termination is more likely than not.
     """
 
     def __init__(
-        self, judge: Expert, held: Batch, every: Sequence[Batch], episodes: int, horizon: int, ends: Endings | None
+        self,
+        reference: LatentPolicy,
+        expert: Batch,
+        data: Sequence[Batch],
+        episodes: int,
+        horizon: int,
+        termination: TerminationModel | None,
     ) -> None:
-        self.judge, self.horizon, self.ends = judge, horizon, ends
-        n, starts = judge.theta_hat.shape[1], held.obs[:, :, 0]
+        self.reference, self.horizon, self.termination = reference, horizon, termination
+        n, starts = reference.theta_hat.shape[1], expert.obs[:, :, 0]
         draws = Draws([np.random.default_rng(i) for i in range(len(starts))], "cpu")
-        self.starts = [take(starts, draws.below(starts.shape[1], n)) for _ in range(episodes)]  # the same for everyone
-        self.known, self.seen = known_range(held), seen_range(*every)
-        self.scale = self._scale(held)
+        self.starts = [take(starts, draws.integers(starts.shape[1], n)) for _ in range(episodes)]  # of all rollouts
+        self.valid, self.observed = valid_range(expert), observed_range(*data)
+        self.scale = self._scale(expert)
 
-    def _scale(self, held: Batch) -> Tensor:
-        """How far the actions of two latents' experts are apart where experts go: [S, 1]."""
-        theta_hat = self.judge.theta_hat
-        if self.judge.policy.signature.actions:
+    def _scale(self, expert: Batch) -> Tensor:
+        """The mean distance [S, 1] of the reference's actions under two random latents, on expert observations."""
+        theta_hat = self.reference.theta_hat
+        if self.reference.policy.signature.actions:
             return torch.ones(len(theta_hat), 1)
         n = theta_hat.shape[1]
         draws = Draws([np.random.default_rng(i) for i in range(len(theta_hat))], "cpu")
-        obs = held.steps(held.draw_steps(16 * n, draws)).obs
-        one, other = (take(theta_hat, draws.below(n, 16 * n)) for _ in range(2))
-        apart = (self.judge.point(obs, one) - self.judge.point(obs, other)).abs().sum(-1)
-        return apart.mean(1, keepdim=True).clamp(min=1e-3)
+        obs = expert.steps(expert.draw_steps(16 * n, draws)).obs
+        first, second = (take(theta_hat, draws.integers(n, 16 * n)) for _ in range(2))
+        distance = (self.reference.point(obs, first) - self.reference.point(obs, second)).abs().sum(-1)
+        return distance.mean(1, keepdim=True).clamp(min=1e-3)
 
-    def _off(self, obs: Tensor, action: Tensor) -> Tensor:
-        """How far an action [S, N, A] is from the knowing expert's, 0 to 1."""
-        point = self.judge.point(obs, self.judge.theta_hat)
-        if self.judge.policy.signature.actions:
-            likely = point.gather(-1, action[..., :1].long())[..., 0]
-            return 1 - (likely - point.amax(-1)).exp()
+    def _action_error(self, obs: Tensor, action: Tensor) -> Tensor:
+        """The distance [S, N] of actions [S, N, A] from the reference's, 0 to 1."""
+        point = self.reference.point(obs, self.reference.theta_hat)
+        if self.reference.policy.signature.actions:
+            log_prob = point.gather(-1, action[..., :1].long())[..., 0]
+            return 1 - (log_prob - point.amax(-1)).exp()
         return ((action - point).abs().sum(-1) / self.scale).clamp(max=1)
 
     @torch.no_grad()
-    def visit(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
-        """An actor's last episode: how far its actions are from the judge's [S], and its observations [S, N, T, O].
+    def rollout(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
+        """The mean action error [S] and the observations [S, N, T, O] of an actor's last episode.
 
-        The first is a mean over steps, 0 to 1; where that range is left, the rest of the episode counts as 1. Then, and
-        when it is over, observations stay as they are.
+        After an episode leaves the valid range, its errors count as 1. From there on, or after its termination, its
+        observations stay as they are.
         """
-        seeds, n, _ = self.judge.theta_hat.shape
+        seeds, n, _ = self.reference.theta_hat.shape
         rngs = [np.random.default_rng(rng.integers(2**63)) for rng in rngs]
         draws = Draws(rngs, "cpu")
         actor.begin(n, rngs)
         for obs in self.starts:
-            there, lost = torch.ones(seeds, n), torch.zeros(seeds, n)
-            total, count, went = torch.zeros(seeds, n), torch.zeros(seeds, n), list[Tensor]()
+            alive, left = torch.ones(seeds, n), torch.zeros(seeds, n)
+            total, count, path = torch.zeros(seeds, n), torch.zeros(seeds, n), list[Tensor]()
             for _ in range(self.horizon):
                 action = actor.choose(obs)
-                total += there * self._off(obs, action) + lost
-                count += there + lost
-                next_obs = self.judge.model.dynamics.sample(obs, action, self.judge.theta_hat, draws)
-                actor.remember(Batch(obs, action, next_obs, there))  # as drawn: of that, log_next is the likelihood
-                obs = torch.where(there[..., None] > 0, next_obs.clamp(*self.seen), obs)
-                inside = ((obs >= self.known[0]) & (obs <= self.known[1])).all(-1)
-                lost = torch.maximum(lost, there * ~inside)
-                there = there * inside
-                if self.ends is not None:
-                    there = there * (self.ends.logit(obs) <= 0)
-                went.append(obs)
-        return (total / count).mean(1), torch.stack(went, 2)
+                total += alive * self._action_error(obs, action) + left
+                count += alive + left
+                next_obs = self.reference.model.dynamics.sample(obs, action, self.reference.theta_hat, draws)
+                actor.remember(Batch(obs, action, next_obs, alive))  # before clamping, as log_next models it
+                obs = torch.where(alive[..., None] > 0, next_obs.clamp(*self.observed), obs)
+                inside = ((obs >= self.valid[0]) & (obs <= self.valid[1])).all(-1)
+                left = torch.maximum(left, alive * ~inside)
+                alive = alive * inside
+                if self.termination is not None:
+                    alive = alive * (self.termination.logit(obs) <= 0)
+                path.append(obs)
+        return (total / count).mean(1), torch.stack(path, 2)

@@ -1,6 +1,6 @@
-"""One file a method, and the training loops that several share. A line of METHODS registers a method.
+"""Methods, a file each, and training loops that several share. A line of METHODS registers a method.
 
-A method is a function that is declared with `uses` (deconf/method.py): `fit` of the module, or the one that is named.
+A method is a function with the decorator `uses` (deconf/method.py), given here as module:function.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ METHODS = {
     "expert": "references:expert",
     "random": "references:random",
 }
-"""In the order of tables, and of a run: the longest first."""
+"""In the order of tables and of a run: the longest first."""
 
 
 def load(name: str) -> Callable[[Given], Agent]:
-    """The function of a registered method; its module is imported now."""
+    """The function of a registered method, from its module, which is imported now."""
     module, function = METHODS[name].split(":")
     return getattr(import_module(f"{__name__}.{module}"), function)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import AMOUNTS, MemorylessAgent
+from deconfounded.deconf.methods import memoryless_bc
+from deconfounded.deconf.methods.memoryless_bc import PRESETS, MemorylessAgent
 
 
-@uses("demonstrations", **AMOUNTS)
+@uses("demonstrations", **PRESETS)
 def fit(given: Given) -> MemorylessAgent:
-    """Clone the expert step by step."""
-    return cloning.train(given.demonstrations, given.config, given.rngs, monitor=given.monitor)
+    """Clone the expert's action at each step."""
+    return memoryless_bc.train(given.demonstrations, given.config, given.rngs, monitor=given.monitor)

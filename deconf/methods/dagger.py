@@ -1,14 +1,14 @@
-"""Tier 3: expert queries, after DAgger (Ross et al., 2011). A policy with a memory learns from labels on its roll-outs.
+"""Tier 3: expert queries, after DAgger (Ross et al., 2011). A policy with memory learns from labels on its roll-outs.
 
-It is on-policy distillation of a privileged expert: others call it SequIL, or counterfactual teaching (Ortega et al.,
-2021). Other than DAgger's, its roll-outs are never the expert's, nor a mixture with it: the first are random.
+This is on-policy distillation of a privileged expert, also called SequIL, or counterfactual teaching (Ortega et al.,
+2021). Unlike in DAgger, no roll-out is the expert's or a mixture with it: the first are random.
 
-The expert, which sees theta, is asked what it would do at each step that the imitator comes to. Actions in these
-histories are the imitator's, and so no evidence of theta: at its optimum this is the interventional policy (Ortega et
-al., 2021), whatever the dynamics tell. Expert roll-outs are not used: their actions would be evidence.
+The expert, which sees theta, labels each step of the imitator's roll-outs with the action that it would take. Actions
+in these histories are the imitator's, and so no evidence of theta: the optimum is the interventional policy (Ortega et
+al., 2021) for any dynamics. Expert roll-outs are not used, since their actions are evidence of theta.
 
-What such a policy has to remember is the evidence of theta, a sum over transitions whatever their order (see
-EvidenceBelief). A GRU in its place took 1.6 times the time, and had .11 on `swapped_lander`, not .9.
+The memory is a sum of evidence over transitions, in any order (see EvidenceBelief). A GRU in its place took 1.6 times
+as long, and scored .11 on `swapped_lander`, not .9.
 """
 
 from __future__ import annotations
@@ -25,41 +25,40 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take, take_steps
-from deconfounded.deconf.core.drift import apart
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, take_steps
+from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Query = Callable[[Agent | None], tuple[Trials, NDArray[np.float32]]]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each seed.
+"""Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.
 
-Returns trials, and beside them what the expert would have done at each step [B, E, T, A]."""
+Returns trials, and the expert's action at each of their steps [B, E, T, A]."""
 
 
 @dataclass(frozen=True)
 class DaggerConfig(Configuration):
-    """Widths and amounts, for each seed. Each round queries on fresh roll-outs of the policy so far."""
+    """Hyperparameters for each seed. Each round labels fresh roll-outs of the current policy."""
 
     width: int = 64
-    latent: int = 16  # numbers that the policy reads of the memory
+    latent: int = 16  # width of the features of the memory that the policy reads
     rounds: int = 16
     updates: int = 4000  # in all; later rounds, with more labels, get more of them
     batch: int = 16  # trials, whose every step is evidence
-    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
-    steps: int | None = 1024  # of them, whose label is predicted; None: all
+    shortest: float = 1 / 16  # least share of these trials that an update reads: see Batch.beginnings
+    steps: int | None = 1024  # whose label is predicted, of these trials; None: all
     learning_rate: float = 3e-3
-    drifts: bool = False  # theta changes between the episodes of a trial: each episode begins without memory
+    drifts: bool = False  # theta changes between episodes: the memory is reset at each
     device: str = "cpu"
 
 
 class DaggerAgent(LearnedAgent):
-    """Acts on the observation and on what it made of its transitions so far."""
+    """A policy of the observation and of a sum of evidence over the agent's transitions."""
 
     def __init__(self, memory: EvidenceBelief, policy: ActionHead, latent: int, forgets: bool) -> None:
         super().__init__(policy)
@@ -69,7 +68,7 @@ class DaggerAgent(LearnedAgent):
     def new(
         width: int, latent: int, forgets: bool, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> DaggerAgent:
-        """One that knows nothing yet."""
+        """An untrained agent. forgets: its memory is reset at each episode."""
         memory = EvidenceBelief(latent, width, signature, obs, change, draws)
         policy = ActionHead(memory.inputs.obs_width + latent, width, signature, draws)
         return DaggerAgent(memory.eval(), policy, latent, forgets)
@@ -95,7 +94,7 @@ class DaggerAgent(LearnedAgent):
             self._memory = self.memory.start(self._n)
 
     def _inputs(self, obs: Tensor, memory: Tensor) -> Tensor:
-        """What the policy reads."""
+        """Features for the policy."""
         return torch.cat([self.memory.inputs.obs(obs), self.memory.posterior(memory)[0]], -1)
 
     def choose(self, obs: Tensor) -> Tensor:
@@ -109,7 +108,7 @@ class DaggerAgent(LearnedAgent):
         return self.memory.posterior(self._memory)[0].flatten(0, 1).cpu().numpy()
 
     def loss(self, batch: Batch, label: Tensor, steps: int | None, draws: Draws) -> Tensor:
-        """The imitation loss [S] of the labels [S, B, T, A] of so many steps of trials."""
+        """The imitation loss [S] of labels [S, B, T, A] at so many steps of trials."""
         index = batch.draw_steps(steps, draws)
         memories = self.memory(batch)[:, :, :-1].flatten(1, 2)
         inputs = self._inputs(take_steps(batch.obs, index), take(memories, index))
@@ -122,35 +121,33 @@ class DaggerAgent(LearnedAgent):
 
 
 def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> DaggerAgent:
-    """Label roll-outs, train on all labels so far, and again. Raises InputError for less than one round."""
-    if config.rounds < 1:
-        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, monitor = listed(rng), monitor or Monitor()
+    """In rounds, label roll-outs and train on all labels so far.."""
+    rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
 
     def labelled(behaviour: DaggerAgent | None) -> tuple[Signature, Batch, Tensor]:
-        """Roll-outs, and their labels [S, B, T, A], joined as the trials' own actions are."""
+        """Roll-outs, and labels [S, B, T, A] aligned with their actions."""
         trials, labels = query(behaviour)
-        each = apart if config.drifts else lambda trials: trials
-        told = Trials(trials.obs, labels, trials.mask, trials.actions)
-        acted, meant = (Batch.of(each(some), len(rngs), config.device) for some in (trials, told))
-        return Signature.of(trials), acted, meant.action
+        unit = split_episodes if config.drifts else lambda trials: trials
+        relabelled = Trials(trials.obs, labels, trials.mask, trials.actions)
+        batch, label = (Batch.of(unit(x), len(rngs), config.device) for x in (trials, relabelled))
+        return Signature.of(trials), batch, label.action
 
     signature, data, label = labelled(None)
     agent = DaggerAgent.new(config.width, config.latent, config.drifts, signature, *scalers(data), draws)
     share = config.updates / (config.rounds * (config.rounds + 1) / 2)
     updates = [max(1, round(share * i)) for i in range(1, config.rounds + 1)]
     optimizer, done = Adam([agent.memory, agent.policy], config.learning_rate, sum(updates)), 0
-    agent.memory.whiten.left = sum(updates) // 2  # what roll-outs come to changes with each round, and so do moments
+    agent.memory.whiten.updates_left = sum(updates) // 2  # moments change with each round's roll-outs
     for i in range(config.rounds):
         if i > 0:
             _, more, new = labelled(agent)
             data, label = data.joined(more), torch.cat([label, new], 1)
         for _ in range(updates[i]):
-            index, batch = draws.below(len(data), config.batch), data.beginnings(done, config.shortest)
-            told = take(label[:, :, : batch.mask.shape[2]], index)
+            index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)
+            target = take(label[:, :, : batch.mask.shape[2]], index)
             agent.memory.train()
-            loss = agent.loss(batch.trials(index), told, config.steps, draws)
+            loss = agent.loss(batch.trials(index), target, config.steps, draws)
             agent.memory.eval()
             optimizer.step(loss)
             done += 1
@@ -167,5 +164,5 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     smoke_bandit={"updates": 500, "rounds": 4},
 )
 def fit(given: Given) -> DaggerAgent:
-    """Rounds of labelled roll-outs and imitation."""
+    """Train on labelled roll-outs."""
     return train(given.query, given.config, given.rngs, given.monitor)

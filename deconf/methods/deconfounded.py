@@ -1,8 +1,8 @@
 """Deconfounded imitation learning, Tier 2: Algorithm 1 (training) and Algorithm 2 (deployment) of the paper.
 
-A latent-variable model learns from exploration that is blind to theta. Latents theta_hat_H are inferred on whole
-expert trials, and a latent-conditional policy pi_eta(a | s, theta_hat) is cloned. At test time the agent samples
-theta_hat from its belief, acts, and updates the belief on what follows.
+A latent-variable model is trained on exploration that is blind to theta. It infers latents theta_hat_H on whole expert
+trials, given which a latent-conditional policy pi_eta(a | s, theta_hat) is cloned. At test time the agent samples
+theta_hat from its belief (posterior sampling), acts, and updates the belief on the transition.
 """
 
 from __future__ import annotations
@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, drawn, listed, take
-from deconfounded.deconf.core.drift import apart, choose_kept
-from deconfounded.deconf.core.models import LatentModel, final_belief
-from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
+from deconfounded.deconf.core.drift import choose_kept, split_episodes
+from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
+from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -32,15 +31,14 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Explore = Callable[[Agent | None], Trials]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments: as many trials for each seed."""
+"""Rolls out a behaviour (None: uniformly random actions) under fresh thetas: as many trials for each seed."""
 
 
 @dataclass(frozen=True)
 class DeconfoundedConfig(Configuration):
-    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy.
+    """Hyperparameters for each seed. Each round explores, then updates the model, then the policy.
 
-    The discrete model has no bound to weigh and no step to leave out: beta, warm_up, inference_steps and fit_prior are
-    not for it.
+    The discrete model has an exact likelihood: beta, warm_up, inference_steps and fit_prior do not apply to it.
     """
 
     model: Literal["evidence", "gru", "discrete"] = "evidence"
@@ -51,24 +49,23 @@ class DeconfoundedConfig(Configuration):
     rounds: int = 8
     inference_updates: int = 500  # a round
     inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
-    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
-    inference_steps: int | None = 1024  # of them, whose next observation is predicted; None: all
+    shortest: float = 1 / 16  # least share of these trials that an update reads: see Batch.beginnings
+    inference_steps: int | None = 1024  # whose next observation is predicted, of these trials; None: all
     inference_rate: float = 3e-3
     imitation_updates: int = 250  # a round
     final_updates: int = 2000  # of the policy, after the last round
     imitation_batch: int | None = 1024  # steps; None: all there are
     imitation_rate: float = 2e-3
     cooled: bool = True  # learning rates fall to 0 along a cosine
-    # Use the explorations of all rounds; else each round's alone, with demonstrations drawn anew if there is a source.
-    accumulate: bool = True
-    fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it stays N(0, 1)
+    accumulate: bool = True  # train on exploration of all rounds; else of each alone, and on fresh demonstrations
+    fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it is N(0, 1)
     drifts: bool = False  # theta changes between the episodes of a trial: see deconf/core/drift.py
     device: str = "cpu"
-    random_share: float = 0.1  # of exploring actions that are uniformly random; at 1 the imitator is not asked
+    random_share: float = 0.1  # of exploration's actions that are uniformly random; 1: without the imitator
 
 
 class DeconfoundedAgent(LearnedAgent):
-    """Algorithm 2. resample: draw theta_hat anew every step, or once an episode."""
+    """Algorithm 2, posterior sampling. resample: draw theta_hat at every step, or once an episode."""
 
     def __init__(self, model: LatentModel, policy: ActionHead, resample: Literal["step", "episode"] = "step") -> None:
         super().__init__(policy)
@@ -78,7 +75,7 @@ class DeconfoundedAgent(LearnedAgent):
     def new(
         kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> DeconfoundedAgent:
-        """One that knows nothing yet. Raises InputError for a kind of model that there is not."""
+        """An untrained agent. Raises InputError for an unknown kind of model."""
         model = new_model(kind, latent, width, signature, obs, change, draws)
         return DeconfoundedAgent(model.eval(), ActionHead(model.inputs.obs_width + latent, width, signature, draws))
 
@@ -106,7 +103,7 @@ class DeconfoundedAgent(LearnedAgent):
         self._memory = self.model.forget(self._memory)
 
     def latent(self) -> Tensor:
-        """The theta_hat [S, N, D] to act under now."""
+        """The theta_hat [S, N, D] for the next action."""
         if self._latent is None or self.resample == "step":
             self._latent = self.model.sample(self.model.belief(self._memory), self._draws)
         return self._latent
@@ -120,11 +117,11 @@ class DeconfoundedAgent(LearnedAgent):
     def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
         """The imitation loss [S] on steps of expert trials; their theta_hat_H is drawn from beliefs [S, B, P]."""
         index = batch.draw_steps(steps, draws)
-        real = batch.steps(index)
+        pairs = batch.steps(index)
         theta_hat = self.model.sample(take(belief, index // batch.mask.shape[2]), draws)
         with torch.no_grad():
-            inputs = self.model.inputs.obs(real.obs)
-        return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), real.action), real.mask)
+            inputs = self.model.inputs.obs(pairs.obs)
+        return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), pairs.action), pairs.mask)
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
@@ -138,10 +135,10 @@ class DeconfoundedAgent(LearnedAgent):
 
 
 class Explorer(DeconfoundedAgent):
-    """The imitator itself, so far, with some random actions; blind to theta but for what its own history tells.
+    """The exploration policy: the current imitator, with a share of random actions; it sees no theta.
 
-    In every other trial its latents are drawn once an episode from those inferred on expert trials (which is what the
-    prior stands for) instead of from the belief, so that each expert's behaviour is tried under each theta.
+    In every other trial its latent is drawn once an episode from those inferred on expert trials (samples of the prior)
+    instead of from the belief, so that each expert's behaviour is rolled out under each theta.
     """
 
     def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
@@ -151,7 +148,7 @@ class Explorer(DeconfoundedAgent):
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
         self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
-        self._drawn = take(self.latents, self._draws.below(self.latents.shape[1], self._n))
+        self._drawn = take(self.latents, self._draws.integers(self.latents.shape[1], self._n))
 
     def latent(self) -> Tensor:
         return torch.where(self._blind, self._drawn, super().latent())
@@ -165,27 +162,28 @@ def train(
 ) -> DeconfoundedAgent:
     """Algorithm 1.
 
-    trials: of the expert, without theta; in as many equal groups as there are generators in rng, one after another. Or
-    what draws them: fresh ones every round, if config does not accumulate.
-    explore: called once a round. Raises InputError if the two disagree.
+    trials: of the expert, without theta, in as many equal groups as there are generators in rng; or a function that
+    draws them, called in every round if config does not accumulate. explore: called once a round. Raises InputError if
+    the two do not fit each other.
     """
-    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
     seeds = len(rngs)
-    each = apart if config.drifts else lambda trials: trials
-    shown, first = each(drawn(trials)), drawn(lambda: explore(None))
-    episodes, first = first.mask.shape[1], each(first)
-    signature = Signature.of(shown)
+    unit = split_episodes if config.drifts else lambda trials: trials
+    demonstrations, first = unit(trials_of(trials)), trials_of(lambda: explore(None))
+    episodes, first = first.mask.shape[1], unit(first)
+    signature = Signature.of(demonstrations)
     if Signature.of(first) != signature:
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
-    expert, seen, draws = Batch.of(shown, seeds, device), Batch.of(first, seeds, device), Draws(rngs, device)
-    # Experts' changes count too: those of random actions alone can be far smaller, and theta is then learned poorly.
-    obs, change = scalers(seen.joined(expert))
+    expert, explored = (Batch.of(x, seeds, device) for x in (demonstrations, first))
+    draws = Draws(rngs, device)
+    # Changes are scaled by both: those of random actions alone can be far smaller, and theta is then learned poorly.
+    obs, change = scalers(explored.joined(expert))
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
-    model, policy = agent.model, agent.policy  # the model is in its eval mode but for its updates
-    drawn_at_once = config.inference_batch
+    model, policy = agent.model, agent.policy  # the model is in eval mode except in its updates
+    inference_batch = config.inference_batch
     if config.drifts:
-        model.kept.fill_(0.5)  # while it explores
-        drawn_at_once = drawn_at_once and drawn_at_once * episodes  # as much evidence as of trials that are whole
+        model.kept.fill_(0.5)  # during exploration
+        inference_batch = inference_batch and inference_batch * episodes  # as many steps as of whole trials
 
     inferences = config.rounds * config.inference_updates
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
@@ -203,20 +201,20 @@ def train(
         monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
     )
     if before := checkpoint.load():
-        begin, belief, latents, seen = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
+        begin, belief, latents, explored = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
         expert = Batch(*before["expert"]) if before["expert"] else expert
         done = begin * (config.inference_updates + config.imitation_updates)
     for i in range(begin, config.rounds):
         if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
-            new = Batch.of(each(explore(explorer)), seeds, device)
-            seen = seen.joined(new) if config.accumulate else new
+            new = Batch.of(unit(explore(explorer)), seeds, device)
+            explored = explored.joined(new) if config.accumulate else new
             if not config.accumulate:
-                expert = Batch.of(each(drawn(trials)), seeds, device)
+                expert = Batch.of(unit(trials_of(trials)), seeds, device)
         for j in range(config.inference_updates):  # of phi and psi
             warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
-            beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
-            batch = beginnings.draw_trials(drawn_at_once, draws)
+            beginnings = explored.beginnings(i * config.inference_updates + j, config.shortest)
+            batch = beginnings.draw_trials(inference_batch, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)
@@ -228,13 +226,13 @@ def train(
             imitate(done, imitation)
             done += 1
         fresh = None if isinstance(trials, Trials) else expert.tensors
-        checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=seen.tensors, expert=fresh)
+        checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=explored.tensors, expert=fresh)
     final = Adam([policy], config.imitation_rate, config.final_updates)
     for _ in range(config.final_updates):
         imitate(done, final)
         done += 1
     if config.drifts:
-        choose_kept(model, seen[:, -(len(first) // seeds) :], episodes, draws)
+        choose_kept(model, explored[:, -(len(first) // seeds) :], episodes, draws)
     return agent
 
 
@@ -245,13 +243,13 @@ ON_BANDIT = DeconfoundedConfig(
     inference_updates=1200,
     inference_batch=64,
     inference_steps=3200,
-    shortest=1.0,  # its trials are short, and on the beginnings of few the latent is ignored for too long
+    shortest=1.0,  # its trials are short; on their beginnings the latent is ignored for too long
     imitation_updates=800,
     final_updates=3200,
     imitation_rate=3e-3,
     random_share=1.0,
 )
-PAPER = DeconfoundedConfig(  # appendix D and table 1; what they leave open is in docs/paper.md
+PAPER = DeconfoundedConfig(  # appendix D and table 1; docs/paper.md has what they leave open
     model="gru",
     width=256,
     latent=256,
@@ -273,26 +271,26 @@ PAPER = DeconfoundedConfig(  # appendix D and table 1; what they leave open is i
 )
 
 
-def many(config: DeconfoundedConfig) -> dict[str, Any]:
-    """Changes where much is observed: theta is inferred longer, at a lower rate (3e-3: ant_goal is worse)."""
-    return {"latent": SPACIOUS, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
+def large(config: DeconfoundedConfig) -> dict[str, Any]:
+    """Changes for large observations: more inference updates, at a lower rate (with 3e-3 ant_goal is worse)."""
+    return {"latent": LARGE_LATENT, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
 
 
-def once(agent: DeconfoundedAgent) -> DeconfoundedAgent:
-    """The same agent, whose theta_hat is drawn once an episode."""
+def per_episode(agent: DeconfoundedAgent) -> DeconfoundedAgent:
+    """The agent with theta_hat drawn once an episode."""
     return DeconfoundedAgent(agent.model, agent.policy, "episode")
 
 
 USES = ("demonstrations", "exploration")
-FAMILY: dict[str, Any] = {  # of all methods that train so
+SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
     "smoke": {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100},
     "smoke_bandit": {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800},
-    "ways": {"episode": once},
+    "deployments": {"episode": per_episode},
 }
 
 
-@uses(*USES, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, many=many, **FAMILY)
+@uses(*USES, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
-    """Algorithm 1, on explorations of all rounds; or on each round's alone, with fresh demonstrations."""
+    """Train by Algorithm 1."""
     trials = given.demonstrations if given.config.accumulate else given.source
     return train(trials, given.explore, given.config, given.rngs, given.monitor)

@@ -1,4 +1,4 @@
-"""Deconfounded imitation whose latent is one of K values: a mixture of K dynamics models, with an exact posterior."""
+"""Deconfounded imitation with a discrete latent: a mixture of K dynamics models, with an exact posterior."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
-from deconfounded.deconf.methods.deconfounded import FAMILY, USES, DeconfoundedAgent, DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded import SHARED, USES, DeconfoundedAgent, DeconfoundedConfig
 
 ON_CONTROL = DeconfoundedConfig(
     model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
@@ -27,7 +27,7 @@ ON_BANDIT = DeconfoundedConfig(
 PAPER = replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40)
 
 
-@uses(*USES, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **FAMILY)
+@uses(*USES, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
-    """Algorithm 1 with that belief."""
+    """Train by Algorithm 1 with the discrete model."""
     return deconfounded.fit(given)

@@ -1,4 +1,4 @@
-"""Deconfounded imitation with the paper's own belief, a GRU over transitions, in place of a sum of evidence."""
+"""Deconfounded imitation with the paper's belief: a GRU over transitions, not a sum of evidence."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import (
-    FAMILY,
     ON_BANDIT,
     PAPER,
+    SHARED,
     USES,
     DeconfoundedAgent,
     DeconfoundedConfig,
@@ -19,7 +19,7 @@ from deconfounded.deconf.methods.deconfounded import (
 ON_CONTROL, BANDIT = DeconfoundedConfig(model="gru"), replace(ON_BANDIT, model="gru")
 
 
-@uses(*USES, cost=14, on_control=ON_CONTROL, on_bandit=BANDIT, paper=PAPER, many=deconfounded.many, **FAMILY)
+@uses(*USES, cost=14, on_control=ON_CONTROL, on_bandit=BANDIT, paper=PAPER, large=deconfounded.large, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
-    """Algorithm 1 with that belief."""
+    """Train by Algorithm 1 with the GRU belief."""
     return deconfounded.fit(given)

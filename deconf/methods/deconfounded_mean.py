@@ -1,9 +1,9 @@
-"""Tier 2 as its authors released it (vuoristo/deconfounding), where that is not Algorithm 1 and 2 as they wrote it.
+"""Tier 2 as in the authors' released code (vuoristo/deconfounding), where it departs from Algorithms 1 and 2.
 
-Same data as `deconfounded`; four things differ. The policy is trained and deployed on the mean of the running belief:
-theta_hat is sampled nowhere but in the model's own training, and expert actions early in a trial are cloned under what
-was known then, not under what the whole trial tells. The KL divergence is from the belief a step before, not from the
-prior. The latent of a step predicts the next several transitions, not just one. And errors of these are squared errors.
+The data is that of `deconfounded`; four things differ. The policy is trained and deployed on the mean of the running
+belief: theta_hat is sampled in the model's training alone, and expert actions are cloned given the belief at that step,
+not the belief after the whole trial. The KL divergence is from the belief of the step before, not from the prior. The
+latent of a step predicts several transitions, not one. The reconstruction loss is the squared error.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.agents import Checkpoint
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
+from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -30,18 +30,18 @@ from deconfounded.experts.rollout import Trials
 
 @dataclass(frozen=True)
 class MeanConfig(Configuration):
-    """Widths and amounts, for each seed. Each round explores, then updates the model, then the policy."""
+    """Hyperparameters for each seed. Each round explores, then updates the model, then the policy."""
 
     model: Literal["evidence", "gru"] = "gru"
     width: int = 64
     latent: int = 8
-    beta: float = 1.0  # weight of the KL divergence from the belief a step before, against the sum of squared errors
+    beta: float = 1.0  # weight of the KL divergence from the previous belief, against the sum of squared errors
     ahead: int = 10  # transitions that a latent predicts
     rounds: int = 8
     inference_updates: int = 60  # a round
     inference_batch: int = 16  # trials
-    shortest: float = 1 / 16  # share of these trials that an update reads, at least: see Batch.beginnings
-    inference_steps: int = 2048  # pairs of a latent and a transition that it is to predict
+    shortest: float = 1 / 16  # least share of these trials that an update reads: see Batch.beginnings
+    inference_steps: int = 2048  # pairs of a latent and a transition that it predicts
     inference_rate: float = 1e-3
     imitation_updates: int = 250  # a round
     final_updates: int = 2000  # of the policy, after the last round
@@ -51,7 +51,7 @@ class MeanConfig(Configuration):
 
 
 class MeanAgent(DeconfoundedAgent):
-    """Acts on the mean of its belief."""
+    """A policy of the observation and of the belief's mean."""
 
     model: VariationalModel
 
@@ -59,7 +59,7 @@ class MeanAgent(DeconfoundedAgent):
     def new(
         kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
     ) -> MeanAgent:
-        """One that knows nothing yet. Raises InputError for a model without a mean."""
+        """An untrained agent. Raises InputError for a model without a mean."""
         if kind not in ("evidence", "gru"):
             raise InputError(f"model was {kind!r}; it must be evidence or gru")
         model = VariationalModel(kind, latent, width, signature, obs, change, draws)
@@ -79,20 +79,20 @@ class MeanAgent(DeconfoundedAgent):
     def imitation(self, batch: Batch, mean: Tensor, steps: int | None, draws: Draws) -> Tensor:
         """The imitation loss [S] on steps of expert trials [S, B, T], under means [S, B, T, D]."""
         index = batch.draw_steps(steps, draws)
-        real = batch.steps(index)
-        features = torch.cat([_scaler(self.model)(real.obs), take_steps(mean, index)], -1)
-        return imitation_loss(self.policy.log_prob(features, real.action), real.mask)
+        pairs = batch.steps(index)
+        features = torch.cat([_scaler(self.model)(pairs.obs), take_steps(mean, index)], -1)
+        return imitation_loss(self.policy.log_prob(features, pairs.action), pairs.mask)
 
 
 def _scaler(model: VariationalModel) -> Scaler:
-    """The policy has its own inputs: the released one's, too, is trained apart from the encoder's."""
+    """The scaler of observations: the policy shares no embedding with the encoder, as in the released code."""
     return model.inputs.scaler
 
 
 def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, draws: Draws) -> Tensor:
-    """[S], on trials [S, B, T]: sum over steps ahead of the mean squared error, and the KL of each belief.
+    """The loss [S] on trials [S, B, T]: the mean squared error, summed over steps ahead, and the KL of each belief.
 
-    Which latent predicts which transition is drawn, `inference_steps` pairs of them, that stand for all.
+    It is estimated on `inference_steps` random pairs of a latent and a transition that it predicts.
     """
     memories = model.encoder(batch)[:, :, :-1]
     mean, std = model.encoder.posterior(memories)  # before each step, [S, B, T, D]
@@ -101,7 +101,7 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
     kl = masked_mean(gaussian_kl(mean, std, *before).flatten(1), batch.mask.flatten(1))
     theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
     ahead = min(config.ahead, batch.mask.shape[2])
-    offset = draws.below(ahead, config.inference_steps)
+    offset = draws.integers(ahead, config.inference_steps)
     index = batch.draw_steps(config.inference_steps, draws)  # of the latents
     steps = batch.mask.shape[2]
     inside = index % steps + offset < steps
@@ -117,20 +117,20 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
 
 @torch.no_grad()
 def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tensor:
-    """The belief's mean before each step, [S, B, T, D]; so many trials at a time, for the sake of memory."""
+    """The belief's mean before each step, [S, B, T, D]; in parts of so many trials, to save memory."""
     indices = torch.arange(len(trials), device=trials.mask.device).split(part)
     return torch.cat([model.encoder.posterior(model.encoder(trials[:, i])[:, :, :-1])[0] for i in indices], 1)
 
 
 def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
-    """trials: of the expert, without theta, in as many equal groups as there are generators in rng.
+    """Train in rounds of exploration, inference and imitation; explore is called once a round.
 
-    explore: called once a round.
+    trials: of the expert, without theta, in as many equal groups as there are generators in rng..
     """
-    rngs, device, monitor = listed(rng), config.device, monitor or Monitor()
+    rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
     first, draws = explore(None), Draws(rngs, device)
-    expert, seen = Batch.of(trials, len(rngs), device), Batch.of(first, len(rngs), device)
-    obs, change = scalers(seen.joined(expert))
+    expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, first))
+    obs, change = scalers(explored.joined(expert))
     agent = MeanAgent.new(config.model, config.latent, config.width, Signature.of(trials), obs, change, draws)
     model, policy = agent.model, agent.policy
     assert isinstance(model, VariationalModel)
@@ -143,11 +143,11 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     )
     begin, done = 0, 0
     if before := checkpoint.load():
-        begin, seen, mean = before["round"], Batch(*before["seen"]), before["mean"]
+        begin, explored, mean = before["round"], Batch(*before["seen"]), before["mean"]
         done = begin * (config.inference_updates + config.imitation_updates)
 
     def imitate(updates: int, optimizer: Adam, done: int) -> int:
-        """That many updates of eta; returns how many there were of all kinds."""
+        """Take that many updates of eta; returns the number of all updates so far."""
         for _ in range(updates):
             loss = agent.imitation(expert, mean, config.imitation_batch, draws)
             optimizer.step(loss)
@@ -157,9 +157,9 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
 
     for i in range(begin, config.rounds):
         if i > 0:
-            seen = seen.joined(Batch.of(explore(agent), len(rngs), device))
+            explored = explored.joined(Batch.of(explore(agent), len(rngs), device))
         for j in range(config.inference_updates):
-            beginnings = seen.beginnings(i * config.inference_updates + j, config.shortest)
+            beginnings = explored.beginnings(i * config.inference_updates + j, config.shortest)
             model.train()
             loss = inference_loss(model, beginnings.draw_trials(config.inference_batch, draws), config, draws)
             model.eval()
@@ -168,7 +168,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
             monitor.update(done, total, {"inference": loss.mean().item()}, agent)
         mean = running_mean(model, expert)
         done = imitate(config.imitation_updates, imitation, done)
-        checkpoint.save(round=i + 1, seen=seen.tensors, mean=mean)
+        checkpoint.save(round=i + 1, seen=explored.tensors, mean=mean)
     final = Adam([policy], config.imitation_rate, config.final_updates)
     imitate(config.final_updates, final, done)
     return agent
@@ -195,8 +195,8 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     ),
     smoke={"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 20},
     smoke_bandit={"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 400},
-    many=lambda config: {"latent": SPACIOUS},
+    large=lambda config: {"latent": LARGE_LATENT},
 )
 def fit(given: Given) -> MeanAgent:
-    """Rounds of exploration, inference and imitation."""
+    """Train in rounds of exploration, inference and imitation."""
     return train(given.demonstrations, given.explore, given.config, given.rngs, given.monitor)

@@ -1,9 +1,9 @@
 """Tier 1 (appendix C, Algorithm 3): deconfounded imitation from expert demonstrations alone.
 
-An offline encoder reads whole expert trials, actions and all (in training so many drawn steps of each), and a decoder
-in two factors, dynamics and policy, explains both by one latent, Eq. (7). The encoder is deluded by actions, but the
-dynamics are not: they make synthetic trajectories under actions that are blind to the latent, and an online encoder is
-trained on these, Eq. (6). It is deployed as in Tier 2, by Algorithm 2.
+An offline encoder reads whole expert trials, actions included (in training, a random subset of their steps), and a
+decoder of two factors, dynamics and policy, explains both by one latent, Eq. (7). The encoder takes actions for
+evidence, but the dynamics do not: synthetic trials are rolled out in them under actions that are blind to the latent,
+and an online encoder is trained on these, Eq. (6). It is deployed as in Tier 2, by Algorithm 2.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.agents import ramp
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, extent, listed, take
-from deconfounded.deconf.core.drift import apart, choose_kept
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
+from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
-from deconfounded.deconf.core.sizes import SPACIOUS, Configuration
+from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -29,22 +29,22 @@ from deconfounded.experts.rollout import Trials
 
 @dataclass(frozen=True)
 class OfflineConfig(Configuration):
-    """Widths and amounts, for each seed. First Eq. (7), then Eq. (6): nothing of the second acts back on the first."""
+    """Hyperparameters for each seed. Eq. (7) trains first; updates by Eq. (6) do not change its networks."""
 
     width: int = 64
     latent: int = 4
     offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
-    offline_steps: int = 256  # of each, that are read, and stand for all of them in Eq. (7)'s likelihood
+    offline_steps: int = 256  # random steps of each, on which Eq. (7) is estimated
     beta: float = 1e-3  # of Eq. (6), a step
     warm_up: float = 0.5  # share of online updates over which this beta rises to its value
     online_updates: int = 2000
     online_batch: int = 16  # synthetic trials
-    shortest: float = 1 / 16  # share of these trials that an update reads, at least
-    online_steps: int = 1024  # of them, whose next observation is predicted
+    shortest: float = 1 / 16  # least share of these trials that an update reads
+    online_steps: int = 1024  # whose next observation is predicted, of these trials
     refresh: int = 50  # updates between syntheses
-    synthetic: int = 128  # trials a synthesis
+    synthetic: int = 128  # trials of a synthesis
     random_share: float = 0.1  # of synthetic actions that are uniformly random
     learning_rate: float = 4e-3
     drifts: bool = False  # theta changes between the episodes of a trial: see deconf/core/drift.py
@@ -54,9 +54,9 @@ class OfflineConfig(Configuration):
 def explain(
     data: Batch, signature: Signature, config: OfflineConfig, draws: Draws, monitor: Monitor, times: int = 1
 ) -> tuple[VariationalModel, VariationalModel, ActionHead]:
-    """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an online model to train.
+    """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an untrained online model.
 
-    The online one's dynamics are the offline one's, and its prior that of the latents. Batches are `times` as large.
+    The two models share their dynamics. Batches are `times` as large.
     """
     obs, change = scalers(data)
     sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
@@ -69,14 +69,14 @@ def explain(
         batch = data.draw_trials(config.offline_batch * times, draws)
         steps = batch.mask.shape[2]
         index = draws.uniform(steps).argsort(-1)[:, : config.offline_steps]
-        some = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
-        belief = offline.belief(offline.last(some))
+        subset = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
+        belief = offline.belief(offline.last(subset))
         mean, std = belief.chunk(2, -1)
         theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, index.shape[1], -1)
-        log_next = offline.dynamics.log_prob(some.obs, some.action, some.next_obs, theta_hat)[..., 0]
-        log_policy = policy.log_prob(torch.cat([online.inputs.obs(some.obs), theta_hat], -1), some.action)
+        log_next = offline.dynamics.log_prob(subset.obs, subset.action, subset.next_obs, theta_hat)[..., 0]
+        log_policy = policy.log_prob(torch.cat([online.inputs.obs(subset.obs), theta_hat], -1), subset.action)
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
-        weight = some.mask * (steps / index.shape[1])  # so that their sum is that of all, on average
+        weight = subset.mask * (steps / index.shape[1])  # an unbiased estimate of the sum over all steps
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
@@ -84,9 +84,10 @@ def explain(
 
 
 def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:
-    """Algorithm 3. trials: of the expert, without theta, in as many equal groups as there are generators in rng."""
-    rngs, signature, monitor, each = listed(rng), Signature.of(trials), monitor or Monitor(), trials.mask.shape[1]
-    trials, times = (apart(trials), each) if config.drifts else (trials, 1)  # single episodes: so many times as many
+    """Train by Algorithm 3 on expert trials, which are in as many equal groups as there are generators in rng."""
+    rngs, signature, monitor = as_generators(rng), Signature.of(trials), monitor or Monitor()
+    episodes = trials.mask.shape[1]
+    trials, times = (split_episodes(trials), episodes) if config.drifts else (trials, 1)
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     offline, online, policy = explain(data, signature, config, draws, monitor, times)
     latents = offline.sample(final_belief(offline, data), draws)
@@ -105,7 +106,7 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
     if config.drifts:
-        choose_kept(online, data[:, : 64 * each], each, draws)
+        choose_kept(online, data[:, : 64 * episodes], episodes, draws)
     return agent
 
 
@@ -120,22 +121,21 @@ def synthesise(
     config: OfflineConfig,
     draws: Draws,
 ) -> Batch:
-    """Trials of the learned dynamics: a latent [S, B, D] a trial, and another, blind to it, for each episode's actions.
+    """Rollouts in the learned dynamics: each trial has a latent of [S, B, D], and each episode's actions another one.
 
-    They are as long as the expert's, in episodes of at most `horizon` steps from starts [S, K, O]. Where one leaves the
-    range of observations in which the expert acted, another begins: the dynamics were not learned there, and what they
-    would say of the latent is noise.
+    They are as long as the expert's trials, in episodes of at most `horizon` steps from starts [S, K, O]. An episode
+    ends where it leaves the range of the expert's observations: the dynamics were not trained there.
     """
     n, (low, high) = config.synthetic, extent(expert.obs, expert.mask)
-    theta_hat = take(latents, draws.below(latents.shape[1], n))
-    obs, other = starts[:, :1], latents[:, :1]  # replaced at once
+    theta_hat = take(latents, draws.integers(latents.shape[1], n))
+    obs, action_latent = starts[:, :1], latents[:, :1]  # replaced in the first step
     over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
     steps: list[tuple[Tensor, Tensor, Tensor]] = []
     for t in range(expert.mask.shape[2]):
         over = over | (t % horizon == 0)
-        obs = torch.where(over, take(starts, draws.below(starts.shape[1], n)), obs)
-        other = torch.where(over, take(latents, draws.below(latents.shape[1], n)), other)
-        action = policy.sample(torch.cat([model.inputs.obs(obs), other], -1), draws)
+        obs = torch.where(over, take(starts, draws.integers(starts.shape[1], n)), obs)
+        action_latent = torch.where(over, take(latents, draws.integers(latents.shape[1], n)), action_latent)
+        action = policy.sample(torch.cat([model.inputs.obs(obs), action_latent], -1), draws)
         action = policy.signature.randomise(action, config.random_share, draws)
         next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
         steps.append((obs, action, next_obs))
@@ -163,8 +163,8 @@ def synthesise(
     ),
     smoke={"offline_updates": 300, "online_updates": 300},
     smoke_bandit={"offline_updates": 300, "online_updates": 300},
-    many=lambda config: {"latent": SPACIOUS, "learning_rate": 2e-3},
+    large=lambda config: {"latent": LARGE_LATENT, "learning_rate": 2e-3},
 )
 def fit(given: Given) -> DeconfoundedAgent:
-    """Algorithm 3."""
+    """Train by Algorithm 3."""
     return train(given.demonstrations, given.config, given.rngs, given.monitor)

@@ -1,12 +1,12 @@
-"""GAIL with memory, the published paper's baseline: a recurrent policy, trained by PPO to be taken for the expert.
+"""GAIL with memory, the published paper's baseline: PPO trains a recurrent policy on a discriminator's logit.
 
-A discriminator tells the expert's transitions (s, a, s') from the policy's own (Ho and Ermon, 2016), and its logit is
-the reward. Practice is in environments without theta, which are stepped far more often than any explorer does; no
-reward of the task is seen. What the policy does is so made to look like the expert's mixture over theta: it need not be
-what the expert does under *this* theta, unless the transitions show it.
+A discriminator separates the expert's transitions (s, a, s') from the policy's own (Ho and Ermon, 2016). PPO's
+environments hide theta and the task's reward, and take far more steps than exploration in other methods. The policy
+learns to match the expert's mixture over theta; it matches the expert under *this* theta only as far as transitions
+identify theta.
 
-RecurrentPPO is sb3-contrib's. A trial is one episode of it, so that its LSTM outlives the resets. Seeds practise one
-after another, each with random numbers of its own; their discriminators are trained side by side.
+RecurrentPPO is sb3-contrib's. An episode of PPO is a whole trial, so that the LSTM's state outlives the resets. PPO
+trains seeds one after another, each with random numbers of its own; discriminators are trained side by side.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
 from deconfounded.deconf.core.sizes import Configuration
@@ -35,16 +35,16 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.methods.practice import Practice
+    from deconfounded.deconf.methods.gail_ppo import TrialVecEnv
 
 Space = spaces.Box | spaces.Discrete
-Open = Callable[[int, int], Environments]
-"""Environments of a seed, by its index, and how many."""
+Make = Callable[[int, int], Environments]
+"""Makes environments for the seed of an index: that many."""
 
 
 @dataclass(frozen=True)
 class GailConfig(Configuration):
-    """Widths and amounts, for each seed. A round is `steps` in each of `envs`, from new trials; then PPO, then D."""
+    """Hyperparameters for each seed. A round: `steps` in each of `envs`, from new trials; then PPO, then D."""
 
     width: int = 64
     rounds: int = 60
@@ -61,7 +61,7 @@ class GailConfig(Configuration):
 
 
 class Lstm(nn.Module):
-    """S LSTMs side by side, for deployment: torch's own equations, gates i, f, g, o."""
+    """S LSTMs side by side, for deployment: torch's equations, gates i, f, g, o."""
 
     def __init__(self, inputs: int, width: int, draws: Draws) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ class Lstm(nn.Module):
 
 
 class PpoHead(ActionHead):
-    """Stable-Baselines3's distribution: categorical, or Gaussian with one std, whatever the features."""
+    """Stable-Baselines3's distribution: categorical, or Gaussian with a std that does not depend on features."""
 
     def __init__(self, width: int, signature: Signature, draws: Draws) -> None:
         super().__init__(width, width, signature, draws)
@@ -90,7 +90,7 @@ class PpoHead(ActionHead):
 
 
 class GailAgent(LearnedAgent):
-    """What PPO has trained, of all seeds; it acts as that does, and carries its memory over resets."""
+    """The policies of all seeds that PPO has trained, with a memory that outlives resets."""
 
     policy: PpoHead
 
@@ -119,7 +119,7 @@ class GailAgent(LearnedAgent):
         super().reset(rngs)
         before = self.policy.signature.action_features
         self._before = torch.zeros(self.seeds, self._n, before + 1, device=self.device)
-        self._before[..., -1] = 1  # an episode begins
+        self._before[..., -1] = 1  # flags the start of an episode
 
     def choose(self, obs: Tensor) -> Tensor:
         self._next = self.lstm(torch.cat([self.obs(obs), self._before], -1), self._state)
@@ -135,19 +135,19 @@ class GailAgent(LearnedAgent):
         return self._state[..., : self.width].flatten(0, 1).cpu().numpy()
 
     @torch.no_grad()
-    def take(self, i: int, policy: Any) -> None:
-        """The weights of Stable-Baselines3's policy, for seed i."""
+    def load_policy(self, i: int, policy: Any) -> None:
+        """Copy the weights of Stable-Baselines3's policy to seed i."""
         lstm = policy.lstm_actor
         for gate, weight, bias in (
             (self.lstm.input, lstm.weight_ih_l0, lstm.bias_ih_l0),
             (self.lstm.recurrent, lstm.weight_hh_l0, lstm.bias_hh_l0),
         ):
             gate.weight[i], gate.bias[i, 0] = weight.T, bias
-        theirs = [*policy.mlp_extractor.policy_net, policy.action_net]
-        linear = [layer for layer in theirs if isinstance(layer, nn.Linear)]
-        ours = [layer for layer in self.policy.net if isinstance(layer, Linear)]
-        for mine, layer in zip(ours, linear, strict=True):
-            mine.weight[i], mine.bias[i, 0] = layer.weight.T, layer.bias
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+        sources = [layer for layer in modules if isinstance(layer, nn.Linear)]
+        targets = [layer for layer in self.policy.net if isinstance(layer, Linear)]
+        for target, source in zip(targets, sources, strict=True):
+            target.weight[i], target.bias[i, 0] = source.weight.T, source.bias
         if not self.policy.signature.actions:
             self.policy.log_std[i, 0] = policy.log_std
 
@@ -166,38 +166,36 @@ class Discriminator(nn.Module):
         return self.net(torch.cat([*inputs, self.change(batch.next_obs - batch.obs)], -1))[..., 0]
 
     def loss(self, expert: Batch, own: Batch) -> Tensor:
-        """[S]: cross-entropy of telling the expert's steps from the policy's own."""
+        """The binary cross-entropy [S] of the expert's steps against the policy's own."""
         return (F.softplus(-self(expert)) + F.softplus(self(own))).mean(-1) / 2
 
     @torch.no_grad()
     def reward(self, *step: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The logit [N] of transitions: observation, action, next observation; of one seed's discriminator alone."""
-        obs, action, then = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
-        return self(Batch(obs, action, then, obs[..., 0]))[0].cpu().numpy()
+        """The logits [N] of transitions (observation, action, next observation); for a discriminator of one seed."""
+        obs, action, next_obs = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
+        return self(Batch(obs, action, next_obs, obs[..., 0]))[0].cpu().numpy()
 
     def of_seed(self, i: int) -> Discriminator:
-        """A copy of the i-th seed's."""
-        one = copy.deepcopy(self)
-        for tensor in (*one.parameters(), *one.buffers()):
+        """A copy of the i-th seed's discriminator."""
+        single = copy.deepcopy(self)
+        for tensor in (*single.parameters(), *single.buffers()):
             tensor.data = tensor.data[i : i + 1]
-        return one
+        return single
 
 
 def train(
-    trials: Trials, environments: Open, space: Space, config: GailConfig, rng: Rngs, monitor: Monitor | None = None
+    trials: Trials, environments: Make, space: Space, config: GailConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> GailAgent:
     """Adversarial imitation, in rounds of PPO and of the discriminator.
 
-    trials: of the expert, in as many equal groups as there are generators in rng. environments: to practise in. space:
-    of actions.
-
-    Raises InputError where sb3-contrib is not installed.
+    trials: of the expert, in as many equal groups as there are generators in rng. environments: for PPO. space: of
+    actions. Raises InputError where sb3-contrib is not installed.
     """
     if find_spec("sb3_contrib") is None:
         raise InputError("gail needs sb3-contrib; install deconfounded-imitation[train]")
-    from deconfounded.deconf.methods.practice import Player, Practice, new_ppo, numbers
+    from deconfounded.deconf.methods.gail_ppo import PpoState, TrialVecEnv, new_ppo, seeded
 
-    rngs, monitor, signature = listed(rng), monitor or Monitor(), Signature.of(trials)
+    rngs, monitor, signature = as_generators(rng), monitor or Monitor(), Signature.of(trials)
     seeds, draws = len(rngs), Draws(rngs, config.device)
     expert = Batch.of(trials, seeds, config.device)
     obs, change = scalers(expert)
@@ -206,28 +204,28 @@ def train(
     agent = GailAgent.blank({"width": config.width}, signature, obs, draws)
     mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
 
-    def practice(i: int) -> Practice:
+    def vector(i: int) -> TrialVecEnv:
         reward = discriminator.of_seed(i).reward
-        return Practice(environments(i, config.envs), space, mean[i], std[i], reward)
+        return TrialVecEnv(environments(i, config.envs), space, mean[i], std[i], reward)
 
-    players = [Player(new_ppo(practice(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
-    named = {f"player{i}": player for i, player in enumerate(players)}
+    states = [PpoState(new_ppo(vector(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
+    named = {f"player{i}": state for i, state in enumerate(states)}
     checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
     begin = (checkpoint.load() or {"round": 0})["round"]
     for done in range(begin, config.rounds):
         own = []
-        for i, player in enumerate(players):
-            env = practice(i)
-            with numbers(int(rngs[i].integers(2**31))):
-                player.ppo.set_env(env)
-                player.ppo.learn(config.envs * config.steps)
+        for i, state in enumerate(states):
+            env = vector(i)
+            with seeded(int(rngs[i].integers(2**31))):
+                state.ppo.set_env(env)
+                state.ppo.learn(config.envs * config.steps)
             own.append([np.concatenate(column) for column in zip(*env.transitions, strict=True)])
-            agent.take(i, player.ppo.policy)
-        before, action, then = (torch.as_tensor(np.stack(x), device=config.device) for x in zip(*own, strict=True))
-        seen = Batch(before, action, then, torch.ones_like(before[..., 0]))[:, None]
+            agent.load_policy(i, state.ppo.policy)
+        before, action, after = (torch.as_tensor(np.stack(x), device=config.device) for x in zip(*own, strict=True))
+        generated = Batch(before, action, after, torch.ones_like(before[..., 0]))[:, None]
         losses = []
         for _ in range(config.discriminator_updates):
-            real, fake = (x.steps(x.draw_steps(config.discriminator_batch, draws)) for x in (expert, seen))
+            real, fake = (x.steps(x.draw_steps(config.discriminator_batch, draws)) for x in (expert, generated))
             loss = discriminator.loss(real, fake)
             optimizer.step(loss)
             losses.append(loss.mean().item())
@@ -247,6 +245,6 @@ def train(
     smoke_bandit={"rounds": 20},
 )
 def fit(given: Given) -> GailAgent:
-    """Rounds of practice and discrimination."""
+    """Train by GAIL on demonstrations and exploration."""
     data, space = given.demonstrations, given.action_space
     return train(data, given.environments, space, given.config, given.rngs, given.monitor)

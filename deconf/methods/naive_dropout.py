@@ -1,4 +1,4 @@
-"""Cloning with dropout of past actions (Swamy et al., 2022).
+"""Recurrent behavioural cloning with dropout of past actions (Swamy et al., 2022).
 
 The memory reads each past action with probability 1 - dropout in training, and all of them in deployment. All else is
 naive_rnn's.
@@ -15,48 +15,47 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import clone_by_chunks
-from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
 
 
-class DroppingMemory(GruMemory):
-    """A GRU over transitions (s, a, s'), of whose actions some are kept: `kept` [S, B, T, 1] multiplies them."""
+class ActionDropoutMemory(GruMemory):
+    """A GRU over transitions (s, a, s'), with actions multiplied by `action_mask` [S, B, T, 1]."""
 
-    kept: Tensor | None = None
+    action_mask: Tensor | None = None
 
     def _embed(self, batch: Batch) -> Tensor:
         inputs, action = self.inputs, self.inputs.signature.encode_action(batch.action)
-        if self.kept is not None:
-            action = action * self.kept
+        if self.action_mask is not None:
+            action = action * self.action_mask
         embedded = [inputs.obs(batch.obs), inputs.embed_action(action), inputs.obs(batch.next_obs)]
         return self.input(torch.cat(embedded, -1))
 
 
 @dataclass(frozen=True)
 class DropoutConfig(RecurrentConfig):
-    """dropout: the probability with which a past action is not heard of, in training."""
+    """Those of naive_rnn, and dropout: the probability that the memory misses a past action, in training."""
 
     dropout: float = 0.5
 
 
-class DroppingAgent(RecurrentAgent):
-    """Acts on all of its history, having learned not to count on its actions."""
+class ActionDropoutAgent(RecurrentAgent):
+    """naive_rnn's agent, trained with dropout of past actions."""
 
-    memory_kind = DroppingMemory
-    memory: DroppingMemory
-    dropout: float = 0.0  # while it is trained
+    memory_kind = ActionDropoutMemory
+    memory: ActionDropoutMemory
+    dropout: float = 0.0  # in training
 
     def configure(self, config: DropoutConfig) -> None:
         self.dropout = config.dropout
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         if self.dropout:
-            heard = self.noise.uniform(*batch.mask.shape[1:], 1) >= self.dropout
-            self.memory.kept = heard.float() / (1 - self.dropout)
+            kept = self.noise.uniform(*batch.mask.shape[1:], 1) >= self.dropout
+            self.memory.action_mask = kept.float() / (1 - self.dropout)
         try:
             return super().loss(batch, label, state)
         finally:
-            self.memory.kept = None
+            self.memory.action_mask = None
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
@@ -71,6 +70,6 @@ class DroppingAgent(RecurrentAgent):
     smoke={"updates": 60},
     smoke_bandit={"updates": 500},
 )
-def fit(given: Given) -> DroppingAgent:
+def fit(given: Given) -> ActionDropoutAgent:
     """Clone the demonstrations."""
-    return clone_by_chunks(DroppingAgent, given.source, given.config, given.rngs, given.monitor)
+    return train_recurrent(ActionDropoutAgent, given.source, given.config, given.rngs, given.monitor)

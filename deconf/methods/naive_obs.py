@@ -1,7 +1,7 @@
-"""Cloning of past observations alone (Swamy et al., 2022): a cure for delusion, at a price.
+"""Recurrent behavioural cloning on past observations alone (Swamy et al., 2022).
 
-What the imitator did is then no evidence of theta, but neither can it tell what of the motion was its own doing: where
-theta shows only in what follows an action, as on the bandit, it learns nothing of it. All else is naive_rnn's.
+Without past actions the imitator cannot take its own for evidence of theta, but the effect of an action is hidden too:
+where theta shows only there, as on the bandit, nothing is learned of it. All else is naive_rnn's.
 """
 
 from __future__ import annotations
@@ -13,19 +13,18 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import clone_by_chunks
-from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 class ObsMemory(GruMemory):
-    """A GRU over transitions (s, s'), whatever the action was."""
+    """A GRU over pairs (s, s'), without actions."""
 
     def _embed(self, batch: Batch) -> Tensor:
         return super()._embed(Batch(batch.obs, torch.zeros_like(batch.action), batch.next_obs, batch.mask))
 
 
 class ObsAgent(RecurrentAgent):
-    """Acts on observations, past and present."""
+    """A policy of past and present observations."""
 
     memory_kind = ObsMemory
 
@@ -40,4 +39,4 @@ class ObsAgent(RecurrentAgent):
 )
 def fit(given: Given) -> ObsAgent:
     """Clone the demonstrations."""
-    return clone_by_chunks(ObsAgent, given.source, given.config, given.rngs, given.monitor)
+    return train_recurrent(ObsAgent, given.source, given.config, given.rngs, given.monitor)

@@ -1,8 +1,8 @@
 """Naive behavioural cloning with memory: an RNN fitted to expert trials by likelihood.
 
-At its optimum it is the conditional policy, Eq. (2), which takes its own past actions as evidence of theta. A fair
-opponent: it is trained on whole trials, its memory is carried over the resets, and its history encoder is that of the
-paper's belief.
+Its optimum is the conditional policy, Eq. (2), which takes its own past actions for evidence of theta. For a fair
+comparison it is trained on whole trials, its memory outlives resets, and its history encoder is that of the paper's
+belief.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from deconfounded.deconf.core.data import Rngs, Source
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import clone_by_chunks
-from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
-    """Clone the expert's trials, or what draws them."""
-    return clone_by_chunks(RecurrentAgent, trials, config, rng, monitor)
+    """Clone the expert's trials."""
+    return train_recurrent(RecurrentAgent, trials, config, rng, monitor)
 
 
 @uses(

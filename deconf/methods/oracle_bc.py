@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import AMOUNTS, MemorylessAgent
+from deconfounded.deconf.methods import memoryless_bc
+from deconfounded.deconf.methods.memoryless_bc import PRESETS, MemorylessAgent
 
 
-@uses("demonstrations", "theta", **AMOUNTS)
+@uses("demonstrations", "theta", **PRESETS)
 def fit(given: Given) -> MemorylessAgent:
-    """Clone the expert step by step, given theta."""
+    """Clone the expert's action at each step, given theta."""
     trials, theta = given.demonstrations, given.theta
-    return cloning.train(trials, given.config, given.rngs, theta, given.acting_theta, given.monitor)
+    return memoryless_bc.train(trials, given.config, given.rngs, theta, given.acting_theta, given.monitor)

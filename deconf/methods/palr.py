@@ -1,9 +1,8 @@
-"""Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn, whose memory is to forget its last action.
+"""Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn with a penalty on what its memory leaks.
 
-What the memory knows of the action just taken is to be no more than what the expert's next action explains. The penalty
-is kernel-based, the Hilbert-Schmidt conditional independence criterion, HSCIC (Park and Muandet, 2020): the dependence
-between memory and past action, given the action to come. It is 0 where they are conditionally independent. Only the
-last action is kept from leaking: older ones may, and so may a theta that was wrongly inferred from them.
+The penalty is the Hilbert-Schmidt conditional independence criterion, HSCIC (Park and Muandet, 2020): the dependence of
+memory and previous action, given the expert's next action, by kernels; 0 where they are conditionally independent. It
+covers the last action alone: older actions may leak, and so may a theta that was wrongly inferred from them.
 """
 
 from __future__ import annotations
@@ -17,13 +16,12 @@ from deconfounded.deconf.core.data import Batch, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.clones import clone_by_chunks
-from deconfounded.deconf.methods.recurrent import RecurrentAgent, RecurrentConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 @dataclass(frozen=True)
 class PalrConfig(RecurrentConfig):
-    """penalty: weight of the HSCIC; samples: steps of a chunk that it is estimated on; ridge: of its regression."""
+    """penalty: weight of the HSCIC; samples: steps of a chunk on which it is estimated; ridge: of its regression."""
 
     penalty: float = 0.1
     samples: int = 128
@@ -31,15 +29,15 @@ class PalrConfig(RecurrentConfig):
 
 
 def kernel(x: Tensor) -> Tensor:
-    """Gaussian kernel matrix [n, n] of rows [n, F]; its width is their root mean square distance."""
+    """The Gaussian kernel matrix [n, n] of rows [n, F], with their root mean square distance for a width."""
     squares = (x[:, None] - x[None]).square().sum(-1)
     return torch.exp(-squares / squares.detach().mean().clamp(min=1e-6))
 
 
 def hscic(x: Tensor, y: Tensor, given: Tensor, ridge: float) -> Tensor:
-    """The squared distance of P(x, y | z) from P(x | z) P(y | z), as kernel embeddings; averaged over z. A number.
+    """The squared distance of P(x, y | z) from P(x | z) P(y | z), as kernel embeddings, averaged over z.
 
-    x [n, F], y [n, G], given [n, H]: joint samples of x, y and z. ridge: of the regressions on z, a sample.
+    x [n, F], y [n, G], given [n, H]: joint samples of x, y and z. ridge: of the regressions on z, for each sample.
     """
     kx, ky, kz = kernel(x), kernel(y), kernel(given)
     n = len(x)
@@ -47,14 +45,14 @@ def hscic(x: Tensor, y: Tensor, given: Tensor, ridge: float) -> Tensor:
     by_x, by_y = kx @ weight, ky @ weight
     joint = (weight * ((kx * ky) @ weight)).sum(0)
     mixed = (weight * by_x * by_y).sum(0)
-    apart = (weight * by_x).sum(0) * (weight * by_y).sum(0)
-    return (joint - 2 * mixed + apart).mean()
+    product = (weight * by_x).sum(0) * (weight * by_y).sum(0)
+    return (joint - 2 * mixed + product).mean()
 
 
 class PalrAgent(RecurrentAgent):
-    """naive_rnn's; what is new is its loss."""
+    """naive_rnn's agent with PALR's loss."""
 
-    config: PalrConfig | None = None  # while it is trained
+    config: PalrConfig | None = None  # in training
 
     def configure(self, config: PalrConfig) -> None:
         self.config = config
@@ -69,17 +67,17 @@ class PalrAgent(RecurrentAgent):
         return loss, states[:, :, -1].detach()
 
     def leakage(self, memories: Tensor, batch: Batch, label: Tensor) -> Tensor:
-        """HSCIC [S] of the memory [S, B, T, W] before each step and the action taken last, given the expert's next."""
+        """HSCIC [S] of memories [S, B, T, W] before steps and the previous actions, given the expert's next actions."""
         assert self.config is not None
         if batch.mask.shape[2] < 2:
             return memories.new_zeros(len(memories))
         encode, later = self.policy.signature.encode_action, batch[:, :, 1:]
         index = later.draw_steps(self.config.samples, self.noise)
         columns = (memories[:, :, 1:], encode(batch.action[:, :, :-1]), encode(label[:, :, 1:]))
-        drawn = (take_steps(column, index) for column in columns)
-        # Seed by seed: a product over a stack may take another order for one seed than for several.
-        found = torch.stack([hscic(x, y, given, self.config.ridge) for x, y, given in zip(*drawn, strict=True)])
-        return found * (later.mask.flatten(1).sum(1) > 0)  # of padding alone, nothing leaks
+        samples = (take_steps(column, index) for column in columns)
+        # Seed by seed: a product over a stack may have another order for one seed than for several.
+        values = torch.stack([hscic(x, y, given, self.config.ridge) for x, y, given in zip(*samples, strict=True)])
+        return values * (later.mask.flatten(1).sum(1) > 0)  # 0 for padding alone
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
@@ -96,4 +94,4 @@ class PalrAgent(RecurrentAgent):
 )
 def fit(given: Given) -> PalrAgent:
     """Clone the demonstrations."""
-    return clone_by_chunks(PalrAgent, given.source, given.config, given.rngs, given.monitor)
+    return train_recurrent(PalrAgent, given.source, given.config, given.rngs, given.monitor)

@@ -1,6 +1,6 @@
-"""Reference policies: nothing is learned. They are handed the environments that evaluation steps, and the expert.
+"""Reference policies, without learning, on the environments that evaluation steps.
 
-The exact ones hold the posterior of theta on a grid: `conditional` takes its own actions as evidence, Eq. (2), and
+The exact policies hold the posterior of theta on a grid: `conditional` takes its own actions for evidence, Eq. (2), and
 `interventional` does not, Eq. (4).
 """
 
@@ -17,7 +17,7 @@ from deconfounded.experts.rollout import ExpertAgent, RandomAgent
 
 @dataclass(frozen=True)
 class ExactConfig(Configuration):
-    """grid: values of each latent; 0 where all latents are categories, which have values of their own."""
+    """grid: values of each latent; 0 where all latents are categorical, and the grid is their categories."""
 
     grid: int = 21
 
@@ -41,11 +41,11 @@ def interventional(given: Given) -> ExactAgent:
 
 @uses("environment", cost=1)
 def expert(given: Given) -> ExpertAgent:
-    """The expert itself, which sees theta: the one of every score."""
+    """The expert, which sees theta: 1 in every score."""
     return ExpertAgent(*given.environment)
 
 
 @uses(cost=1)
 def random(given: Given) -> RandomAgent:
-    """Uniform actions: the zero of every score."""
+    """Uniform actions: 0 in every score."""
     return RandomAgent(given.action_space)

@@ -1,8 +1,8 @@
-"""Teacher and student as in rapid motor adaptation (Kumar et al., 2021): sees theta in training, and only there.
+"""Teacher and student as in rapid motor adaptation (Kumar et al., 2021): theta is seen in training alone.
 
-The teacher is oracle BC, pi(a | s, theta), cloned from demonstrations whose thetas are told. The student acts by the
-teacher's policy on its own estimate of theta, which a recurrent network regresses from its own roll-outs: their actions
-were chosen by the student, and so are no evidence of theta. It acts on one estimate, the mean, as though it were sure.
+The teacher is oracle BC, pi(a | s, theta), cloned from demonstrations labelled with theta. The student acts by the
+teacher's policy on an estimate of theta, which a recurrent network regresses on the student's roll-outs: their actions
+are the student's, and so no evidence of theta. The estimate is a point, the mean, without uncertainty.
 """
 
 from __future__ import annotations
@@ -18,30 +18,29 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods import cloning
-from deconfounded.deconf.methods.cloning import CloningConfig
+from deconfounded.deconf.methods import memoryless_bc
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.streams import Array
-from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
-Tell = Callable[[Agent | None], tuple[Trials, Array]]
-"""Roll out a behaviour (None: uniformly random actions) in fresh environments, as many trials for each seed.
+Explore = Callable[[Agent | None], tuple[Trials, Array]]
+"""Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.
 
 Returns trials, and the encoded theta [B, E, F] of their episodes."""
 
 
 @dataclass(frozen=True)
 class RmaConfig(Configuration):
-    """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation.
+    """Hyperparameters for each seed; batch counts trials, chunk the steps of truncated backpropagation.
 
-    Updates are of the student; each round adds roll-outs of the student so far, and later rounds get more updates.
+    Updates are of the student; each round adds roll-outs of the current student, and later rounds get more updates.
     """
 
     width: int = 64
@@ -57,7 +56,7 @@ class RmaConfig(Configuration):
 
 
 class Adapter(GruMemory):
-    """Regresses theta from a history of the student's own transitions."""
+    """The adaptation module: regresses theta on the history of transitions."""
 
     def __init__(self, width: int, theta: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
         super().__init__(width, signature, obs, draws)
@@ -65,7 +64,7 @@ class Adapter(GruMemory):
 
 
 class RmaAgent(LearnedAgent):
-    """Acts on the observation and on its estimate of theta; carries its memory over resets."""
+    """A policy of the observation and of the estimate of theta, with a memory that outlives resets."""
 
     def __init__(self, adapter: Adapter, policy: ActionHead, obs: Scaler) -> None:
         super().__init__(policy)
@@ -106,18 +105,16 @@ class RmaAgent(LearnedAgent):
 
 
 def train(
-    trials: Trials, theta: Array, tell: Tell, config: RmaConfig, rng: Rngs, monitor: Monitor | None = None
+    trials: Trials, theta: Array, explore: Explore, config: RmaConfig, rng: Rngs, monitor: Monitor | None = None
 ) -> RmaAgent:
-    """Clone the teacher, then teach the student on its own roll-outs.
+    """Clone the teacher, then train the student on its own roll-outs.
 
-    trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
-    Raises InputError for less than one round.
+     trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
+    .
     """
-    if config.rounds < 1:
-        raise InputError(f"rounds was {config.rounds}; it must be at least 1")
-    rngs, monitor = listed(rng), monitor or Monitor()
+    rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
-    teacher = cloning.train(trials, _teacher(config), rngs, theta)
+    teacher = memoryless_bc.train(trials, _teacher(config), rngs, theta)
     signature, width = Signature.of(trials), config.width
     adapter = Adapter(width, theta.shape[-1], signature, teacher.scaler, draws)
     agent = RmaAgent(adapter, teacher.policy, teacher.scaler)
@@ -127,29 +124,29 @@ def train(
     total = sum(passes) * chunks
     optimizer = Adam([adapter], config.learning_rate, total)
     checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=optimizer, draws=draws)
-    data, told, begin = None, torch.empty(0), 0
+    data, targets, begin = None, torch.empty(0), 0
     if before := checkpoint.load():
-        begin, data, told = before["round"], Batch(*before["data"]), before["told"]
+        begin, data, targets = before["round"], Batch(*before["data"]), before["told"]
     for i in range(begin, config.rounds):
-        own, thetas = tell(agent if i > 0 else None)
-        new, label = Batch.of(own, len(rngs), config.device), along(own, thetas, len(rngs), config.device)
-        data, told = (new, label) if data is None else (data.joined(new), torch.cat([told, label], 1))
+        own, thetas = explore(agent if i > 0 else None)
+        new, target = Batch.of(own, len(rngs), config.device), per_step(own, thetas, len(rngs), config.device)
+        data, targets = (new, target) if data is None else (data.joined(new), torch.cat([targets, target], 1))
         for j in range(passes[i]):
-            index = draws.below(len(data), config.batch)
-            error = _pass(agent, optimizer, data.trials(index), take(told, index), config.chunk)
+            index = draws.integers(len(data), config.batch)
+            error = _pass(agent, optimizer, data.trials(index), take(targets, index), config.chunk)
             monitor.update((sum(passes[:i]) + j + 1) * chunks, total, {"theta": error}, agent)
-        checkpoint.save(round=i + 1, data=data.tensors, told=told)
+        checkpoint.save(round=i + 1, data=data.tensors, told=targets)
     return agent
 
 
-def _teacher(config: RmaConfig) -> CloningConfig:
-    return CloningConfig(
+def _teacher(config: RmaConfig) -> MemorylessConfig:
+    return MemorylessConfig(
         config.width, config.teacher_updates, config.teacher_batch, config.teacher_rate, device=config.device
     )
 
 
 def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: int) -> float:
-    """An update a chunk of trials [S, B, T], the memory passed on between chunks; returns the mean error."""
+    """One pass through trials [S, B, T]: an update a chunk, the memory passed on; returns the mean error."""
     state, errors = agent.adapter.start(len(batch)), []
     for begin in range(0, batch.mask.shape[2], chunk):
         part = slice(begin, begin + chunk)
@@ -159,10 +156,10 @@ def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: 
     return sum(errors) / len(errors)
 
 
-def along(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
+def per_step(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
     """theta [B, E, F] of episodes -> [S, B, T, F], at each step as `Batch.of` joins them."""
-    each = np.repeat(theta[:, :, None], trials.mask.shape[2], 2).astype(np.float32)
-    return Batch.of(Trials(trials.obs, each, trials.mask), seeds, device).action
+    repeated = np.repeat(theta[:, :, None], trials.mask.shape[2], 2).astype(np.float32)
+    return Batch.of(Trials(trials.obs, repeated, trials.mask), seeds, device).action
 
 
 @uses(
@@ -174,6 +171,6 @@ def along(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
     smoke_bandit={"updates": 500, "rounds": 2, "teacher_updates": 400},
 )
 def fit(given: Given) -> RmaAgent:
-    """Clone the teacher; then rounds of the student's roll-outs."""
+    """Clone the teacher, then train the student on its roll-outs."""
     theta = given.theta
     return train(given.demonstrations, theta, given.explore_with_theta, given.config, given.rngs, given.monitor)

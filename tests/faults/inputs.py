@@ -31,7 +31,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.methods.cloning import CloningConfig, train
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig, train
 from deconfounded.experts import policy, store
 from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
@@ -175,7 +175,7 @@ def commands(folder: Path) -> Iterator[tuple[str, str]]:
     (folder / "junk").write_bytes(b"\xff\x00 junk {")
     preset = tiny_preset()
     shown = Context(envs.get("bandit"), preset, [0]).demonstrations
-    agent = train(shown, CloningConfig(updates=3, batch=64), [np.random.default_rng(0)])
+    agent = train(shown, MemorylessConfig(updates=3, batch=64), [np.random.default_rng(0)])
     assert isinstance(agent, LearnedAgent)
     store.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
     for command, (base, options) in ODD.items():
@@ -203,7 +203,7 @@ def calls() -> dict[str, Callable[[], Any]]:
     rng = np.random.default_rng(0)
     obs, action, mask = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1)), np.ones((2, 1, 3), bool)
     trials = Trials(obs, action, mask)
-    agent = train(trials, CloningConfig(updates=1, batch=4), [rng])
+    agent = train(trials, MemorylessConfig(updates=1, batch=4), [rng])
     batch, task = envs.BatchEnv(envs.get("bandit"), 4), envs.get(CONTROL)
     odd: dict[str, Callable[[], Any]] = {}
     for name in (None, 3, b"bandit", "", [], "bandid", True, 1.5, ("bandit",)):

@@ -1,27 +1,77 @@
-"""A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) and its training by likelihood: naive_rnn's."""
+"""Behavioural cloning by sequence models: the training loop of all, and the recurrent policy of naive_rnn's family.
+
+A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) is trained by maximum likelihood with truncated backpropagation.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, trials_of
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 
+Kind = TypeVar("Kind", bound=LearnedAgent)
+Recurrent = TypeVar("Recurrent", bound="RecurrentAgent")
+
+
+class Trainer(Protocol):
+    """Takes updates of an agent; `done` and `total` count them."""
+
+    optimizer: Adam
+    done: int
+    total: int
+
+    def learn(self, batch: Batch, label: Tensor) -> None:
+        """Update on trials [S, B, T]; label [S, B, T, A]: the expert's action at each step."""
+
+
+def train_sequence(
+    trials: Source,
+    config: Any,
+    rng: Rngs,
+    new_agent: Callable[[Signature, Scaler, Draws], Kind],
+    new_trainer: Callable[[Kind, int, Monitor], Trainer],
+    monitor: Monitor | None = None,
+) -> Kind:
+    """Clone the expert's trials, which are in as many equal groups as there are generators in rng.
+
+    Of a function that draws trials, each batch is fresh trials. config: has `batch`, in trials, and `device`.
+    new_agent: makes the untrained agent, given a scaler of the expert's observations. new_trainer: makes its trainer,
+    given the number of steps of a trial.
+    """
+    rngs, monitor = as_generators(rng), monitor or Monitor()
+    first = trials_of(trials)
+    data, draws = Batch.of(first, len(rngs), config.device), Draws(rngs, config.device)
+    agent = new_agent(Signature.of(first), Scaler(data.obs, data.mask), draws)
+    trainer = new_trainer(agent, data.mask.shape[2], monitor)
+    checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=trainer.optimizer, draws=draws)
+    if before := checkpoint.load():
+        trainer.done = before["done"]
+    while trainer.done < trainer.total:
+        if first is trials:
+            batch = data.draw_trials(config.batch, draws)
+        else:
+            batch = Batch.of(trials_of(trials), len(rngs), config.device)
+        trainer.learn(batch, batch.action)
+        checkpoint.save(done=trainer.done)
+    return agent
+
 
 @dataclass(frozen=True)
 class RecurrentConfig(Configuration):
-    """Widths and amounts, for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
+    """Hyperparameters for each seed; batch counts trials, chunk the steps of truncated backpropagation."""
 
     width: int = 64
     updates: int = 1500
@@ -33,10 +83,10 @@ class RecurrentConfig(Configuration):
 
 
 class RecurrentAgent(LearnedAgent):
-    """Acts on the observation and on a memory of its own transitions, carried over resets.
+    """A policy of the observation and of a memory of the agent's transitions, which outlives resets.
 
-    The policy reads the observation itself, scaled, beside the memory: through the memory's embedding it cannot tell
-    the expert's small action noise from its own error, and clones less well.
+    The policy reads the scaled observation itself, not the memory's embedding of it, which resolves the expert's small
+    action noise less well.
     """
 
     memory_kind: ClassVar[type[GruMemory]] = GruMemory
@@ -48,14 +98,14 @@ class RecurrentAgent(LearnedAgent):
 
     @classmethod
     def new(cls, width: int, signature: Signature, obs: Scaler, draws: Draws) -> Self:
-        """One that knows nothing yet; `noise` is for its training."""
+        """An untrained agent; `noise` is for training."""
         memory = cls.memory_kind(width, signature, obs, draws)
         agent = cls(memory, ActionHead(width + signature.obs, width, signature, draws))
         agent.noise = draws
         return agent
 
     def configure(self, config: Any) -> None:
-        """Take what training needs of a configuration, beside the width."""
+        """Take over further settings that the loss needs."""
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
@@ -93,8 +143,8 @@ class RecurrentAgent(LearnedAgent):
         return self.loss(batch, batch.action, self.memory.start(len(batch)))[0]
 
 
-class Cloner:
-    """Trains an agent by likelihood: passes through trials, an update a chunk, the memory passed on between chunks.
+class RecurrentTrainer:
+    """Trains by truncated backpropagation: in a pass through trials, each chunk is an update and hands its memory on.
 
     `done` and `total` count updates; there is at least one pass.
     """
@@ -103,11 +153,11 @@ class Cloner:
         self.agent, self.chunk, self.monitor, self.done = agent, config.chunk, monitor, 0
         self.chunks = -(-steps // config.chunk)
         self.total = max(1, round(config.updates / self.chunks)) * self.chunks
-        cooled = self.total if config.cooled else None
-        self.optimizer = Adam([agent.memory, agent.policy], config.learning_rate, cooled)
+        schedule = self.total if config.cooled else None
+        self.optimizer = Adam([agent.memory, agent.policy], config.learning_rate, schedule)
 
     def learn(self, batch: Batch, label: Tensor) -> None:
-        """One pass. label [S, B, T, A]: the expert's action at each step, which need not be the one taken."""
+        """Take one pass. label [S, B, T, A]: the expert's action at each step."""
         state, losses = self.agent.memory.start(len(batch)), []
         for begin in range(0, self.chunks * self.chunk, self.chunk):
             part = slice(begin, begin + self.chunk)
@@ -116,3 +166,19 @@ class Cloner:
             losses.append(loss.mean().item())
         self.done += self.chunks
         self.monitor.update(self.done, self.total, {"imitation": sum(losses) / self.chunks}, self.agent)
+
+
+def train_recurrent(
+    kind: type[Recurrent], trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None
+) -> Recurrent:
+    """Clone the expert's trials with an agent of that kind: see `train_sequence`."""
+
+    def new_agent(signature: Signature, obs: Scaler, draws: Draws) -> Recurrent:
+        agent = kind.new(config.width, signature, obs, draws)
+        agent.configure(config)
+        return agent
+
+    def new_trainer(agent: Recurrent, steps: int, monitor: Monitor) -> RecurrentTrainer:
+        return RecurrentTrainer(agent, config, steps, monitor)
+
+    return train_sequence(trials, config, rng, new_agent, new_trainer, monitor)

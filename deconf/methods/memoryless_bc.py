@@ -1,4 +1,4 @@
-"""Behavioural cloning without memory: blind BC, pi(a | s), and oracle BC, pi(a | s, theta)."""
+"""Memoryless behavioural cloning: blind BC, pi(a | s), and oracle BC, pi(a | s, theta)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, listed, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler
 from deconfounded.deconf.core.sizes import Configuration
@@ -21,8 +21,8 @@ from deconfounded.experts.rollout import Trials
 
 
 @dataclass(frozen=True)
-class CloningConfig(Configuration):
-    """Widths and amounts, for each seed; batch counts steps."""
+class MemorylessConfig(Configuration):
+    """Hyperparameters for each seed; batch counts steps."""
 
     width: int = 64
     updates: int = 2000
@@ -32,7 +32,7 @@ class CloningConfig(Configuration):
 
 
 class MemorylessAgent(LearnedAgent):
-    """Acts on the observation, and on the features of theta that `side` returns, if it is an oracle."""
+    """A policy of the observation and, for the oracle, of the encoded theta that `side` returns."""
 
     def __init__(self, policy: ActionHead, scaler: Scaler, side: Callable[[], Array] | None) -> None:
         super().__init__(policy)
@@ -40,7 +40,7 @@ class MemorylessAgent(LearnedAgent):
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> MemorylessAgent:
-        """An oracle is told by whoever deploys it: `side` is theirs to set."""
+        """An untrained agent. An oracle's `side` has to be set before it is deployed."""
         return cls(ActionHead(signature.obs + shape["theta"], shape["width"], signature, draws), obs, None)
 
     def shape(self) -> dict[str, Any]:
@@ -53,7 +53,7 @@ class MemorylessAgent(LearnedAgent):
     def choose(self, obs: Tensor) -> Tensor:
         features = self.scaler(obs)
         if self.shape()["theta"] and self.side is None:
-            raise InputError("an oracle acts on theta, and was told none; set its `side`")
+            raise InputError("an oracle acts on theta, and had none; set its `side`")
         if self.side is not None:
             theta = torch.as_tensor(self.side()).to(features).reshape(*features.shape[:2], -1)
             features = torch.cat([features, theta], -1)
@@ -62,24 +62,24 @@ class MemorylessAgent(LearnedAgent):
 
 def train(
     trials: Trials,
-    config: CloningConfig,
+    config: MemorylessConfig,
     rng: Rngs,
     theta: Array | None = None,
     side: Callable[[], Array] | None = None,
     monitor: Monitor | None = None,
 ) -> MemorylessAgent:
-    """Clone the expert step by step; trials are in as many equal groups as there are generators in rng.
+    """Clone the expert's action at each step; trials are in as many equal groups as there are generators in rng.
 
-    theta [B, E, F]: features of each episode's theta, for the oracle, whose agent then asks `side` for those [N, F] of
-    the environments it acts in. Without both: blind BC.
+    For the oracle alone: theta [B, E, F], the encoded theta of each episode, and `side`, which returns that of the
+    environments that the agent acts in [N, F].
     """
-    rngs, signature, monitor = listed(rng), Signature.of(trials), monitor or Monitor()
+    rngs, signature, monitor = as_generators(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     scaler = Scaler(data.obs, data.mask)
     features = scaler(data.obs)
     if theta is not None:
-        each = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], *theta.shape[1:])
-        features = torch.cat([features, each.repeat_interleave(trials.mask.shape[2], 2)], -1)
+        by_episode = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], *theta.shape[1:])
+        features = torch.cat([features, by_episode.repeat_interleave(trials.mask.shape[2], 2)], -1)
     policy = ActionHead(features.shape[-1], config.width, signature, draws)
     agent = MemorylessAgent(policy, scaler, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)
@@ -92,7 +92,7 @@ def train(
     return agent
 
 
-AMOUNTS: dict[str, Any] = {
-    **{"cost": 1, "on_control": CloningConfig(), "on_bandit": CloningConfig(updates=500)},
+PRESETS: dict[str, Any] = {
+    **{"cost": 1, "on_control": MemorylessConfig(), "on_bandit": MemorylessConfig(updates=500)},
     **{"smoke": {"updates": 400}, "smoke_bandit": {"updates": 400}},
 }

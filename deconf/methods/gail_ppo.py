@@ -1,4 +1,4 @@
-"""The side of Stable-Baselines3 of GAIL: theta-blind environments, whose episode is a whole trial, and its policy."""
+"""GAIL's PPO: vector environments without theta, whose episode is a whole trial, and the recurrent policy."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from deconfounded.deconf.methods.gail import GailConfig
 
 Reward = Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
-"""Of observations [N, O], actions [N, A] and what followed [N, O]: [N]. The task's own reward is told to nobody."""
+"""Observations [N, O], actions [N, A], next observations [N, O] -> rewards [N]. The task's reward is hidden."""
 
 
-class Practice(BatchVecEnv):
-    """The environments of a vector in which a whole trial is one episode: `done` says that the trial is over.
+class TrialVecEnv(BatchVecEnv):
+    """A vector of environments whose episode, for PPO, is a whole trial: `done` marks the end of the trial.
 
-    What is observed [N, O + F + 1]: the observation, scaled; the action before it, one-hot if discrete; and whether an
-    episode has just begun, when there is no such action. `transitions` keeps what took place since the last reset.
+    Its observation [N, O + F + 1]: the task's, scaled; the previous action, one-hot if discrete; and a flag of the
+    start of an episode, where there is no such action. `transitions` holds those since the last reset.
     """
 
     def __init__(
@@ -40,11 +40,11 @@ class Practice(BatchVecEnv):
         self._environments, self._mean, self._std, self._reward = environments, mean, std, reward
         width, self._actions = action_sizes(space)
         self._features = self._actions or width
-        seen = spaces.Box(-np.inf, np.inf, (len(mean) + self._features + 1,), np.float32)
-        super().__init__(environments.n, seen, space)
+        observation_space = spaces.Box(-np.inf, np.inf, (len(mean) + self._features + 1,), np.float32)
+        super().__init__(environments.n, observation_space, space)
 
     def reset(self) -> Any:
-        """Trials start, under the thetas of these environments' seeds."""
+        """Start trials, under the thetas of these environments' seeds."""
         self._obs = self._environments.reset()
         self.transitions: list[tuple[NDArray[np.float32], ...]] = []
         return self._observation(np.zeros((self.num_envs, self._features)), np.ones(self.num_envs, bool))
@@ -58,27 +58,27 @@ class Practice(BatchVecEnv):
 
     def step_wait(self) -> Any:
         action, obs = self._chosen, self._obs
-        then, following, over, done = self._environments.step(action)
-        reward = self._reward(obs, action, then)
-        self.transitions.append((obs, action, then))
+        next_obs, following, over, done = self._environments.step(action)
+        reward = self._reward(obs, action, next_obs)
+        self.transitions.append((obs, action, next_obs))
         before = np.eye(self._actions)[action[:, 0].astype(int)] if self._actions else action
-        self._obs = then
+        self._obs = next_obs
         infos: list[dict[str, Any]] = [{} for _ in done]
-        ends = self._observation(before, np.zeros(len(done), bool))
+        terminal = self._observation(before, np.zeros(len(done), bool))
         for i in np.flatnonzero(done):
-            infos[i] = {"terminal_observation": ends[i], "TimeLimit.truncated": True}  # life would go on
+            infos[i] = {"terminal_observation": terminal[i], "TimeLimit.truncated": True}  # PPO bootstraps here
         self._obs = following
         return self._observation(before, over), reward, done, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Its seeds are given when it is made."""
+        """Nothing: seeds are those of the environments."""
         return [None] * self.num_envs
 
 
-class WholePolicy(RecurrentActorCriticPolicy):
-    """sb3-contrib's, whose LSTM reads a sequence at once if an episode starts with it, instead of step by step.
+class SequencePolicy(RecurrentActorCriticPolicy):
+    """sb3-contrib's recurrent policy, with an LSTM that reads a sequence at once if episodes start at its first step.
 
-    Its buffer cuts sequences where episodes start, so that this is how all of them are trained.
+    The rollout buffer splits sequences at starts of episodes, so that this holds in training.
     """
 
     @staticmethod
@@ -94,8 +94,8 @@ class WholePolicy(RecurrentActorCriticPolicy):
 
 
 @contextlib.contextmanager
-def numbers(seed: int) -> Iterator[None]:
-    """Stable-Baselines3 draws from torch's and numpy's global generators: seeded here, and put back after."""
+def seeded(seed: int) -> Iterator[None]:
+    """Seed torch's and numpy's global generators, which Stable-Baselines3 uses, and restore them afterwards."""
     before = np.random.get_state()  # noqa: NPY002
     with torch.random.fork_rng():
         torch.manual_seed(seed)
@@ -106,8 +106,8 @@ def numbers(seed: int) -> Iterator[None]:
             np.random.set_state(before)  # noqa: NPY002
 
 
-class Player:
-    """RecurrentPPO of one seed: what of it is to be kept in a checkpoint."""
+class PpoState:
+    """RecurrentPPO of one seed, as a part of a checkpoint."""
 
     def __init__(self, ppo: RecurrentPPO) -> None:
         self.ppo = ppo
@@ -120,8 +120,8 @@ class Player:
         self.ppo.policy.optimizer.load_state_dict(state["adam"])
 
 
-def new_ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
-    """Untrained. Its mean is near 0 and its std .6 at first, for actions in [-1, 1]."""
+def new_ppo(env: TrialVecEnv, config: GailConfig, seed: int) -> RecurrentPPO:
+    """An untrained RecurrentPPO. Its actions have a mean near 0 and a std of .6."""
     widths = [config.width, config.width]
     policy = {
         "lstm_hidden_size": config.width,
@@ -129,9 +129,9 @@ def new_ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
         "activation_fn": nn.ReLU,
         "log_std_init": -0.5,
     }
-    with numbers(seed):
+    with seeded(seed):
         ppo = RecurrentPPO(
-            WholePolicy,
+            SequencePolicy,
             env,
             learning_rate=config.policy_rate,
             n_steps=config.steps,
@@ -141,5 +141,5 @@ def new_ppo(env: Practice, config: GailConfig, seed: int) -> RecurrentPPO:
             policy_kwargs=policy,
             device=config.device,
         )
-    ppo.set_logger(Logger(None, []))  # its own would leave an empty folder in the temporary one, each round
+    ppo.set_logger(Logger(None, []))  # the default logger leaves an empty temporary folder each round
     return ppo

@@ -1,0 +1,102 @@
+"""Episodes that terminate early do so in the learned environment too."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from deconfounded.deconf.core import termination
+from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.nets import scalers
+from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
+from deconfounded.experts.rollout import Trials
+
+
+def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
+    """Random walks [n, 1, steps, 1] that terminate beyond the limit."""
+    obs = np.random.default_rng(0).normal(size=(n, 1, steps + 1, 1)).cumsum(2).astype(np.float32)
+    beyond = np.abs(obs[..., 0]) > limit
+    mask = ~(np.maximum.accumulate(beyond, -1)[..., :-1])
+    mask[..., 0] = True
+    return Trials(obs, np.zeros((n, 1, steps, 1)), mask)
+
+
+def test_the_limit_is_learned() -> None:
+    """Termination beyond the limit and not within: right for 95% of observations .3 or more from it."""
+    trials = walks()
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    model = termination.fit([trials], scalers(Batch.of(trials, 1))[0], draws)
+    assert model is not None
+    obs = torch.linspace(-4, 4, 401)[None, :, None]
+    predicted = (model.logit(obs) > 0)[0]
+    clear = (obs.abs() - 2).abs()[0, :, 0] > 0.3
+    right = predicted == (obs.abs() > 2)[0, :, 0]
+    assert right[clear].float().mean() > 0.95
+
+
+def test_a_horizon_is_no_termination() -> None:
+    trials = walks(limit=1e9)
+    assert termination.fit([trials], scalers(Batch.of(trials, 1))[0], Draws([np.random.default_rng(0)], "cpu")) is None
+
+
+def test_labels() -> None:
+    """Of an episode of three steps of four the last is a termination; of one of four none is."""
+    obs = np.arange(10.0).reshape(2, 1, 5, 1)
+    mask = np.array([[[1, 1, 1, 0]], [[1, 1, 1, 1]]], bool)
+    next_obs, terminated = termination.labelled(Trials(obs, np.zeros((2, 1, 4, 1)), mask))
+    assert next_obs[:, 0].tolist() == [1, 2, 3, 6, 7, 8, 9]
+    assert terminated.tolist() == pytest.approx([0, 0, 1, 0, 0, 0, 0])
+
+
+class Walker:
+    """Reference and actor: both take a step of 1."""
+
+    theta_hat = torch.zeros(1, 3, 1)
+    policy = SimpleNamespace(signature=SimpleNamespace(actions=0))
+    model = SimpleNamespace(dynamics=SimpleNamespace(sample=lambda obs, action, latent, draws: obs + action))
+
+    def begin(self, n: int, rngs: Any) -> None:
+        self.steps, self.farthest = 0.0, 0.0
+
+    def choose(self, obs: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(obs)
+
+    def remember(self, step: Batch) -> None:
+        self.steps += float(step.mask.sum()) / 3
+        self.farthest = max(self.farthest, float(step.next_obs.max()))
+
+    def point(self, obs: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(obs)
+
+
+@pytest.mark.parametrize(
+    ("limit", "observed", "steps", "last", "error"),
+    [(3.5, 99.0, 4, 4.0, 0.0), (99.0, 99.0, 8, 8.0, 12 / 20), (99.0, 5.0, 20, 5.0, 0.0)],
+    ids=[
+        "terminated: later steps do not count",
+        "out of the valid range: the rest of the episode counts as wrong",
+        "observations stay within the observed range",
+    ],
+)
+def test_rollouts_end(limit: float, observed: float, steps: int, last: float, error: float) -> None:
+    """From 0 on, a step at a time; the data is 0 to 5, so that dynamics are valid from -2.5 to 7.5."""
+
+    def trial(*obs: float) -> Batch:
+        steps = len(obs) - 1
+        return Batch.of(
+            Trials(np.reshape(obs, (1, 1, -1, 1)), np.zeros((1, 1, steps, 1)), np.ones((1, 1, steps), bool)), 1
+        )
+
+    walker, model = Walker(), SimpleNamespace(logit=lambda obs: obs[..., 0] - limit)
+    make: Any = LearnedEnv
+    expert = trial(*range(6))
+    env = make(walker, expert, [expert, trial(-1, observed)], 1, 20, model)
+    action_error, path = env.rollout(walker, [np.random.default_rng(0)])
+    assert walker.steps == steps
+    assert walker.farthest >= min(last + 1, 6)  # the actor's evidence is not clamped
+    assert action_error.item() == pytest.approx(error)
+    assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]
