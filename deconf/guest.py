@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -114,7 +115,7 @@ def main() -> None:
     line = b""
     while not line.endswith(b"\n") and (more := os.read(0, 65536)):
         line += more
-    settings, sys.stdin = json.loads(line), open(os.devnull, encoding="utf-8")  # noqa: SIM115
+    settings, sys.stdin = json.loads(line), io.StringIO()
     sys.path[:] = settings["path"]
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(AttributeError):  # characters that the output's encoding lacks are escaped

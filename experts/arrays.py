@@ -1,7 +1,5 @@
 """What arrays must be to become Trials: real numbers that float32 holds, and nothing that could be read in padding."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

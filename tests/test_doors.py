@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import re
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -56,9 +58,7 @@ def data_set(folder: Path, observation: Any, action: Any, values: Any, about: An
                 infos={},
             )
         )
-    from deconfounded.experts import datasets
-
-    with datasets._root(folder):
+    with patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder)):
         made = minari.create_dataset_from_buffers(
             "outside/of-us-v0", buffers, observation_space=observation, action_space=action, data_format="hdf5"
         )

@@ -1,7 +1,5 @@
 """Counts and seeds that are given from outside."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from deconfounded.envs.support.errors import InputError
