@@ -1,15 +1,10 @@
-"""Is a task confounded, and by how much? `python benchmarks/certify.py --task slippery_cartpole`
+"""Is a task confounded, and by how much? `deconf certify --task slippery_cartpole`
 
 Four measurements, none of which needs a trained imitator but the last: what it costs to expect the wrong theta, how
 loudly actions and dynamics speak of theta, what the exact policies make of it, and what a policy without memory does.
 """
 
 from __future__ import annotations
-
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
 
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
@@ -28,7 +23,6 @@ from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.score import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
-from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -139,6 +133,8 @@ def certify(
     done(STAGES[3])
 
     demo_env = envs.BatchEnv(task, 2 * trials)
+    from deconfounded.deconf.methods import memoryless_bc  # torch takes seconds: what checks its input goes without
+
     demos = run_trials(demo_env, ExpertAgent(demo_env, expert), EPISODES, stream(DEMOS, SEED)).trials
     blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(SEED)))
     done(STAGES[4])
@@ -232,7 +228,3 @@ def main() -> None:
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
     if result["verdict"] == "failed":
         raise SystemExit(1)
-
-
-if __name__ == "__main__":
-    run_command(main)

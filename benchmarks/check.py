@@ -5,15 +5,10 @@
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import sys
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser
 from deconfounded.envs.contract.check import check_task, sentence
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
@@ -33,7 +28,3 @@ def main() -> None:
         else:
             print(f"ok   {name}", flush=True)
     sys.exit(failed)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -23,8 +23,6 @@ if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes wi
     from deconfounded.benchmarks.engine.scheduler import Engine
     from deconfounded.benchmarks.engine.store import Finished
 
-KEPT = "what was finished is kept, and --resume goes on"
-
 
 def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
     """Arguments of a run; methods: help on what they may be; seeds: how many by default, if not the preset's."""

@@ -91,12 +91,11 @@ def escape_output() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")  # as Python's own for standard error
 
 
-def need_checkout(name: str) -> None:
-    """End a command with one line and exit code 2 where there is no source tree, but an installed package."""
-    if not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
-        wrong = f"{name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there"
-        print(f"error: {wrong}", file=sys.stderr)
-        sys.exit(2)
+def end(line: str, code: int = 2) -> NoReturn:
+    """End this process with a line on standard error, though a name in it holds several; bad input is code 2."""
+    with contextlib.suppress(OSError):  # the terminal is gone
+        print(" ".join(line.splitlines()), file=sys.stderr)
+    sys.exit(code)
 
 
 def _flush() -> None:
@@ -183,6 +182,4 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
             line, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
         else:
             raise
-    with contextlib.suppress(OSError):  # the terminal is gone
-        print(line, file=sys.stderr)
-    sys.exit(code)
+    end(line, code)

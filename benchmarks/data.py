@@ -6,16 +6,11 @@ sha256 is of the contents: made again anywhere with the same versions, it is the
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from collections.abc import Callable
 from importlib.util import find_spec
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command, whole
+from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.envs.support.files import check_folder
 from deconfounded.experts import datasets, policy
@@ -46,7 +41,3 @@ def main() -> None:
     collected = datasets.collect(task, args.trials, behaviours[kind], seed)
     written = datasets.write(args.out, task, f"{kind}{args.trials}s{args.seed}", collected, kind, (low, high))
     print(f"{task.name}: {args.trials} trials, sha256 {collected[0].sha256} -> {written}")
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -1,4 +1,4 @@
-"""Is your data confounded? `python benchmarks/diagnose.py --trials expert.npz`
+"""Is your data confounded? `deconf diagnose --trials expert.npz`
 
 From an expert's trials alone, and exploration if you have some: no theta, no simulator. Both are a Minari data set's
 folder, or an .npz as `Trials.save` writes it; each trial is under a hidden theta of its own. It writes index.html and
@@ -6,11 +6,6 @@ diagnosis.json. Interrupted, it goes on where it was.
 """
 
 from __future__ import annotations
-
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
 
 import json
 import sys
@@ -21,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import Parser, place, run_command, whole
+from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
@@ -135,7 +130,3 @@ def main() -> None:
     args = parser.parse_args()
     asked = " ".join(["deconf diagnose", *sys.argv[1:]])
     print(run(args.trials, args.explore, args.seed, args.out, asked)[1])
-
-
-if __name__ == "__main__":
-    run_command(main, "what was finished is kept, and the same command goes on")

@@ -5,11 +5,6 @@ Prints the return of each episode of a trial, under one theta; --video writes wh
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +12,7 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command, whole
+from deconfounded.benchmarks.console import Parser, whole
 from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.guest import Stranger
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -84,7 +79,3 @@ def main() -> None:
 
         imageio.mimsave(args.video, frames, fps=frame_rate(task), macro_block_size=8)
         print(f"-> {args.video}")
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -5,15 +5,10 @@ Nothing is trained, and nothing is made that is not there.
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from pathlib import Path
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import store
 from deconfounded.benchmarks.output import report
 from deconfounded.envs.support.files import read_sealed
@@ -32,7 +27,3 @@ def main() -> None:
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
     print(report.write(task, about, finished, folder))
-
-
-if __name__ == "__main__":
-    run_command(main)

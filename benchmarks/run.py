@@ -8,17 +8,18 @@ Seeds of a method run side by side in one program, in as many groups as there ar
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
+if __name__ == "__main__":  # this file is `deconf run` too
+    from deconfounded.__main__ import main as deconf
 
-    stop_at_once()
+    deconf("run")
+    raise SystemExit
 
 from importlib.util import find_spec
 from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import COMMON, run_command
+from deconfounded.benchmarks.console import COMMON
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.experts import policy
 
@@ -59,7 +60,3 @@ def main() -> None:
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, about = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
     print(report.write(task, about, finished, folder))
-
-
-if __name__ == "__main__":
-    run_command(main, commands.KEPT)

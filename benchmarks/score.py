@@ -6,16 +6,11 @@ you like: what the expert, random actions and the agent then make of it are meas
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from dataclasses import replace
 from typing import Any
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command, whole
+from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.output import score
@@ -82,7 +77,3 @@ def main() -> None:
         asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}
         about = {"task": task.name, "task_version": task.version, "agent": str(args.agent)}
         write_json(args.out, {**about, **asked, **scored})
-
-
-if __name__ == "__main__":
-    run_command(main)

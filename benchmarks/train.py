@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import os
 import platform
 import time
@@ -16,7 +11,7 @@ import numpy as np
 from safetensors.numpy import save as to_bytes
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command, whole
+from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.files import check_file, write_atomically, write_json
@@ -79,7 +74,3 @@ def main() -> None:
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
     if file.resolve() != policy.path(task).resolve():
         print(f"commands take it as --expert {file}; they look for {policy.path(task)} unasked")
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -6,11 +6,6 @@ Says `same bits`, `inside the interval` (the mean return of every episode within
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import tempfile
 from pathlib import Path
 
@@ -18,7 +13,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import ROOT, Parser, run_command
+from deconfounded.benchmarks.console import ROOT, Parser
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
@@ -104,7 +99,3 @@ def main() -> None:
     print(f"{task.name} {method} {args.seed}: {outcome}" + "".join(f"\n    {line}" for line in differs))
     if outcome == "not the same":
         raise SystemExit(1)
-
-
-if __name__ == "__main__":
-    run_command(main)

@@ -7,16 +7,17 @@ bandit: envs/tasks/bandit.py.
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from deconfounded.envs.streams import Array
 
-Values = TypeVar("Values", Array, Tensor)
+if TYPE_CHECKING:  # exact policies, which have arrays alone, go without torch
+    from torch import Tensor
+
+Values = TypeVar("Values", Array, "Tensor")
 
 
 def imitation_objective(log_expert: Array, taken: NDArray[np.bool_]) -> Array:
@@ -40,9 +41,9 @@ def belief_update(log_belief: Values, log_dynamics: Values, log_policy: Values |
     normalised log-belief [..., K]. Sums over several steps update by all of them.
     """
     joint = log_belief + log_dynamics if log_policy is None else log_belief + log_dynamics + log_policy
-    if isinstance(joint, Tensor):
-        return joint - torch.logsumexp(joint, -1, keepdim=True)
-    return joint - np.logaddexp.reduce(joint, axis=-1, keepdims=True)
+    if isinstance(joint, np.ndarray):
+        return joint - np.logaddexp.reduce(joint, axis=-1, keepdims=True)
+    return joint - joint.logsumexp(-1, keepdim=True)
 
 
 def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor) -> Tensor:
@@ -85,7 +86,7 @@ def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
     log_prior [..., K], log_next [..., B, T, K], mask [..., B, T] -> [...].
     """
     total = (log_next * mask[..., None]).sum(-2)
-    marginal = torch.logsumexp(log_prior[..., None, :] + total, -1)
+    marginal = (log_prior[..., None, :] + total).logsumexp(-1)
     return -marginal.sum(-1) / mask.sum((-2, -1)).clamp(min=1)
 
 

@@ -1,64 +1,63 @@
-"""One command for all: `deconf run --task slippery_cartpole` is `python benchmarks/run.py --task slippery_cartpole`.
+"""The command line, `deconf NAME ...`: one entrance for all commands, with one line for bad input and for signals.
 
-Each name below is a file with a command line of its own; `deconf NAME --help` shows it.
+Each name below is a module whose `main` reads the rest of the line; `deconf NAME --help` shows it.
 """
 
 from __future__ import annotations
 
-import runpy
+import importlib
 import sys
 
-from deconfounded.benchmarks.console import need_checkout, quiet_pipe, stop_at_once
+from deconfounded.benchmarks.console import ROOT, end, quiet_pipe, run_command, stop_at_once
 
 STUDIES = "benchmarks.studies."  # of a checkout alone: they make this repository's own pages
-COMMANDS = {
-    "run": ("benchmarks.run", "train, deploy and score methods on a task"),
-    "train": ("benchmarks.train", "train a task's expert (PPO)"),
-    "check": ("benchmarks.check", "does a task hold together? the contract tests"),
-    "certify": ("benchmarks.certify", "is a task confounded, and by how much?"),
-    "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone"),
-    "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?"),
-    "play": ("benchmarks.play", "run a kept agent in one environment"),
-    "score": ("benchmarks.score", "score a kept agent on fresh thetas, or a range never seen"),
-    "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set"),
-    "report": ("benchmarks.report", "make a run's report again, without training"),
-    "verify": ("benchmarks.verify", "run a record's seed again, and compare"),
-    "table": ("benchmarks.studies.table", "make the records that are missing"),
-    "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too"),
-    "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper"),
-    "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds"),
-    "tune": ("benchmarks.studies.tune", "the opponents' tuning"),
-    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise"),
+NOTHING = "nothing was written"
+RESUMED = "what was finished is kept, and --resume goes on"
+REPEATED = "what was finished is kept, and the same command goes on"
+COMMANDS = {  # name: module, what it does, what is said when it is interrupted
+    "run": ("benchmarks.run", "train, deploy and score methods on a task", RESUMED),
+    "train": ("benchmarks.train", "train a task's expert (PPO)", NOTHING),
+    "check": ("benchmarks.check", "does a task hold together? the contract tests", NOTHING),
+    "certify": ("benchmarks.certify", "is a task confounded, and by how much?", NOTHING),
+    "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone", REPEATED),
+    "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?", REPEATED),
+    "play": ("benchmarks.play", "run a kept agent in one environment", NOTHING),
+    "score": ("benchmarks.score", "score a kept agent on fresh thetas, or a range never seen", NOTHING),
+    "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),
+    "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
+    "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
+    "table": ("benchmarks.studies.table", "make the records that are missing", RESUMED),
+    "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),
+    "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper", RESUMED),
+    "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
+    "tune": ("benchmarks.studies.tune", "the opponents' tuning", REPEATED),
+    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise", RESUMED),
 }
 
 
-def main() -> None:
-    """Run the command that is named first, with the arguments that follow it."""
-    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+def main(*first: str) -> None:
+    """Run a command; the command line is what is given here, and then this process's arguments."""
+    stop_at_once()
+    name, *arguments = [*first, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help"):
         with quiet_pipe():
             print("usage: deconf COMMAND ...\n")
-            for command, (module, text) in COMMANDS.items():
+            for command, (module, text, _) in COMMANDS.items():
                 print(f"  {command:11} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
         return
     if name not in COMMANDS:
-        print(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}", file=sys.stderr)
-        sys.exit(2)
-    if COMMANDS[name][0].startswith(STUDIES):
-        need_checkout(name)
-    stop_at_once()
-    sys.argv = [f"deconf {name}", *sys.argv[2:]]
+        end(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}")
+    module, _, interrupted = COMMANDS[name]
+    if module.startswith(STUDIES) and not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
+        end(f"error: {name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there")
+    sys.argv = [f"deconf {name}", *arguments]
     try:
-        runpy.run_module(f"deconfounded.{COMMANDS[name][0]}", run_name="__main__", alter_sys=True)
+        run_command(importlib.import_module(f"deconfounded.{module}").main, interrupted)
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise
         extra = "train" if name == "train" else "data" if error.name == "minari" else "bench"
-        print(
-            f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it",
-            file=sys.stderr,
-        )
-        sys.exit(2)
+        end(f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it")
 
 
 if __name__ == "__main__":

@@ -45,64 +45,61 @@ def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:
 
 def refusal(args: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     """What a command that must end with code 2 says, in this process."""
-    name = args[1] if args[0] == "-m" else "deconfounded." + args[0].removesuffix(".py").replace("/", ".")
-    monkeypatch.setattr("sys.argv", [args[0], *args[2 if args[0] == "-m" else 1 :]])
+    monkeypatch.setattr("sys.argv", list(args))
     with pytest.raises(SystemExit) as ended:
-        run_command(importlib.import_module(name).main)
+        run_command(importlib.import_module(f"deconfounded.{COMMANDS[args[0]][0]}").main)
     assert ended.value.code == 2
     return capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("args", "says"),
-    [
-        (("benchmarks/run.py", "--task", "slipery_cartpole"), "did you mean 'slippery_cartpole'?"),
-        (("benchmarks/run.py", "--task", "bandit", "--methods", "naive"), "did you mean 'naive_rnn'?"),
-        (("benchmarks/run.py", "--task", "bandit", "--preset", "smok"), "did you mean 'smoke'?"),
-        (("benchmarks/run.py", "--task", "bandit", "--seeds", "0"), "must be at least 1"),
-        (("benchmarks/run.py", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
-        (("benchmarks/run.py", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
-        (("benchmarks/run.py",), "--task is missing"),
-        (("benchmarks/run.py", "--list", "--task", "nonsense"), "it lists all, and goes by itself"),
-        (("benchmarks/run.py", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
-        (("benchmarks/run.py", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
-        (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
-        (("benchmarks/run.py", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
-        (("benchmarks/certify.py", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
-        (("benchmarks/studies/performance.py", "sped"), "did you mean 'speed'?"),
-        (
-            ("benchmarks/train.py", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
-            "output folder /proc/none cannot be written",
-        ),
-        (
-            ("benchmarks/train.py", "--task", "slippery_cartpole", "--seed", "4294967296"),
-            "it must be a whole number from 0 to",
-        ),
-        (("benchmarks/run.py", "--task", "bandit", "--set", "seeds=0"), "--set seeds was '0'; it must be like 5"),
-        (("benchmarks/run.py", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
-        (("benchmarks/run.py", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
-        (("benchmarks/play.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
-        (("benchmarks/score.py", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
-        (
-            ("benchmarks/verify.py", "bandit", "random", "0", "--records", "nowhere.jsonl"),
-            "records nowhere.jsonl cannot be read: No such file",
-        ),
-        (("benchmarks/report.py", "nowhere"), "nowhere holds no settings.json of a run"),
-        (
-            ("benchmarks/data.py", "--task", "bandit", "--out", "x", "--trials", "0"),
-            "argument --trials: it was '0'; it must be a whole number from 1 to 100,000",
-        ),
-        (("benchmarks/check.py", "--task", "bandid"), "did you mean 'bandit'?"),
-        (("benchmarks/run.py", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
-        (("benchmarks/run.py", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
-        (("benchmarks/run.py", "--task", "leaning_beam"), "your own is path/file.py:Class"),
-        (("benchmarks/studies/paper.py", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
-        (("benchmarks/studies/publish.py", "nowhere"), "holds no records and adaptation.png"),
-        (("benchmarks/certify.py", "--task", "bandid"), "did you mean 'bandit'?"),
-        (("-m", "deconfounded.benchmarks.train", "--task", "bandit"), "nothing to train"),
-        (("benchmarks/studies/performance.py", "--tasks", "bandit"), "no physics to time"),
-    ],
-)
+REFUSALS: list[tuple[tuple[str, ...], str]] = [
+    (("run", "--task", "slipery_cartpole"), "did you mean 'slippery_cartpole'?"),
+    (("run", "--task", "bandit", "--methods", "naive"), "did you mean 'naive_rnn'?"),
+    (("run", "--task", "bandit", "--preset", "smok"), "did you mean 'smoke'?"),
+    (("run", "--task", "bandit", "--seeds", "0"), "must be at least 1"),
+    (("run", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
+    (("run", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
+    (("run",), "--task is missing"),
+    (("run", "--list", "--task", "nonsense"), "it lists all, and goes by itself"),
+    (("run", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
+    (("run", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
+    (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
+    (("run", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
+    (("certify", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
+    (("performance", "sped"), "did you mean 'speed'?"),
+    (
+        ("train", "--task", "slippery_cartpole", "--out", "/proc/none/e.safetensors"),
+        "output folder /proc/none cannot be written",
+    ),
+    (("train", "--task", "slippery_cartpole", "--seed", "4294967296"), "it must be a whole number from 0 to"),
+    (("run", "--task", "bandit", "--set", "seeds=0"), "--set seeds was '0'; it must be like 5"),
+    (("run", "--task", "slippery_cartpole", "--expert", "gone.py:f"), "there is no file gone.py"),
+    (("run", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
+    (("play", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
+    (("score", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
+    (
+        ("verify", "bandit", "random", "0", "--records", "nowhere.jsonl"),
+        "records nowhere.jsonl cannot be read: No such file",
+    ),
+    (("report", "nowhere"), "nowhere holds no settings.json of a run"),
+    (
+        ("data", "--task", "bandit", "--out", "x", "--trials", "0"),
+        "argument --trials: it was '0'; it must be a whole number from 1 to 100,000",
+    ),
+    (("check", "--task", "bandid"), "did you mean 'bandit'?"),
+    (("check", "--task", "two\nlines.py:T"), "there is no file two lines.py"),
+    (("run", "--task", "bandit", "--seeds", "many"), "invalid int value: 'many'"),
+    (("run", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
+    (("run", "--task", "leaning_beam"), "your own is path/file.py:Class"),
+    (("paper", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
+    (("publish", "nowhere"), "holds no records and adaptation.png"),
+    (("certify", "--task", "bandid"), "did you mean 'bandit'?"),
+    (("train", "--task", "bandit"), "nothing to train"),
+    (("performance", "--tasks", "bandit"), "no physics to time"),
+]
+
+
+@pytest.mark.parametrize(("args", "says"), REFUSALS)
 def test_bad_input_is_one_line(
     args: tuple[str, ...], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,29 +114,52 @@ def test_what_is_not_installed_is_said_at_once(
     """Before trials are made, which takes minutes."""
     monkeypatch.setattr(data, "find_spec", lambda name: None)
     monkeypatch.setattr(data, "run_trials", None)
-    told = refusal(("benchmarks/data.py", "--task", "bandit", "--out", str(tmp_path)), monkeypatch, capsys)
+    told = refusal(("data", "--task", "bandit", "--out", str(tmp_path)), monkeypatch, capsys)
     assert "`pip install deconfounded-imitation[data]` brings it" in told
 
 
 def test_bad_input_from_the_shell() -> None:
-    """As above, in a process of its own; and what only lists or checks does not import what takes seconds."""
+    """As above, in a process of its own."""
     done = command("benchmarks/run.py", "--task", "slipery_cartpole")
     assert done.returncode == 2
     assert done.stderr.startswith("error: task 'slipery_cartpole' is unknown; did you mean 'slippery_cartpole'?")
     assert len(done.stderr.strip().splitlines()) == 1
-    code = (
-        "import sys; from deconfounded.benchmarks import run;"
-        " sys.argv = ['run.py', '--list']; run.main(); print(*sys.modules)"
-    )
-    loaded = command("-c", code).stdout.splitlines()[-1].split()
-    assert "mujoco" in loaded
-    assert not {"torch", "stable_baselines3", "sklearn", "matplotlib", "scipy.stats"} & set(loaded)
+
+
+QUICK = ("run", "check", "certify", "data", "diagnose")
+
+
+def test_what_lists_or_checks_does_not_import_what_takes_seconds() -> None:
+    """`run --list`, and what these commands refuse before they begin."""
+    lines = [args for args, _ in REFUSALS if args[0] in QUICK and not {"--device", "--out", "--set"} & {*args}]
+    lines = [("run", "--list"), *((name, "--help") for name in QUICK), *lines]
+    code = f"""
+import contextlib, importlib, io, sys
+from deconfounded.__main__ import COMMANDS
+from deconfounded.benchmarks.console import run_command
+for sys.argv in map(list, {lines}):
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()):
+        run_command(importlib.import_module("deconfounded." + COMMANDS[sys.argv[0]][0]).main)
+    slow = {{"torch", "stable_baselines3", "sklearn", "matplotlib"}} & {{*sys.modules}}
+    assert not slow, (sys.argv, slow)
+"""
+    done = command("-c", code)
+    assert done.returncode == 0, done.stderr
 
 
 def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
-    out, args = tmp_path / "out", ("benchmarks/run.py", "--task", "bandit", "--preset", "smoke", "--out")
-    first = command(*args, str(out), "--methods", "blind_bc", "conditional", "interventional", MUJOCO_GL="off")
+    out, args = tmp_path / "out", ("run", "--task", "bandit", "--preset", "smoke", "--out")
+    first = command(
+        "benchmarks/run.py",
+        *args[1:],
+        str(out),
+        "--methods",
+        "blind_bc",
+        "conditional",
+        "interventional",
+        MUJOCO_GL="off",
+    )
     assert first.returncode == 0, first.stderr
     results = json.loads((out / "results.json").read_text())
     for file in ("rows.csv", "adaptation.png", "learning.png", "report.html"):
@@ -160,7 +180,9 @@ def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 
     (out / "jobs" / "blind_bc-0.npz").unlink()
     (out / "jobs" / "random-0.npz").write_bytes(b"half a file")
-    resumed = command(*args, str(out), "--resume", "--methods", "blind_bc", "conditional", "interventional")
+    resumed = command(
+        "-m", "deconfounded", *args, str(out), "--resume", "--methods", "blind_bc", "conditional", "interventional"
+    )
     assert resumed.returncode == 0, resumed.stderr
     repeated = json.loads((out / "results.json").read_text())
     for entry in (*repeated["methods"].values(), *results["methods"].values()):
@@ -261,13 +283,10 @@ def test_workers_are_kept(tmp_path: Path) -> None:
     assert os.environ.get("OMP_NUM_THREADS") == threads
 
 
-def test_every_command_listens_first() -> None:
-    """Before the imports that take long."""
-    for _, (name, _) in COMMANDS.items():
-        text = (ROOT / f"{name.replace('.', '/')}.py").read_text()
-        first = text.split("from __future__ import annotations\n\n")[1].partition("\n\nimport ")[0]
-        assert first.startswith('if __name__ == "__main__":'), name
-        assert "    stop_at_once()" in first.splitlines(), name
+def test_one_entrance() -> None:
+    """Signals and errors are seen to in __main__.py; run.py alone is a script too, and goes there first of all."""
+    scripts = [file.name for file in (ROOT / "benchmarks").rglob("*.py") if "__name__ ==" in file.read_text()]
+    assert scripts == ["run.py"]
 
 
 def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -297,7 +316,7 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
     [
         (("-m", "deconfounded", "--help"), 141),
         (("benchmarks/run.py", "--list"), 141),
-        (("benchmarks/studies/cards.py", "--help"), 0),  # argparse thinks nothing of it
+        (("-m", "deconfounded", "publish", "--help"), 0),  # argparse thinks nothing of it
     ],
 )
 def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered: str) -> None:

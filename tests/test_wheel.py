@@ -94,7 +94,7 @@ def test_they_are_whole(built: Path) -> None:
 def test_what_needs_a_checkout_says_so(built: Path, empty: Path) -> None:
     """At once, in a line: the studies, which no wheel has."""
     before = files(built / "site")
-    for name, (module, _) in COMMANDS.items():
+    for name, (module, *_) in COMMANDS.items():
         there = (built / "site" / "deconfounded" / f"{module.replace('.', '/')}.py").exists()
         assert there != module.startswith(STUDIES), name
         if not there:
@@ -146,7 +146,7 @@ def test_commands_work_as_installed(built: Path, empty: Path) -> None:
 
     Data there and in a checkout are known to be the same.
     """
-    installed = {name for name, (module, _) in COMMANDS.items() if not module.startswith(STUDIES)}
+    installed = {name for name, (module, *_) in COMMANDS.items() if not module.startswith(STUDIES)}
     assert {line.split()[0] for line in LINES.split("\n") if line} == installed
     before = files(built / "site")
     done = run(built, empty, "-c", SCRIPT, LINES.strip())

@@ -6,11 +6,6 @@ and online (b), imitation loss (c) and best-arm pulls (d) during training; learn
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,7 +16,6 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
@@ -270,7 +264,3 @@ def main() -> None:
     folder = args.out or Path("results") / f"paper-{args.preset}"
     finished, about = commands.run(FigureJob, task, args, methods, folder)
     print(write(task, about, finished, exact(task), folder))
-
-
-if __name__ == "__main__":
-    run_command(main, commands.KEPT)

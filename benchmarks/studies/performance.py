@@ -9,11 +9,6 @@ preset's updates; where the curve is flat, a smaller share does. Each part write
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import argparse
 import platform
 import time
@@ -27,7 +22,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.output.pictures import panels
@@ -226,7 +221,3 @@ def main() -> None:
     for part in args.parts or PARTS:
         PARTS[part](args)
     print(f"-> {args.out}")
-
-
-if __name__ == "__main__":
-    run_command(main, "what was finished is kept, and the same command goes on")

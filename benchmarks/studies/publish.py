@@ -8,11 +8,6 @@ README's picture of docs/index.html, which takes Chromium.
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import hashlib
 import json
 import shutil
@@ -27,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, run_command
+from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import index, records
@@ -199,7 +194,3 @@ def main() -> None:
         with browser(1280, 960) as page:
             page.goto((DOCS / "index.html").as_uri())
             write_atomically(DOCS / "index.png", page.screenshot())
-
-
-if __name__ == "__main__":
-    run_command(main)

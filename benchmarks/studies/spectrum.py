@@ -7,11 +7,6 @@ Interrupted, it goes on where it was.
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,7 +15,6 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES, check_names
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.score import two_decimals
@@ -133,7 +127,3 @@ def main() -> None:
     write_json(folder / "spectrum.json", {"seeds": args.seeds, "preset": args.preset, "points": points})
     picture(points, folder / "spectrum.png")
     print(f"-> {folder / 'spectrum.png'}")
-
-
-if __name__ == "__main__":
-    run_command(main, commands.KEPT)

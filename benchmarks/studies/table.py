@@ -7,18 +7,12 @@ and kept as soon as they are done. Stopped, it goes on where it was. The first f
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.studies import runs
 
@@ -78,7 +72,3 @@ def main() -> None:
     for job, seeds in left.items():
         made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
         records.write(kept, made)
-
-
-if __name__ == "__main__":
-    run_command(main, commands.KEPT)

@@ -7,11 +7,6 @@ once. Interrupted, it goes on where it was; what is there of today's versions an
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.studies import runs
 from deconfounded.benchmarks.studies.cards import DOCS
@@ -126,7 +121,3 @@ def main() -> None:
         means = ", ".join(f"{task} {np.mean(scores):.3f}" for task, scores in row["scores"].items())
         print(f"{name}, {row['setting']}: {means}")
     print(f"-> {file}")
-
-
-if __name__ == "__main__":
-    run_command(main, "what was finished is kept, and the same command goes on")

@@ -8,11 +8,6 @@ that were measured; a case that is diagnosed again takes its row's place. Interr
 
 from __future__ import annotations
 
-if __name__ == "__main__":  # Ctrl-C while the rest is imported is one line too
-    from deconfounded.benchmarks.console import stop_at_once
-
-    stop_at_once()
-
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -22,7 +17,7 @@ import numpy as np
 from scipy import stats
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place, run_command
+from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.output.score import two_decimals
 from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
@@ -202,7 +197,3 @@ def main() -> None:
         print(f"{task.name}: {diagnosis.verdict}, {'right' if row['right'] else 'WRONG'}")
     picture(kept(KEPT), DOCS / f"{KEPT}.png")
     print(f"{summary(kept(KEPT))} -> {DOCS / KEPT}.png")
-
-
-if __name__ == "__main__":
-    run_command(main, "what was finished is kept, and the same command goes on")

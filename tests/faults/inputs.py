@@ -206,7 +206,7 @@ def calls() -> dict[str, Callable[[], Any]]:
     agent = train(trials, MemorylessConfig(updates=1, batch=4), [rng])
     batch, task = envs.BatchEnv(envs.get("bandit"), 4), envs.get(CONTROL)
     odd: dict[str, Callable[[], Any]] = {}
-    for name in (None, 3, b"bandit", "", [], "bandid", True, 1.5, ("bandit",)):
+    for name in (None, 3, b"bandit", "", [], "bandid", True, 1.5, ("bandit",), np.zeros((2, 1))):
         odd |= {
             f"make({name!r})": lambda n=name: envs.make(n),
             f"make_vec({name!r}, 2)": lambda n=name: envs.make_vec(n, 2),
@@ -216,7 +216,7 @@ def calls() -> dict[str, Callable[[], Any]]:
         odd[f"make_vec(n={n!r})"] = lambda n=n: envs.make_vec(CONTROL, n)
         odd[f"make_vec(episodes={n!r})"] = lambda n=n: envs.make_vec(CONTROL, 2, episodes=n)
         odd[f"BatchEnv(n={n!r})"] = lambda n=n: envs.BatchEnv(task, n)
-    for seed in ("a", -1, 1.5, [1], np.nan, b"", (1, -2), {}, "1", True):
+    for seed in ("a", -1, 1.5, [1], np.nan, b"", (1, -2), {}, "1", True, [None, []]):
         odd[f"make_dm(seed={seed!r})"] = lambda s=seed: envs.make_dm(CONTROL, seed=s)
         odd[f"vec.reset(seed={seed!r})"] = lambda s=seed: vec.reset(seed=s)
         odd[f"BatchEnv.reset({seed!r})"] = lambda s=seed: batch.reset(s)
