@@ -34,7 +34,7 @@ def test_the_same_in_another_process(
     data.main()
     assert f"{name}: 4 trials, sha256 {shown.sha256} -> {tmp_path}" in capsys.readouterr().out
     code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.stdout.strip() == shown.sha256, done.stderr
     trials, theta = datasets.read(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
@@ -76,7 +76,7 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
 
 def test_the_standard_sets_are_the_same() -> None:
     """Of the bandit, which a second makes; on MuJoCo the last bits are the machine's kind's."""
-    kept = json.loads((Path(__file__).parents[1] / "docs" / "data.json").read_text())
+    kept = json.loads((Path(__file__).parents[2] / "docs" / "data.json").read_text())
     assert set(kept) == {f"{name}-v{envs.get(name).version}" for name in envs.SUITE}
     for kind, purpose in (("expert", DEMOS), ("random", EXPLORATION)):
         env = envs.BatchEnv(envs.get("bandit"), 256)

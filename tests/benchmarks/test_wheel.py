@@ -19,7 +19,7 @@ from deconfounded import envs
 from deconfounded.__main__ import COMMANDS, STUDIES
 from deconfounded.benchmarks.engine import identity, sources
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGES = ("assets", "benchmarks", "deconf", "envs", "experts")
 PIP = (sys.executable, "-m", "pip", "-q", "--disable-pip-version-check", "--no-cache-dir")
 OFFLINE = ("--no-deps", "--no-index")

@@ -17,7 +17,7 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from tests.tools import tiny_preset
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 MESH = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
 FIELD = struct.pack("ii", 2, 2) + bytes(16)

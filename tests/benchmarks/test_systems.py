@@ -29,7 +29,7 @@ from deconfounded.experts import datasets, policy
 from deconfounded.experts.rollout import RandomAgent
 from deconfounded.experts.sb3 import Sb3VecEnv
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
 OWN = f"""
 from deconfounded import envs

@@ -24,7 +24,7 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TINY = Amounts(
     rivals=2,
     dreams=4,

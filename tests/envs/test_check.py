@@ -301,7 +301,7 @@ def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
 def test_check_command_says_one_line() -> None:
     """Of a task that is not there, without a word of the interpreter's; and nothing is lost under `python -O`."""
     command = [sys.executable, "-O", "-m", "deconfounded", "check", "--task", "nowhere"]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.returncode == 2
     assert done.stderr.startswith("error: ")
     assert done.stderr.count("\n") == 1

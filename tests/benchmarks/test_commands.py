@@ -34,7 +34,7 @@ from deconfounded.envs.support.files import check_file, read_sealed, write_json,
 from deconfounded.experts.policy import CallableExpert
 from tests.tools import tiny_preset
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def command(*args: str, **environ: str) -> subprocess.CompletedProcess[str]:

@@ -24,7 +24,7 @@ from deconfounded.benchmarks.studies import cards, findings, gap, publish, resul
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
 def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

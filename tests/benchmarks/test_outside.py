@@ -38,7 +38,7 @@ from deconfounded.experts import policy, store
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
 BENT = "bent_cartpole.py:BentCartpole"
 

@@ -44,5 +44,5 @@ def test_render_then_train(before: str) -> None:
     """Mesa's LLVM and triton's in one process: torch imports triton once something has been drawn."""
     command = [sys.executable, "-c", before + RENDER_AND_TRAIN]
     environ = {**os.environ, "MUJOCO_GL": render.backend()}
-    done = subprocess.run(command, cwd=Path(__file__).parents[1], env=environ, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], env=environ, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "rendered, trained, rendered\n"), done.stderr
