@@ -1,0 +1,89 @@
+"""Plant faults in a copy of this tree, one at a time, and see which test notices: `python tests/faults/planted.py`
+
+Each fault of FAULTS is a plausible slip: a text that occurs once in a file, and what stands there in its place. Its tests
+are run on the copy with `-x`; one of them must fail. Words after the command choose faults by name. `noticed by <test>` or
+`NOT NOTICED` for each; exit code 1 if any was not noticed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Fault(NamedTuple):
+    """tests: arguments of pytest, in the order in which they are to be tried."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str
+
+
+FAULTS = (
+)
+
+
+def plant(fault: Fault, tree: Path) -> str:
+    """Put the fault into a file of the tree; returns the file's text without it."""
+    text = (tree / fault.file).read_text(encoding="utf-8")
+    assert text.count(fault.old) == 1, f"{fault.name}: the old text occurs {text.count(fault.old)} times"
+    (tree / fault.file).write_text(text.replace(fault.old, fault.new), encoding="utf-8")
+    return text
+
+
+def noticed(fault: Fault, tree: Path) -> str:
+    """The test that fails for the fault in a tree; empty if none does. The tree is put back as it was."""
+    text = plant(fault, tree)
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    environ = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        ended = subprocess.run(
+            [*command, *fault.tests.split()], cwd=tree, env=environ, capture_output=True, text=True
+        )
+    finally:
+        (tree / fault.file).write_text(text, encoding="utf-8")
+    failed = re.search(r"^FAILED (\S+::\S+)", ended.stdout, re.M)
+    if not failed and ended.returncode:  # a file that cannot be imported, say, is no test that tells what is wrong
+        raise SystemExit(f"{fault.name}: pytest ended with {ended.returncode}\n{ended.stdout}{ended.stderr}")
+    return failed[1] if failed else ""
+
+
+def copied(folder: Path) -> Path:
+    """A copy of what git tracks, as it is in the working tree."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    for name in filter(None, os.fsdecode(listed).split("\0")):
+        if os.path.lexists(ROOT / name):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, folder / name, follow_symlinks=False)
+    return folder
+
+
+def main() -> None:
+    """The command line."""
+    chosen = [fault for fault in FAULTS if not sys.argv[1:] or any(word in fault.name for word in sys.argv[1:])]
+    missed = 0
+    with tempfile.TemporaryDirectory(prefix="planted-") as scratch:
+        tree = copied(Path(scratch))
+        for fault in chosen:
+            start = time.monotonic()
+            test = noticed(fault, tree)
+            missed += not test
+            said = f"noticed by {test}" if test else "NOT NOTICED"
+            print(f"{fault.name}: {said} ({time.monotonic() - start:.0f} s)", flush=True)
+    print(f"{len(chosen) - missed} of {len(chosen)} noticed")
+    sys.exit(missed > 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""Physics by what it means: returns of known policies, directions, sizes of noise, and what evidence is of."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.deconf import exact
+from deconfounded.envs.contract.probe import actions
+from deconfounded.envs.edits import ModelEdit, SpecEdit
+from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array
+from deconfounded.experts import policy
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
+from tests import toys
+
+DOCS = Path(__file__).parents[1] / "docs"
+TASKS = envs.names()
+PHYSICAL = [name for name in TASKS if isinstance(envs.get(name), MujocoTask)]
+
+
+def expected(name: str, policy_name: str) -> float:
+    """Mean return: the certificate's, or that of the records of a task without one."""
+    certificate = DOCS / "certificates" / f"{name}.json"
+    if certificate.is_file():
+        return json.loads(certificate.read_text())[f"return_{policy_name}"]
+    lines = map(json.loads, (DOCS / "records" / f"{name}.jsonl").read_text().splitlines())
+    return float(np.mean([line["returns"] for line in lines if line["method"] == policy_name]))
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_returns_are_the_certificate_s(name: str) -> None:
+    """Of 24 episodes of the expert and of random actions, whose mean is within four standard errors, and 2% of range."""
+    env = envs.BatchEnv(envs.get(name), 24)
+    made: dict[str, tuple[Any, ...]] = {
+        "random": (RandomAgent(env.task.action_space), 1),
+        "expert": (ExpertAgent(env, policy.load(env.task)), 2),
+    }
+    spread = expected(name, "expert") - expected(name, "random")
+    for kind, (agent, seed) in made.items():
+        returns = run_trials(env, agent, 1, seed).returns
+        tolerance = 4 * returns.std() / np.sqrt(len(returns)) + 0.02 * spread
+        assert returns.mean() == pytest.approx(expected(name, kind), abs=tolerance), f"{kind} on {name}"
+
+
+# Task, index of its latent, a low and a high value of it, the action held, steps, joint whose velocity is read, and the sign of
+# the difference that the higher value makes to it.
+DIRECTIONS = (
+    ("tilted_cartpole", 0, (-0.2, 0.2), (0.0,), 10, "slider", 1),  # down the rail, whose x end sinks
+    ("rolling_deck", 0, (-0.2, 0.2), (0.0,), 10, "slider", 1),
+    ("slippery_cartpole", 0, (0.05, 0.25), (0.0,), 10, "hinge", 1),  # the axle drags the pole along
+    ("heavy_payload", 0, (1.0, 3.0), (0.0,), 5, "load", -1),
+    ("icy_stop", 0, (0.1, 0.6), (-1.0,), 5, "car", -1),  # braking
+    ("weak_thruster", 0, (0.8, 2.0), (1.0,), 10, "height", 1),
+    ("dragged_sled", 0, (3.0, 18.0), (0.0,), 10, "sled", -1),
+    ("curling", 0, (0.025, 0.1), (1.0,), 10, "slide", -1),
+    ("swapped_lander", 0, (0, 1), (0.0, 1.0), 5, "x", -1),  # 1 is to the right, if it is not swapped
+    ("slippery_walker", 1, (-0.1, 0.18), (0.0,) * 6, 10, "rootx", -1),  # uphill along x
+)
+
+
+@pytest.mark.parametrize(("name", "latent", "values", "action", "steps", "joint", "sign"), DIRECTIONS)
+def test_theta_acts_in_its_direction(
+    name: str, latent: int, values: tuple[float, float], action: Any, steps: int, joint: str, sign: int
+) -> None:
+    """From the same start, without noise."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    env = envs.BatchEnv(task, 2)
+    thetas = np.repeat(task.theta_grid(1)[:1], 2, 0)
+    thetas[:, latent] = values
+    env.reset([3, 3], {"theta": thetas})
+    state = env.state.copy()
+    for _ in range(steps):
+        state = env.simulator.outcome(state, np.tile(action, (2, 1)))
+    low, high = task.qvel(state, joint)
+    assert sign * (high - low) > 0.02, (low, high)
+
+
+def test_wind_blows_along_y_and_a_load_ahead_dips_the_nose() -> None:
+    """Without noise, hovering; wind to either side mirrors the path, and moves the drone sideways alone."""
+    task = envs.get("windy_drone")
+    assert isinstance(task, MujocoTask)
+    env = envs.BatchEnv(task, 4)
+    env.reset([3] * 4, {"theta": [[0, 0], [12, 0], [-12, 0], [0, 0.02]]})
+    level = np.array([0, 0, 1.5, 1, 0, 0, 0], float)
+    state = task.state(flight=(np.tile(level, (4, 1)), np.zeros((4, 6))))
+    for _ in range(5):
+        state = env.simulator.outcome(state, np.zeros((4, 4)))
+    calm, left, right, laden = task.qvel(state, "flight") - task.qvel(state, "flight")[0]
+    assert not calm.any()
+    assert left[1] == pytest.approx(-right[1], rel=0.01)
+    assert left[1] > 0.1
+    assert abs(left[0]) < 0.01 * left[1]
+    assert laden[4] > 0.1  # about y, left: the x axis sinks
+    assert abs(laden[3]) < 0.01 * laden[4]
+
+
+@pytest.mark.parametrize("kind", ["compiled", "specified"])
+def test_a_slope_rises_along_x(kind: str) -> None:
+    """Gravity pulls back along x by g sin, and down by g cos."""
+    task = envs.get("slippery_walker")
+    assert isinstance(task, MujocoTask)
+    if kind == "compiled":
+        import copy
+
+        import mujoco
+
+        model = copy.copy(task.model)
+        ModelEdit(model, task.model, mujoco.MjData(model)).slope(0.1)
+    else:
+        spec = task.spec()
+        SpecEdit(spec).slope(0.1)
+        model = spec.compile()
+    np.testing.assert_allclose(model.opt.gravity, [-9.81 * np.sin(0.1), 0, -9.81 * np.cos(0.1)], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", PHYSICAL)
+def test_environments_have_the_noise_that_is_stated(name: str) -> None:
+    """What BatchEnv steps to is off its outcome by the stated deviations: half a chi-squared of as many coordinates."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    env, falls = envs.BatchEnv(task, 40), list[Array]()
+    env.reset(5)
+    for action in actions(task, env.n, 12):
+        alive = env.alive
+        outcome = env.simulator.outcome(env.state, action)
+        env.step(action)
+        falls.append((task.log_prob(outcome, outcome) - task.log_prob(env.state, outcome))[alive])
+    fall, right = np.concatenate(falls), task.noise.size / 2
+    assert fall.mean() == pytest.approx(right, abs=5 * np.sqrt(right / len(fall)))
+
+
+def test_a_reading_is_evidence_of_the_state_that_it_was_taken_in() -> None:
+    """The lamp of a cheetah at 2 m/s says too fast: right if 1 is hidden, wrong if 3; what was before is no matter."""
+    task = envs.get("cheetah_speed")
+    assert isinstance(task, MujocoTask)
+    before, after = task.state(rootx=([0.0, 0.0], [0.0, 0.0])), task.state(rootx=([0.0, 0.0], [2.0, 2.0]))
+    before[:, -1], after[:, -1] = -1, 1
+    told = exact.log_next(task.simulator(2), before, np.zeros((2, 6)), after, np.array([[1.0], [3.0]]))
+    np.testing.assert_allclose(np.exp(told), [0.8, 0.2])
+
+
+def test_sensors_read_the_world_after_the_step() -> None:
+    """Readings of the environment fit the state that they are in, nine times in ten of steps; at 0 theta is told by none."""
+    task = envs.get("cheetah_speed")
+    assert isinstance(task, MujocoTask)
+    env, right = envs.BatchEnv(task, 40), list[Array]()
+    env.reset(0)
+    for action in actions(task, env.n, 15):
+        env.step(action)
+        off = task.qvel(env.state, "rootx") - env.theta[:, 0]
+        right.append((env.state[:, -1] > 0) == (off > 0))
+    assert np.mean(right) == pytest.approx(0.8, abs=0.07)
+
+
+@pytest.mark.parametrize("conditional", [False, True])
+def test_actions_are_weighed_by_what_was_seen_before_them(conditional: bool) -> None:
+    """A step of the exact policies on a point on a line, by hand: Eq. (3) with the expert's density, Eq. (5) without."""
+    task = toys.Push()
+    env = envs.BatchEnv(task, 5)
+    expert = CallableExpert(task, toys.control, "control")
+    agent = exact.ExactAgent(env, expert, conditional, 7)
+    obs = env.reset(2)
+    agent.begin(5)
+    agent.reset([np.random.default_rng(0)])
+    state, action = env.state, agent.act(obs)
+    following = env.step(action)[0]
+    agent.observe(obs, action, following, np.ones(5, bool))
+    told = np.zeros((5, 7))
+    for k, theta in enumerate(task.theta_grid(7)):
+        thetas = np.tile(theta, (5, 1))
+        told[:, k] = task.log_prob(env.state, task.outcome(state, action, thetas))
+        if conditional:
+            told[:, k] += expert.log_prob(obs, action, thetas)
+    told -= np.logaddexp.reduce(told, -1, keepdims=True)
+    np.testing.assert_allclose(agent.log_belief, told, atol=1e-6)
