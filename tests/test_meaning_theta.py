@@ -1,0 +1,167 @@
+"""Theta by what it means: nothing that an imitator sees moves with it but through the world, and scoring has the true one."""
+
+from __future__ import annotations
+
+import queue
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import progress
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.engine.provider import Provider
+from deconfounded.deconf.method import USES
+from deconfounded.deconf.methods import cloning
+from deconfounded.envs.contract.probe import far_thetas
+from deconfounded.experts import datasets
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, Trials, run_trials, thetas
+from tests import toys
+from tests.tools import tiny_preset
+
+
+@pytest.mark.parametrize("name", envs.names())
+def test_later_episodes_start_alike_under_any_theta(name: str) -> None:
+    """Bit for bit, in the state too: the second and third start of a trial, of the same seed."""
+    task = envs.get(name)
+    starts = []
+    for theta in far_thetas(task):
+        env = envs.BatchEnv(task, 2)
+        env.reset([3, 4], {"theta": theta})
+        for _ in range(2):
+            env.step(np.zeros((2, task.action_width)))
+            seen = env.reset(options={"keep_theta": True})
+        starts.append((env.state.copy(), seen))
+    for state, seen in starts[1:]:
+        np.testing.assert_array_equal(state, starts[0][0])
+        np.testing.assert_array_equal(seen, starts[0][1])
+
+
+def test_padding_of_trials_tells_nothing() -> None:
+    """After the end of an episode: no action, and the last observation again and again."""
+    env = envs.BatchEnv(toys.Push(), 32)
+    trials = run_trials(env, RandomAgent(env.task.action_space), 2, 0).trials
+    assert 0.2 < trials.mask.mean() < 0.9
+    assert not trials.action[~trials.mask].any()
+    last = np.take_along_axis(trials.obs, trials.mask.sum(-1)[..., None, None], 2)
+    over = np.arange(trials.obs.shape[2]) >= trials.mask.sum(-1)[..., None]
+    np.testing.assert_array_equal(trials.obs[over], np.broadcast_to(last, trials.obs.shape)[over])
+
+
+def test_episodes_of_a_data_set_hold_no_theta(tmp_path: Path) -> None:
+    """Infos are empty; theta is in the metadata, for scoring, and nowhere else."""
+    minari = pytest.importorskip("minari")
+    task = envs.get("tilted_cartpole")
+    collected = datasets.collect(task, 2, lambda env: RandomAgent(task.action_space), 5)
+    place = datasets.write(tmp_path, task, "random", collected, "random", (0.0, 1.0))
+    trials, theta, _ = collected
+    for i, episode in enumerate(minari.MinariDataset(place / "data").iterate_episodes()):
+        b, e = divmod(i, task.episodes)
+        assert not episode.infos
+        n = len(episode.rewards)
+        np.testing.assert_array_equal(episode.observations, trials.obs[b, e, : n + 1])
+        np.testing.assert_array_equal(episode.actions, trials.action[b, e, :n])
+    np.testing.assert_array_equal(datasets.read(place)[1], theta)
+
+
+def test_who_explores_gets_nothing_else() -> None:
+    """What each use opens, all of it, by name: nothing is opened beside what is written here."""
+    opened = {
+        "demonstrations": {"demonstrations", "fresh demonstrations"},
+        "exploration": {"exploration", "environments", "reset", "step"},
+        "queries": {"queries"},
+        "theta": {"theta", "acting theta"},
+    }
+    assert set(opened) == set(USES)
+    context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
+    for use, kinds in opened.items():
+        assert Provider(context, [use], context.rngs).open == kinds
+
+
+@pytest.mark.parametrize("salt", ["", "salt"])
+def test_a_job_s_file_has_its_own_seed_s_thetas(salt: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that evaluation drew for that seed and salt, episode by episode; they are other ones for another salt."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("rolling_deck", replace(tiny_preset(), eval_trials=3), "random", (0, 1), tmp_path, salt=salt)
+    job.run()
+    for seed in (0, 1):
+        found = job.load(seed)
+        assert found is not None
+        task = envs.get("rolling_deck")
+        expected = thetas(task, 3, task.episodes, stream(EVALUATION, seed, salt))
+        np.testing.assert_array_equal(found["random/theta"], expected)
+        assert (expected != thetas(task, 3, task.episodes, stream(EVALUATION, seed, f"{salt}x"))).all()
+
+
+class TestDrift:
+    """Where theta walks from episode to episode, each episode's labels and features are of its own theta."""
+
+    @pytest.fixture
+    def context(self) -> Context:
+        preset = replace(tiny_preset(), expert_trials=64, explore_trials=64, query_trials=64)
+        return Context(toys.Drift(), preset, [0], expert="tests.toys:control")
+
+    @staticmethod
+    def off(trials: Trials, action: Any, theta: Any) -> Any:
+        """Root mean square of actions less what the expert would do on average under theta [B, E, L], by episode."""
+        b, e, t = trials.mask.shape
+        mean = toys.control(
+            trials.obs[:, :, :-1].reshape(b * e * t, -1), np.repeat(theta.reshape(b * e, -1), t, 0)
+        ).reshape(b, e, t, 1)
+        inside = trials.mask[..., None] & (np.abs(mean) < 0.7)  # not clipped
+        return [np.sqrt(np.mean((action - mean)[:, i][inside[:, i]] ** 2)) for i in range(e)]
+
+    def test_labels_of_queries(self, context: Context, monkeypatch: pytest.MonkeyPatch) -> None:
+        kept: list[Rollout] = []
+        roll_out = context._roll_out
+
+        def keep(*given: Any) -> Rollout:
+            kept.append(roll_out(*given))
+            return kept[0]
+
+        monkeypatch.setattr(context, "_roll_out", keep)
+        trials, labels = context.query(None, context.rngs)
+        assert self.off(trials, labels, kept[0].theta) == pytest.approx([0.1, 0.1], abs=0.02)
+        assert self.off(trials, labels, kept[0].theta[:, ::-1])[1] > 0.15
+
+    def test_thetas_of_demonstrations(self, context: Context) -> None:
+        trials, theta = context.demonstrations, context.demonstrated_theta
+        assert self.off(trials, trials.action, theta) == pytest.approx([0.1, 0.1], abs=0.02)
+        assert self.off(trials, trials.action, theta[:, ::-1])[1] > 0.15
+
+    def test_thetas_of_explorations(self, context: Context) -> None:
+        """The force that the motion shows, whose noise is .125 a step, is the theta that is handed out."""
+        trials, theta = context.explore_with_theta(None, context.rngs)
+        velocity = trials.obs[..., 1]
+        force = (velocity[..., 1:] - 0.8 * velocity[..., :-1]) / 0.4 - trials.action[..., 0]
+        shown = [(force[:, e] - theta[:, e])[trials.mask[:, e]] for e in range(2)]
+        assert [np.sqrt(np.mean(x**2)) for x in shown] == pytest.approx([0.125, 0.125], abs=0.02)
+
+    def test_an_oracle_reads_the_theta_of_the_episode(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Trials whose action is their episode's theta: so is the feature beside every step that it clones."""
+        theta = np.random.default_rng(0).uniform(-1, 1, (6, 3, 1))
+        action = np.repeat(theta[:, :, None], 4, 2)
+        trials = Trials(np.random.default_rng(1).random((6, 3, 5, 2)), action, np.ones((6, 3, 4), bool))
+        seen: list[Any] = []
+        log_prob = cloning.ActionHead.log_prob
+
+        def spy(self: Any, features: Any, actions: Any) -> Any:
+            seen.append((features[..., -1], actions[..., 0]))
+            return log_prob(self, features, actions)
+
+        monkeypatch.setattr(cloning.ActionHead, "log_prob", spy)
+        cloning.train(trials, cloning.CloningConfig(8, 1, 256), np.random.default_rng(0), theta)
+        assert seen[0][0].unique().numel() == 18
+        np.testing.assert_array_equal(*seen[0])
+
+
+def test_a_later_episode_s_expert_acts_on_its_own_theta() -> None:
+    """As evaluation deploys it: what the expert does is of the theta that the roll-out reports."""
+    env = envs.BatchEnv(toys.Drift(), 64)
+    made = run_trials(env, ExpertAgent(env, CallableExpert(env.task, toys.control, "control")), 3, 1)
+    assert TestDrift.off(made.trials, made.trials.action, made.theta) == pytest.approx([0.1] * 3, abs=0.02)
