@@ -9,15 +9,20 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+LIBRARIES = ("torch", "mujoco", "gymnasium", "scipy.stats", "safetensors.numpy")
 
 
 class Fault(NamedTuple):
@@ -42,21 +47,36 @@ def plant(fault: Fault, tree: Path) -> str:
     return text
 
 
-def noticed(fault: Fault, tree: Path) -> str:
+def noticed(fault: Fault, tree: Path, tests: str = "") -> str:
     """The test that fails for the fault in a tree; empty if none does. The tree is put back as it was."""
-    text = plant(fault, tree)
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
-    environ = {**os.environ, "PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+    text, log = plant(fault, tree), tree.parent / f"{tree.name}.log"
     try:
-        ended = subprocess.run(
-            [*command, *fault.tests.split()], cwd=tree, env=environ, capture_output=True, text=True
-        )
+        child = os.fork()  # with the libraries that are imported already, which takes most of the time
+        if not child:
+            _run_tests(tree, log, shlex.split(tests or fault.tests))
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     finally:
         (tree / fault.file).write_text(text, encoding="utf-8")
-    failed = re.search(r"^FAILED (\S+::\S+)", ended.stdout, re.M)
-    if not failed and ended.returncode:  # a file that cannot be imported, say, is no test that tells what is wrong
-        raise SystemExit(f"{fault.name}: pytest ended with {ended.returncode}\n{ended.stdout}{ended.stderr}")
+    said = log.read_text(encoding="utf-8", errors="replace")
+    failed = re.search(r"^FAILED (\S+::.*?)(?: - |$)", said, re.M)
+    if not failed and code:  # a file that cannot be imported, say, is no test that tells what is wrong
+        raise SystemExit(f"{fault.name}: pytest ended with {code}\n{said}")
     return failed[1] if failed else ""
+
+
+def _run_tests(tree: Path, log: Path, tests: list[str]) -> NoReturn:
+    """Run tests in this process, which ends with pytest's code."""
+    code = 1
+    try:
+        os.chdir(tree)
+        for stream in (1, 2):
+            os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if stream == 1 else os.O_APPEND)), stream)
+        os.environ |= {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+        sys.path[0], sys.dont_write_bytecode = str(tree), True
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", *tests])
+    finally:
+        sys.stdout.flush()
+        os._exit(code)
 
 
 def copied(folder: Path) -> Path:
@@ -73,6 +93,8 @@ def main() -> None:
     """The command line."""
     chosen = [fault for fault in FAULTS if not sys.argv[1:] or any(word in fault.name for word in sys.argv[1:])]
     missed = 0
+    for library in LIBRARIES:
+        import_module(library)
     with tempfile.TemporaryDirectory(prefix="planted-") as scratch:
         tree = copied(Path(scratch))
         for fault in chosen:

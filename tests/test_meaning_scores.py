@@ -1,0 +1,200 @@
+"""Scores by what they mean: worked out again from the records, from returns, or from a simulation of what is claimed."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from deconfounded import envs
+from deconfounded.benchmarks import certify, score as score_command
+from deconfounded.benchmarks.engine import measure
+from deconfounded.benchmarks.engine.benchmark import evaluate
+from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.output import report, score, statistics
+from deconfounded.envs.streams import Array
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
+from tests import toys
+from tests.tools import tiny_preset
+
+ROOT = Path(__file__).parents[1]
+PUSH = toys.Push()
+EXPERT = CallableExpert(PUSH, toys.control, "control")
+
+
+class Late(Agent):
+    """Random in a trial's first episode, and the expert in those after."""
+
+    def __init__(self, env: envs.BatchEnv) -> None:
+        self.agents = RandomAgent(PUSH.action_space), ExpertAgent(env, EXPERT)
+
+    def begin(self, n: int) -> None:
+        self.episode = -1
+
+    def reset(self, rngs: Any) -> None:
+        self.episode += 1
+        for agent in self.agents:
+            agent.reset(rngs)
+
+    def act(self, obs: Any) -> Array:
+        return self.agents[self.episode > 0].act(obs)
+
+
+@pytest.mark.parametrize("salt", ["", "any text"])
+def test_evaluation_is_under_the_salt_s_thetas(salt: str) -> None:
+    context = Context(PUSH, tiny_preset(), [0, 1], expert="tests.toys:control")
+    found = evaluate(context, RandomAgent(PUSH.action_space), False, salt)[0]
+    np.testing.assert_array_equal(found["theta"], thetas(PUSH, 8, 2, [stream(EVALUATION, s, salt) for s in (0, 1)]))
+
+
+def test_a_kept_agent_s_score() -> None:
+    """0 is random actions, 1 the expert, over all episodes of the same thetas; the interval is of the last episode."""
+    env = envs.BatchEnv(PUSH, 64)
+    agents = {"late": Late(env), "expert": ExpertAgent(env, EXPERT), "random": RandomAgent(PUSH.action_space)}
+    # `rescore` steps environments of its own, whose theta an expert among the agents would have to see.
+    returns = {name: run_trials(env, agent, 2, 7).returns for name, agent in agents.items()}
+    zero, one = returns["random"].mean(), returns["expert"].mean()
+    found = score_command.rescore(agents["random"], PUSH, EXPERT, 64, 7, PUSH)
+    assert np.mean(found["score"]) == pytest.approx(0, abs=1e-4)
+    assert found["return"]["expert"] == pytest.approx(returns["expert"].mean(0), abs=1e-4)
+    replayed = Replayed(run_trials(env, agents["late"], 2, 7).trials.action)
+    found = score_command.rescore(replayed, PUSH, EXPERT, 64, 7, PUSH)
+    by_trial = (returns["late"] - zero) / (one - zero)
+    assert found["score"] == pytest.approx(by_trial.mean(0), abs=1e-4)
+    assert found["score"][0] < 0.3 < 0.8 < found["score"][1]
+    half = 1.96 * by_trial[:, 1].std() / 8
+    assert found["ci95_last"] == pytest.approx((by_trial[:, 1].mean() - half, by_trial[:, 1].mean() + half), abs=0.02)
+
+
+class Replayed(Agent):
+    """Actions [N, E, T, A] that were taken before, again."""
+
+    def __init__(self, action: Array) -> None:
+        self.action, self.episode = action, -1
+
+    def reset(self, rngs: Any) -> None:
+        self.episode, self.step = self.episode + 1, -1
+
+    def act(self, obs: Any) -> Array:
+        self.step += 1
+        return self.action[:, self.episode, self.step]
+
+
+def test_eq_1_is_over_the_steps_that_took_place() -> None:
+    """By hand, of episodes that end early: the log-density of the expert's normal noise of .1 about its mean."""
+    env = envs.BatchEnv(PUSH, 16)
+    trials, _, theta = run_trials(env, RandomAgent(PUSH.action_space), 2, 3)
+    found = measure.objective(EXPERT, trials, theta)
+    for b in range(16):
+        for e in range(2):
+            n = int(trials.mask[b, e].sum())
+            mean = toys.control(trials.obs[b, e, :n], np.tile(theta[b, e], (n, 1)))
+            by_hand = norm.logpdf(trials.action[b, e, :n], mean, 0.1).sum()
+            assert found[b, e] == pytest.approx(by_hand, rel=1e-4)
+
+
+def test_intervals_over_tasks_are_of_95_percent() -> None:
+    """Of the interquartile mean over two tasks of 20 seeds each: they hold what is true about as often, in 150 tries."""
+    rng, held = np.random.default_rng(1), []
+    for _ in range(150):
+        found = statistics.over_tasks(statistics.iqm, {name: rng.standard_normal(20) for name in "ab"})
+        assert found is not None
+        assert found.interval is not None
+        held.append(found.interval[0] <= 0 <= found.interval[1])
+    assert 0.89 < np.mean(held) < 0.98
+
+
+def last_of_records() -> dict[str, dict[str, tuple[float, float]]]:
+    """By task and method, the score in the last episode and the return there: from the lines of docs/records alone."""
+    found: dict[str, dict[str, tuple[float, float]]] = {}
+    for file in (ROOT / "docs" / "records").glob("*.jsonl"):
+        lines = [json.loads(line) for line in file.read_text().splitlines()]
+        newest = max(line["task_version"] for line in lines)
+        by_method: dict[str, list[Any]] = {}
+        for line in lines:
+            if line["task_version"] == newest and line["preset"] == "default" and not line["set"] and not line["salt"]:
+                name = f"{line['method']}_{line['deployment']}" if line["deployment"] else line["method"]
+                by_method.setdefault(name, []).append(line["returns"][: line["episodes"]])
+        zero, one = np.mean(by_method["random"]), np.mean(by_method["expert"])
+        last = {name: np.mean(returns, 0)[-1] for name, returns in by_method.items()}
+        found[file.stem] = {name: ((value - zero) / (one - zero), value) for name, value in last.items()}
+    return found
+
+
+def tables(page: Path) -> list[list[list[str]]]:
+    """The cells of each table of a page in Markdown, its head first."""
+    found = re.findall(r"(?:^\|.*\|\n)+", page.read_text(encoding="utf-8") + "\n", re.M)
+    return [[[x.strip() for x in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
+
+
+def test_a_number_in_readme_is_its_method_s() -> None:
+    """Each cell is the mean score of the task in its row, of the method over its column."""
+    expected, seen = last_of_records(), 0
+    (table,) = [table for table in tables(ROOT / "README.md") if "deconfounded (2)" in table[0]]
+    for row in table[2:]:
+        for name, cell in zip(table[0][2:-1], row[2:-1], strict=True):
+            if cell:
+                assert float(cell) == pytest.approx(expected[row[0]][name.split(" (")[0]][0], abs=0.0051), (row[0], name)
+                seen += 1
+    assert seen == 11 * len(expected)
+
+
+def test_a_number_in_results_is_its_method_s() -> None:
+    """Score and return of the last episode, best first."""
+    expected = last_of_records()
+    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    names = [name for name in re.findall(r"^## (\w+)$", text, re.M) if name in expected]
+    found = [table for table in tables(ROOT / "docs" / "results.md") if table[0][:2] == ["method", "tier"]]
+    assert len(names) == len(found) == len(expected)
+    for name, (head, _, *rows) in zip(names, found, strict=True):
+        assert {row[0] for row in rows} == set(expected[name])
+        for row in rows:
+            cells = dict(zip(head, row, strict=True))
+            last, value = expected[name][row[0]]
+            assert float(cells["last"]) == pytest.approx(last, abs=0.0051), (name, row[0])
+            assert float(cells["score of each episode"].split()[-1]) == float(cells["last"])
+            assert float(cells["return"].replace(",", "")) == pytest.approx(value, abs=0.051)
+        scores = [float(row[head.index("last")]) for row in rows]
+        assert scores == sorted(scores, reverse=True)
+
+
+def entry(first: float, last: float) -> dict[str, Any]:
+    """A method's part of results.json that scores `first` in the first episode and `last` in the second."""
+    return {
+        **{"method": "x", "deployment": "", "tier": "1", "budget": {}, "cpu_s": 1.0, "ci95": [last - 0.1, last + 0.1]},
+        **{"score": [first, last], "score_last": last, "theta_r2": [0.0, 0.5], "objective": [-9.0, -5.0]},
+        **{"return": [[10 * first, 10 * last], [10 * first, 10 * last]], "seeds": [0, 1], "band": None},
+    }
+
+
+def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
+    methods = {"bad": entry(0.9, 0.1), "best": entry(0.2, 0.8), "middle": entry(0.5, 0.5)}
+    rows = score.rows(methods)
+    assert [row[0] for row in rows] == ["best", "middle", "bad"]
+    best = dict(zip(score.COLUMNS, rows[0], strict=True))
+    assert (best["return"], best["last"], best["95% interval"], best["Eq. (1)"]) == ("8.0", "0.80", "0.70 to 0.90", "-5")
+    about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
+    about |= {"versions": dict.fromkeys(("python", "mujoco", "torch"), "1"), "eval_trials": 4, "episodes": 2}
+    text = report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
+    places = [re.search(rf"<td[^>]*>\s*(?:<[^>]*>\s*)*{name}\b", text).start() for name in ("best", "middle", "bad")]  # type: ignore[union-attr]
+    assert places == sorted(places)
+
+
+def test_a_certificate_asks_for_what_it_says() -> None:
+    """The thresholds that the certificates in docs/ were judged by, the pages name, and a task is certified by."""
+    required = {"blind_bc": "<= 0.7", "told_wrong_theta": "<= 0.65", "conditional_last": "<= 0.7"}
+    required["interventional_last"] = ">= 0.95"
+    assert {name: f"{relation} {bound}" for name, (relation, bound) in certify.THRESHOLDS.items()} == required
+    for file in (ROOT / "docs" / "certificates").glob("*.json"):
+        checks = json.loads(file.read_text())["checks"]
+        assert {name: check["required"] for name, check in checks.items()} == required
+        for check in checks.values():
+            relation, bound = check["required"].split()
+            holds = check["measured"] <= float(bound) if relation == "<=" else check["measured"] >= float(bound)
+            assert check["passed"] == holds
