@@ -1,0 +1,105 @@
+"""Records by what they claim: what they were made of decides whether they are kept, and they can be made again."""
+
+from __future__ import annotations
+
+import queue
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from deconfounded import envs
+from deconfounded.benchmarks import verify
+from deconfounded.benchmarks.engine import identity, progress, store
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+from deconfounded.benchmarks.engine.presets import changed, preset
+from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import table
+from deconfounded.experts import policy
+from tests.tools import tiny_preset
+
+CONTROL = "tilted_cartpole"
+
+
+def other_weights(folder: Path) -> str:
+    """A file with an expert's weights, one of them a little larger than the task's own."""
+    weights = load_file(policy.path(envs.get(CONTROL)))
+    weights["0.bias"] = weights["0.bias"] + np.float32(0.01)
+    save_file(weights, folder / "other.safetensors")
+    return str(folder / "other.safetensors")
+
+
+def test_an_identity_is_of_expert_salt_and_settings(tmp_path: Path) -> None:
+    """Each alone makes another one; the same weights under another name do not."""
+    job = BenchmarkJob(CONTROL, tiny_preset(), "naive_rnn", (0,), tmp_path)
+    shutil.copy(policy.path(envs.get(CONTROL)), tmp_path / "same.safetensors")
+    own = identity.identity(job)
+    named = identity.identity(replace(job, expert=str(tmp_path / "same.safetensors")))
+    assert named["expert"] == own["expert"]
+    for other in (
+        replace(job, expert=other_weights(tmp_path)),
+        replace(job, salt="salt"),
+        replace(job, preset=job.preset.configured("naive_rnn", updates=9)),
+        replace(job, preset=replace(job.preset, eval_trials=5)),
+    ):
+        assert identity.identity(other) != own
+        data = identity.demonstrations(envs.get(CONTROL), other.expert, 4, 0)
+        assert (data != identity.demonstrations(envs.get(CONTROL), None, 4, 0)) == (other.expert is not None)
+
+
+def test_a_file_of_other_settings_expert_or_salt_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a job left is believed by the same job alone."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob(CONTROL, replace(tiny_preset(), eval_trials=2), "blind_bc", (0,), tmp_path)
+    job.run()
+    assert job.load(0) is not None
+    assert replace(job, salt="salt").load(0) is None
+    assert replace(job, expert=other_weights(tmp_path)).load(0) is None
+    assert replace(job, preset=job.preset.configured("blind_bc", updates=4)).load(0) is None
+
+
+@pytest.mark.parametrize("key", ["settings", "versions", "expert", "salt", "preset", "set", "task_version"])
+def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -> None:
+    described = {**dict.fromkeys(("settings", "versions", "expert", "salt", "preset", "set", "task_version"), "a")}
+    store.prepare(tmp_path, described, resume=False)
+    store.prepare(tmp_path, described, resume=True)
+    with pytest.raises(envs.InputError, match=f"holds a run that differs in its {key}"):
+        store.prepare(tmp_path, {**described, key: "b"}, resume=True)
+
+
+def test_a_salted_record_is_verified_under_its_salt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the bit; a record that says another salt is not the same, and neither is one whose returns are off a little."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    task, changes = envs.get("bandit"), ["eval_trials=4"]
+    settings = changed(preset("smoke", task, "cpu", ["random"]), changes)
+    job = BenchmarkJob("bandit", settings, "random", (1,), tmp_path, salt="any text")
+    job.run()
+    data = job.load(1)
+    assert data is not None
+    (record,) = records.of_job(data, "smoke", changes, 1)
+    assert record["salt"] == "any text"
+    again = verify.rerun(record, task, "random", None, "cpu")
+    assert verify.verdict(record, again)[0] == "same bits"
+    off = {**record, "returns": [record["returns"][0] + 1e-6], "bits": records.bits(data["random/returns"] + 1e-6)}
+    assert verify.verdict(off, again)[0] != "same bits"
+
+
+def test_what_the_table_lacks_is_of_today_s_settings_and_expert(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A record of other settings, of another expert, or of a salt, fills no place."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("bandit", replace(tiny_preset(), eval_trials=2), "blind_bc", (0,), tmp_path)
+    job.run()
+    data = job.load(0)
+    assert data is not None
+    (record,) = records.of_job(data, "smoke", [], 1)
+    assert table.missing(job, "smoke", [record]) == ()
+    config = {**record["settings"]["config"], "updates": 99}
+    for change in ({"settings": {**record["settings"], "config": config}}, {"expert": "0" * 64}, {"salt": "salt"}):
+        assert table.missing(job, "smoke", [{**record, **change}]) == (0,)
