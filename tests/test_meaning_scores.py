@@ -12,11 +12,15 @@ import pytest
 from scipy.stats import norm
 
 from deconfounded import envs
-from deconfounded.benchmarks import certify, score as score_command
+from deconfounded.benchmarks import certify
+from deconfounded.benchmarks import score as score_command
 from deconfounded.benchmarks.engine import measure
 from deconfounded.benchmarks.engine.benchmark import evaluate
+from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.output import report, score, statistics
+from deconfounded.benchmarks.output import records, report, score, statistics
+from deconfounded.benchmarks.output.index import Found
+from deconfounded.benchmarks.studies import results
 from deconfounded.envs.streams import Array
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
@@ -127,41 +131,54 @@ def last_of_records() -> dict[str, dict[str, tuple[float, float]]]:
     return found
 
 
-def tables(page: Path) -> list[list[list[str]]]:
+def tables(text: str) -> list[list[list[str]]]:
     """The cells of each table of a page in Markdown, its head first."""
-    found = re.findall(r"(?:^\|.*\|\n)+", page.read_text(encoding="utf-8") + "\n", re.M)
+    found = re.findall(r"(?:^\|.*\|\n)+", text + "\n", re.M)
     return [[[x.strip() for x in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
 
 
-def test_a_number_in_readme_is_its_method_s() -> None:
-    """Each cell is the mean score of the task in its row, of the method over its column."""
+@pytest.fixture(scope="module")
+def some() -> Found:
+    """Two tasks as the pages are made of them today."""
+    tasks = [envs.get(name) for name in ("swapped_lander", "curling")]
+    kept = [records.of_task(ROOT / "docs" / "records", task.name) for task in tasks]
+    return [(task, records.gather(of, list(METHODS))) for task, of in zip(tasks, kept, strict=True)]
+
+
+def test_a_number_in_readme_is_its_method_s(some: Found) -> None:
+    """Each cell is the mean score of the task in its row, of the method over its column: on the page, and made anew."""
     expected, seen = last_of_records(), 0
-    (table,) = [table for table in tables(ROOT / "README.md") if "deconfounded (2)" in table[0]]
-    for row in table[2:]:
-        for name, cell in zip(table[0][2:-1], row[2:-1], strict=True):
-            if cell:
-                assert float(cell) == pytest.approx(expected[row[0]][name.split(" (")[0]][0], abs=0.0051), (row[0], name)
+    for text in ((ROOT / "README.md").read_text(encoding="utf-8"), results.summary(some)):
+        (table,) = [table for table in tables(text) if "deconfounded (2)" in table[0]]
+        for row in table[2:]:
+            for name, cell in zip(table[0][2:-1], row[2:-1], strict=True):
+                right = expected[row[0]][name.split(" (")[0]][0]
+                assert float(cell) == pytest.approx(right, abs=0.0051), (row[0], name)
                 seen += 1
-    assert seen == 11 * len(expected)
+    assert seen == 11 * (len(expected) + 2)
 
 
-def test_a_number_in_results_is_its_method_s() -> None:
-    """Score and return of the last episode, best first."""
-    expected = last_of_records()
-    text = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
-    names = [name for name in re.findall(r"^## (\w+)$", text, re.M) if name in expected]
-    found = [table for table in tables(ROOT / "docs" / "results.md") if table[0][:2] == ["method", "tier"]]
-    assert len(names) == len(found) == len(expected)
-    for name, (head, _, *rows) in zip(names, found, strict=True):
+def test_a_number_in_results_is_its_method_s(some: Found) -> None:
+    """Score and return of the last episode, best first: on the page, and made anew."""
+    expected, seen = last_of_records(), 0
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+    parts = [*re.split(r"^(?=## )", page, flags=re.M), *(results.section(*one) for one in some)]
+    for part in parts:
+        name = part.partition("\n")[0].removeprefix("## ")
+        if name not in expected:
+            continue
+        seen += 1
+        head, _, *rows = tables(part)[0]
         assert {row[0] for row in rows} == set(expected[name])
         for row in rows:
             cells = dict(zip(head, row, strict=True))
             last, value = expected[name][row[0]]
             assert float(cells["last"]) == pytest.approx(last, abs=0.0051), (name, row[0])
-            assert float(cells["score of each episode"].split()[-1]) == float(cells["last"])
+            assert cells["score of each episode"].split()[-1] == cells["last"]
             assert float(cells["return"].replace(",", "")) == pytest.approx(value, abs=0.051)
         scores = [float(row[head.index("last")]) for row in rows]
         assert scores == sorted(scores, reverse=True)
+    assert seen == len(expected) + 2
 
 
 def entry(first: float, last: float) -> dict[str, Any]:

@@ -355,10 +355,11 @@ class TestFiles:
         for write in (lambda: write_json(file, {"x": "y" * 1000}), lambda: save_figure(figure, file, 50)):
             resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
             try:
-                with pytest.raises(SystemExit):
+                with pytest.raises(SystemExit) as ended:
                     run_command(write)
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            assert ended.value.code == 2
             assert capsys.readouterr().err == f"error: {file}: File too large\n"
             assert [one.name for one in tmp_path.iterdir()] == ["kept.json"]
             assert file.read_text() == "{}"

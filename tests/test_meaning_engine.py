@@ -1,0 +1,89 @@
+"""The engine and commands by what they claim: done is what is done, and an exit code of 0 says that all went well."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import certify
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine import jobs, progress, scheduler
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine.local import Local
+from tests.tools import tiny_preset
+
+
+class Killed(jobs.Job):
+    """Its worker is killed, as by a system that is out of memory."""
+
+    def run(self) -> str:
+        os.kill(os.getpid(), signal.SIGKILL)
+        return "not to be said"
+
+
+def test_a_killed_worker_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line, and exit code 2; nothing is said of the job, and none of it counts as done."""
+    job = Killed("bandit", tiny_preset(), "random", (0,), tmp_path)
+    with pytest.raises(SystemExit) as ended, Local() as engine:
+        run_command(lambda: scheduler.run_jobs([job], "killed", engine.run))
+    assert ended.value.code == 2
+    said = capsys.readouterr()
+    assert said.err == "error: a worker process was killed (out of memory?); --resume goes on\n"
+    assert "random, seed 0" not in said.out
+
+
+@pytest.mark.parametrize(("verdict", "code"), [("passed", 0), ("failed", 1)])
+def test_a_certificate_s_exit_code(
+    verdict: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = {
+        **{"task": "bandit", "verdict": verdict, "inferability": [{}]},
+        **{"checks": {"blind_bc": {"measured": 0.9, "required": "<= 0.7", "passed": verdict == "passed"}}},
+        **{"evidence_nats_per_step": {"dynamics": 1.0, "actions": 1.0}},
+    }
+    monkeypatch.setattr(certify, "certify", lambda *_, **__: result)
+    monkeypatch.setattr(certify, "picture", lambda *_: None)
+    monkeypatch.setattr("sys.argv", ["certify", "--task", "bandit", "--out", str(tmp_path)])
+    ended: Any = 0
+    try:
+        run_command(certify.main)
+    except SystemExit as error:
+        ended = error.code
+    assert ended == code
+    assert f"certificate {verdict}" in capsys.readouterr().out
+
+
+def test_a_checkpoint_is_of_its_own_job_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another salt, expert, or amount begins anew; when a job is done its checkpoint is gone, and others' are swept."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
+    job = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", (0,), tmp_path)
+    begun = CurveMonitor(job, 0.8)
+    begun.save(lambda: {"done": 3})
+    for other in (replace(job, salt="x"), replace(job, preset=replace(job.preset, expert_trials=5))):
+        assert CurveMonitor(other, 0.8).load() is None
+    assert CurveMonitor(job, 0.8).load() == {"done": 3}
+    begun.close()
+    assert CurveMonitor(job, 0.8).load() is None
+
+
+def test_a_failed_job_is_an_error_when_others_are_done(tmp_path: Path) -> None:
+    """They are told of, and then it is raised."""
+    said: list[str] = []
+    made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in ("random", "expert")]
+
+    def run(every: Any, tick: Any, say: Any) -> None:
+        for job, became in zip(every, (envs.InputError("it broke"), "all well"), strict=True):
+            say(job, became)
+            said.append(job.method)
+
+    with pytest.raises(envs.InputError, match="it broke"):
+        scheduler.run_jobs(made, "two", run)
+    assert said == ["random", "expert"]

@@ -1,0 +1,154 @@
+"""Learning by what it means: padding is read by nobody, gradients are clipped, exploration is what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.nets import Adam, Linear, Scaler, scalers
+from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.methods import rma
+from deconfounded.deconf.methods.dagger import DaggerAgent
+from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explorer
+from deconfounded.deconf.methods.naive_obs import ObsAgent
+from deconfounded.deconf.methods.naive_transformer import TransformerAgent
+from deconfounded.deconf.methods.recurrent import RecurrentAgent
+
+FLAT = Signature(obs=2, action=1, actions=0, binary=False)
+
+
+def draws() -> Draws:
+    return Draws([np.random.default_rng(i) for i in range(2)], "cpu")
+
+
+@pytest.fixture
+def batch() -> Batch:
+    """Trials of two seeds, 4 of up to 9 steps, that ended after 9, 6, 6 and 2."""
+    random = draws()
+    obs = random.normal(4, 10, 2)
+    ends = torch.tensor([9, 6, 6, 2])
+    mask = (torch.arange(9) < ends[:, None]).float().expand(2, 4, 9)
+    return Batch(obs[:, :, :-1], 2 * random.uniform(4, 9, 1) - 1, obs[:, :, 1:], mask)
+
+
+def poisoned(batch: Batch) -> Batch:
+    """The same trials, with other numbers in their padding."""
+    over = batch.mask[..., None] == 0
+    filled = (x.masked_fill(over, value) for x, value in zip(batch.tensors[:3], (50.0, 0.7, -30.0), strict=True))
+    return Batch(*filled, batch.mask)
+
+
+def test_scalers_read_no_padding(batch: Batch) -> None:
+    """Mean and deviation are those of the steps that took place, by hand."""
+    for one, data in zip(scalers(poisoned(batch)), (batch.obs, batch.next_obs - batch.obs), strict=True):
+        for seed in range(2):
+            rows = data[seed][batch.mask[seed] == 1]
+            torch.testing.assert_close(one.mean[seed], rows.mean(0))
+            torch.testing.assert_close(one.std[seed], rows.std(0, correction=0))
+
+
+def test_a_masked_mean_is_over_what_counts() -> None:
+    assert masked_mean(torch.tensor([1.0, 3.0, 50.0]), torch.tensor([1.0, 1.0, 0.0])).item() == 2
+    assert masked_mean(torch.tensor([50.0]), torch.tensor([0.0])).item() == 0
+
+
+def test_steps_are_drawn_from_those_that_took_place(batch: Batch) -> None:
+    """Each of the 23 about as often: 20,000 draws, five standard errors."""
+    index = batch.draw_steps(20_000, draws())
+    assert batch.steps(index).mask.all()
+    counts = torch.stack([torch.bincount(one, minlength=36) for one in index])[batch.mask.flatten(1) == 1]
+    expected = 20_000 / 23
+    assert (counts - expected).abs().max() < 5 * expected**0.5
+
+
+Loss = Callable[[Batch], Tensor]
+
+
+def losses(batch: Batch) -> dict[str, Loss]:
+    """What each agent and model is trained to make small, without random numbers of one call in another."""
+    obs, change = scalers(batch)
+    shape = {"width": 16, "layers": 1, "heads": 2, "window": 9}
+    recurrent, blind = RecurrentAgent.new(8, FLAT, obs, draws()), ObsAgent.new(8, FLAT, obs, draws())
+    transformer = TransformerAgent.new(shape, FLAT, obs, draws())
+    dagger = DaggerAgent.new(16, 3, False, FLAT, obs, change, draws())
+    adapter = rma.Adapter(8, 1, FLAT, obs, draws())
+    student = rma.RmaAgent(adapter, recurrent.policy, obs)
+    found: dict[str, Loss] = {
+        "naive_rnn": lambda given: recurrent.loss(given, given.action, recurrent.memory.start(4))[0],
+        "naive_obs": lambda given: blind.loss(given, given.action, blind.memory.start(4))[0],
+        "naive_transformer": lambda given: transformer.held_out_loss(given),
+        "dagger": lambda given: dagger.loss(given, given.action, None, draws()),
+        "rma": lambda given: student.loss(given, torch.ones_like(given.action), adapter.start(4))[0],
+    }
+    for kind in ("evidence", "gru", "discrete"):
+        model = new_model(kind, 3, 16, FLAT, obs, change, draws()).eval()
+        agent = DeconfoundedAgent.new(kind, 3, 16, FLAT, obs, change, draws())
+        belief = agent.model.belief(agent.model.last(batch)).detach()
+        found[f"{kind} model"] = lambda given, model=model: model.loss(given, None, 0.1, draws())  # type: ignore[misc]
+        found[f"{kind} policy"] = lambda given, agent=agent, belief=belief: agent.loss(given, belief, None, draws())  # type: ignore[misc]
+        found[f"{kind} memory"] = lambda given, model=model: model.last(given).flatten()  # type: ignore[misc]
+    return found
+
+
+def test_losses_and_memories_read_no_padding(batch: Batch) -> None:
+    """They are what they are with other numbers in it, and not what they are with another last step."""
+    other = Batch(*(x.clone() for x in batch.tensors))
+    other.next_obs[:, 0, 8] += 1
+    other.action[:, 0, 8] *= -1
+    for name, loss in losses(batch).items():
+        torch.testing.assert_close(loss(poisoned(batch)), loss(batch), rtol=1e-5, atol=1e-6, msg=name)
+        if name != "rma":  # whose last step moves nothing that it has to tell
+            assert not torch.allclose(loss(other), loss(batch), rtol=1e-5, atol=1e-6), name
+
+
+@pytest.mark.parametrize(("size", "right"), [(1e3, 1.0), (1e-3, None)])
+def test_gradients_are_clipped_seed_by_seed(size: float, right: float | None) -> None:
+    """To norm 1, of all parameters together; small ones are left as they are, and so is a small one beside a large."""
+    layers = [Linear(3, 2, draws()), Linear(2, 1, draws())]
+    optimizer = Adam(layers, 1e-3)
+    x = draws().normal(5, 3)
+    loss = layers[1](layers[0](x)).flatten(1).mean(1) * torch.tensor([size, 1e-3])
+    expected = torch.autograd.grad(loss.sum(), optimizer.parameters)
+    optimizer.step(layers[1](layers[0](x)).flatten(1).mean(1) * torch.tensor([size, 1e-3]))
+    norms, before = (
+        torch.sqrt(sum(g.flatten(1).square().sum(1) for g in grads))  # type: ignore[arg-type]
+        for grads in ([p.grad for p in optimizer.parameters], expected)
+    )
+    assert before[1] < 0.1
+    torch.testing.assert_close(norms[1], before[1])
+    torch.testing.assert_close(norms[0], before[0] if right is None else torch.tensor(right), rtol=1e-4, atol=1e-6)
+
+
+class TestExploration:
+    def explorer(self, share: float) -> Explorer:
+        """Of 8 trials for each of two seeds; its policy is sure, and its latents of expert trials are 7."""
+        obs = Scaler(draws().normal(4, 3, 2), torch.ones(2, 4, 3))
+        agent = DeconfoundedAgent.new("evidence", 3, 16, FLAT, obs, obs, draws())
+        made = Explorer(agent, torch.full((2, 4, 3), 7.0), share)
+        made.begin(16)
+        made.reset([np.random.default_rng(i) for i in range(2)])
+        return made
+
+    def test_every_other_trial_is_blind_to_its_history(self) -> None:
+        """Its latent is one of expert trials for an episode; in the others it is drawn from the belief."""
+        latent = self.explorer(0.1).latent()
+        assert (latent[:, ::2] == 7).all()
+        assert (latent[:, 1::2] != 7).all()
+
+    def test_a_share_of_actions_is_random(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of a policy that always says .5: as many others as asked for, uniform in [-1, 1]."""
+        for share in (0.0, 0.3, 1.0):
+            explorer = self.explorer(share)
+            monkeypatch.setattr(explorer.policy, "sample", lambda features, _: torch.full((2, 8, 1), 0.5))
+            acted = np.stack([explorer.act(np.zeros((16, 2), np.float32)) for _ in range(100)])
+            random = acted != 0.5
+            assert random.mean() == pytest.approx(share, abs=0.05)
+            if share:
+                assert acted[random].mean() == pytest.approx(0, abs=0.12)
+                assert acted[random].std() == pytest.approx(3**-0.5, abs=0.05)
