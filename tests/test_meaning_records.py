@@ -24,12 +24,12 @@ from tests.tools import tiny_preset
 CONTROL = "tilted_cartpole"
 
 
-def other_weights(folder: Path) -> str:
-    """A file with an expert's weights, one of them a little larger than the task's own."""
+def other_weights(folder: Path, more: float = 0.01) -> str:
+    """A file with an expert's weights, some of them a little larger than the task's own."""
     weights = load_file(policy.path(envs.get(CONTROL)))
-    weights["0.bias"] = weights["0.bias"] + np.float32(0.01)
-    save_file(weights, folder / "other.safetensors")
-    return str(folder / "other.safetensors")
+    weights["0.bias"] = weights["0.bias"] + np.float32(more)
+    save_file(weights, folder / f"other{more}.safetensors")
+    return str(folder / f"other{more}.safetensors")
 
 
 def test_an_identity_is_of_expert_salt_and_settings(tmp_path: Path) -> None:
@@ -39,6 +39,8 @@ def test_an_identity_is_of_expert_salt_and_settings(tmp_path: Path) -> None:
     own = identity.identity(job)
     named = identity.identity(replace(job, expert=str(tmp_path / "same.safetensors")))
     assert named["expert"] == own["expert"]
+    one, another = (identity.identity(replace(job, expert=other_weights(tmp_path, more))) for more in (0.01, 0.02))
+    assert len({own["expert"], one["expert"], another["expert"]}) == 3
     for other in (
         replace(job, expert=other_weights(tmp_path)),
         replace(job, salt="salt"),

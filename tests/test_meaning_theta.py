@@ -56,7 +56,7 @@ def test_padding_of_trials_tells_nothing() -> None:
 def test_episodes_of_a_data_set_hold_no_theta(tmp_path: Path) -> None:
     """Infos are empty; theta is in the metadata, for scoring, and nowhere else."""
     minari = pytest.importorskip("minari")
-    task = envs.get("tilted_cartpole")
+    task = envs.get("rolling_deck")
     collected = datasets.collect(task, 2, lambda env: RandomAgent(task.action_space), 5)
     place = datasets.write(tmp_path, task, "random", collected, "random", (0.0, 1.0))
     trials, theta, _ = collected
