@@ -10,15 +10,17 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
-from deconfounded.deconf.core.models import new as new_model
+from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.nets import Adam, Linear, Scaler, scalers
 from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.methods import dagger as dagger_method
 from deconfounded.deconf.methods import rma
 from deconfounded.deconf.methods.dagger import DaggerAgent
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explorer
 from deconfounded.deconf.methods.naive_obs import ObsAgent
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
-from deconfounded.deconf.methods.recurrent import RecurrentAgent
+from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
+from deconfounded.experts.rollout import Trials
 
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 
@@ -152,3 +154,36 @@ class TestExploration:
             if share:
                 assert acted[random].mean() == pytest.approx(0, abs=0.12)
                 assert acted[random].std() == pytest.approx(3**-0.5, abs=0.05)
+
+
+def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
+    """The rate is half in the middle, and 0 after the last update."""
+    layer = Linear(2, 1, draws())
+    optimizer, rates = Adam([layer], 0.1, 10), []
+    for _ in range(10):
+        optimizer.step(layer(torch.ones(2, 3, 2)).flatten(1).mean(1))
+        rates.append(optimizer.state_dict()["adam"]["param_groups"][0]["lr"])
+    assert rates[4] == pytest.approx(0.05)
+    assert rates[-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_dagger_learns_what_the_expert_would_have_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Roll-outs whose actions are .5, and labels of -.5: the loss is of the labels, the memory's evidence of the actions."""
+    seen: list[tuple[Tensor, Tensor]] = []
+    loss = DaggerAgent.loss
+
+    def spy(self: DaggerAgent, given: Batch, label: Tensor, *rest: object) -> Tensor:
+        seen.append((given.action, label))
+        return loss(self, given, label, *rest)  # type: ignore[arg-type]
+
+    def query(behaviour: object) -> tuple[Trials, np.ndarray]:
+        obs = np.random.default_rng(0).random((8, 1, 6, 2))
+        trials = Trials(obs, np.full((8, 1, 5, 1), 0.5), np.ones((8, 1, 5), bool))
+        return trials, -trials.action
+
+    monkeypatch.setattr(DaggerAgent, "loss", spy)
+    dagger_method.train(
+        query, dagger_method.DaggerConfig(16, 3, rounds=2, updates=2, batch=4), [np.random.default_rng(0)]
+    )
+    assert len(seen) == 2
+    assert all((action == 0.5).all() and (label == -0.5).all() for action, label in seen)

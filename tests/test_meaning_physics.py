@@ -181,3 +181,13 @@ def test_actions_are_weighed_by_what_was_seen_before_them(conditional: bool) -> 
             told[:, k] += expert.log_prob(obs, action, thetas)
     told -= np.logaddexp.reduce(told, -1, keepdims=True)
     np.testing.assert_allclose(agent.log_belief, told, atol=1e-6)
+
+
+@pytest.mark.parametrize("distribution", ["uniform", "loguniform"])
+def test_a_grid_is_of_mid_quantiles(distribution: Any) -> None:
+    """As far from one end as from the other, in quantiles, with equal steps between them."""
+    latent = envs.Latent("x", "", 0.5, 8.0, distribution)
+    quantiles = latent.cdf(latent.grid(5))
+    np.testing.assert_allclose(quantiles, [0.1, 0.3, 0.5, 0.7, 0.9])
+    by_hand = 0.5 * 16**quantiles if distribution == "loguniform" else 0.5 + 7.5 * quantiles
+    np.testing.assert_allclose(latent.grid(5), by_hand)

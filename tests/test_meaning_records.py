@@ -15,10 +15,13 @@ from deconfounded import envs
 from deconfounded.benchmarks import verify
 from deconfounded.benchmarks.engine import identity, progress, store
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.jobs import JobMonitor
 from deconfounded.benchmarks.engine.presets import changed, preset
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table
 from deconfounded.experts import policy
+from tests import toys
 from tests.tools import tiny_preset
 
 CONTROL = "tilted_cartpole"
@@ -52,9 +55,7 @@ def test_an_identity_is_of_expert_salt_and_settings(tmp_path: Path) -> None:
         assert (data != identity.demonstrations(envs.get(CONTROL), None, 4, 0)) == (other.expert is not None)
 
 
-def test_a_file_of_other_settings_expert_or_salt_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_of_other_settings_expert_or_salt_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a job left is believed by the same job alone."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     job = BenchmarkJob(CONTROL, replace(tiny_preset(), eval_trials=2), "blind_bc", (0,), tmp_path)
@@ -105,3 +106,39 @@ def test_what_the_table_lacks_is_of_today_s_settings_and_expert(
     config = {**record["settings"]["config"], "updates": 99}
     for change in ({"settings": {**record["settings"], "config": config}}, {"expert": "0" * 64}, {"salt": "salt"}):
         assert table.missing(job, "smoke", [{**record, **change}]) == (0,)
+
+
+def test_a_record_is_by_episode_over_trials() -> None:
+    """Mean and deviation of each episode's returns over trials, and the mean of Eq. (1)."""
+    returns = np.array([[1.0, 10.0, 100.0], [3.0, 10.0, 104.0]])
+    made = {"task": "bandit", "method": "x", "settings": {}, "versions": {}, "outside": {}, "salt": ""}
+    made |= dict.fromkeys(("task_version", "method_version", "protocol", "expert_version"), 0) | {"expert": "e"}
+    meta = {"identity": made, "agents": {"x": ""}, "curve": {}, "seed": 4, "tier": "1", "budget": {}, "cpu_s": 1.0}
+    meta |= {"spans": [[0.0, 1.0]], "commit": None, "machine": "m"}
+    data = {"meta": meta, "x/returns": returns, "x/objective": -returns, "x/probe": np.array([0.5, 0.6, 0.7])}
+    (record,) = records.of_job(data, "smoke", [], 3)
+    assert (record["returns"], record["returns_sd"]) == ([2.0, 10.0, 102.0], [1.0, 0.0, 2.0])
+    assert (record["objective"], record["theta_r2"]) == ([-2.0, -10.0, -102.0], [0.5, 0.6, 0.7])
+    assert (record["eval_trials"], record["episodes"], record["seed"]) == (2, 3, 4)
+
+
+class TestBudget:
+    """What a seed used is counted once each time, of the steps that took place, and CPU seconds are shared by seeds."""
+
+    def test_queries(self) -> None:
+        context = Context(toys.Push(), tiny_preset(), [0, 1], expert="tests.toys:control")
+        for times in (1, 2):
+            trials, _ = context.query(None, context.rngs)
+            assert context.monitor.budget["exploration_trials"] == [4 * times] * 2
+        steps = trials.mask.reshape(2, -1).sum(1)  # the same each time, as the generators are
+        assert context.monitor.budget["queries"] == (2 * steps).tolist()
+        assert steps.sum() < trials.mask.size
+
+    def test_cpu_seconds(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        monkeypatch.setattr(JobMonitor, "cpu", lambda self: 8.0)
+        job = BenchmarkJob("bandit", replace(tiny_preset(), eval_trials=2), "blind_bc", (0, 1), tmp_path)
+        job.run()
+        data = job.load(1)
+        assert data is not None
+        assert data["meta"]["cpu_s"] == 4.0

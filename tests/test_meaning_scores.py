@@ -14,8 +14,8 @@ from scipy.stats import norm
 from deconfounded import envs
 from deconfounded.benchmarks import certify
 from deconfounded.benchmarks import score as score_command
-from deconfounded.benchmarks.engine import measure
-from deconfounded.benchmarks.engine.benchmark import evaluate
+from deconfounded.benchmarks.engine import benchmark
+from deconfounded.benchmarks.engine.benchmark import evaluate, objective
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.output import records, report, score, statistics
@@ -94,7 +94,7 @@ def test_eq_1_is_over_the_steps_that_took_place() -> None:
     """By hand, of episodes that end early: the log-density of the expert's normal noise of .1 about its mean."""
     env = envs.BatchEnv(PUSH, 16)
     trials, _, theta = run_trials(env, RandomAgent(PUSH.action_space), 2, 3)
-    found = measure.objective(EXPERT, trials, theta)
+    found = objective(EXPERT, trials, theta)
     for b in range(16):
         for e in range(2):
             n = int(trials.mask[b, e].sum())
@@ -195,7 +195,12 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     rows = score.rows(methods)
     assert [row[0] for row in rows] == ["best", "middle", "bad"]
     best = dict(zip(score.COLUMNS, rows[0], strict=True))
-    assert (best["return"], best["last"], best["95% interval"], best["Eq. (1)"]) == ("8.0", "0.80", "0.70 to 0.90", "-5")
+    assert (best["return"], best["last"], best["95% interval"], best["Eq. (1)"]) == (
+        "8.0",
+        "0.80",
+        "0.70 to 0.90",
+        "-5",
+    )
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
     about |= {"versions": dict.fromkeys(("python", "mujoco", "torch"), "1"), "eval_trials": 4, "episodes": 2}
     text = report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
@@ -215,3 +220,72 @@ def test_a_certificate_asks_for_what_it_says() -> None:
             relation, bound = check["required"].split()
             holds = check["measured"] <= float(bound) if relation == "<=" else check["measured"] >= float(bound)
             assert check["passed"] == holds
+
+
+def record(method: str, returns: list[float]) -> dict[str, Any]:
+    """Of one seed, as far as scores go."""
+    return {
+        **{"seed": 0, "returns": returns, "objective": returns, "theta_r2": returns, "budget": {}, "cpu_s": 1.0},
+        **{"tier": "1", "method_version": 1, "method": method, "deployment": ""},
+    }
+
+
+def test_episodes_beyond_training_move_no_score() -> None:
+    """Zero, one, the score and its interval are of the two episodes trained on; those beyond are told apart."""
+    seeds = {"random": [0.0, 0.0, 9.0, 9.0], "expert": [10.0, 10.0, 50.0, 50.0]}
+    by_method = {name: [record(name, returns)] * 2 for name, returns in seeds.items()}
+    by_method["other"] = [record("other", [2.0, 4.0, 30.0, 40.0]), record("other", [2.0, 6.0, 30.0, 40.0])]
+    found = score.summarise(by_method, 2)["other"]
+    assert (found["score"], found["score_last"], found["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
+    assert found["ci95"] == pytest.approx([0.4, 0.6])
+
+
+def test_rows_csv_is_row_by_row_what_came_of_it() -> None:
+    """Theta, return, score and Eq. (1) of each trial and episode, which count from 0 and from 1."""
+    task, returns = toys.Drift(), np.array([[5.0, 10.0], [0.0, 2.5]])
+    theta, objective_ = np.array([[[0.1], [0.2]], [[0.3], [0.4]]]), np.array([[-1.0, -2.0], [-3.0, -4.0]])
+    data = {"meta": {"agents": {"x": ""}}, "x/returns": returns, "x/objective": objective_, "x/theta": theta}
+    about = {"methods": {"random": {"return": [[0.0]]}, "expert": {"return": [[10.0]]}}}
+    lines = score.csv_rows(task, about, [("x", 7, data)]).splitlines()
+    assert lines[0] == "method,seed,trial,force,episode,return,score,objective"
+    assert lines[1:] == [
+        *("x,7,0,0.1,1,5.0,0.5,-1.0", "x,7,0,0.2,2,10.0,1.0,-2.0"),
+        *("x,7,1,0.3,1,0.0,0.0,-3.0", "x,7,1,0.4,2,2.5,0.25,-4.0"),
+    ]
+
+
+class Remembering(RandomAgent):
+    """Its features are one array, which it overwrites in every episode."""
+
+    def begin(self, n: int) -> None:
+        self.memory = np.full((n, 1), -1.0, np.float32)
+
+    def reset(self, rngs: Any) -> None:
+        super().reset(rngs)
+        self.memory += 1
+
+    def features(self) -> Any:
+        return self.memory
+
+
+def test_features_are_kept_as_they_were_when_overwritten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After each of twice as many episodes as a trial of training has, if the agent has learned."""
+    seen: list[Any] = []
+    monkeypatch.setattr(benchmark, "probe", lambda features, theta: (seen.append(features[0, 0]), (0.0, None))[1])
+    context = Context(PUSH, tiny_preset(), [0], expert="tests.toys:control")
+    found = evaluate(context, Remembering(PUSH.action_space), True)[0]
+    assert seen == [0, 1, 2, 3]
+    assert found["returns"].shape == found["objective"].shape == found["theta"].shape[:2] == (4, 4)
+
+
+def test_learned_agents_are_scored_for_twice_the_episodes() -> None:
+    context = Context(PUSH, tiny_preset(), [0], expert="tests.toys:control")
+    episodes = [evaluate(context, RandomAgent(PUSH.action_space), x)[0]["returns"].shape[1] for x in (False, True)]
+    assert episodes == [2, 4]
+
+
+def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
+    """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1."""
+    scores = certify.stakes(PUSH, EXPERT, 32)[1]
+    assert np.diag(scores) == pytest.approx(1)
+    assert max(scores[0, -1], scores[-1, 0]) < 0.8

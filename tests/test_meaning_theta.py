@@ -16,7 +16,7 @@ from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.method import USES
-from deconfounded.deconf.methods import cloning
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.contract.probe import far_thetas
 from deconfounded.experts import datasets
 from deconfounded.experts.policy import CallableExpert
@@ -148,14 +148,14 @@ class TestDrift:
         action = np.repeat(theta[:, :, None], 4, 2)
         trials = Trials(np.random.default_rng(1).random((6, 3, 5, 2)), action, np.ones((6, 3, 4), bool))
         seen: list[Any] = []
-        log_prob = cloning.ActionHead.log_prob
+        log_prob = memoryless_bc.ActionHead.log_prob
 
         def spy(self: Any, features: Any, actions: Any) -> Any:
             seen.append((features[..., -1], actions[..., 0]))
             return log_prob(self, features, actions)
 
-        monkeypatch.setattr(cloning.ActionHead, "log_prob", spy)
-        cloning.train(trials, cloning.CloningConfig(8, 1, 256), np.random.default_rng(0), theta)
+        monkeypatch.setattr(memoryless_bc.ActionHead, "log_prob", spy)
+        memoryless_bc.train(trials, memoryless_bc.MemorylessConfig(8, 1, 256), np.random.default_rng(0), theta)
         assert seen[0][0].unique().numel() == 18
         np.testing.assert_array_equal(*seen[0])
 

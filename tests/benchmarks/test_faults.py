@@ -8,7 +8,19 @@ import pytest
 
 from deconfounded.benchmarks.engine import jobs, progress
 from deconfounded.benchmarks.engine.benchmark import CurveMonitor
-from tests.faults import flips, inputs
+from tests.faults import flips, inputs, planted
+
+
+def test_planted_faults_are_in_step_with_the_code() -> None:
+    """What a fault replaces is there once, and so are the files of its tests; names are its own."""
+    every = planted.faults()
+    assert len({fault.name for fault in every}) == len(every)
+    for fault in every:
+        text = (planted.ROOT / fault.file).read_text(encoding="utf-8")
+        assert text.count(fault.old) == 1, f"{fault.name}: {fault.old!r} occurs {text.count(fault.old)} times"
+        files = [word.partition("::")[0] for word in fault.tests.split() if word.startswith("tests/")]
+        assert files, fault.name
+        assert all((planted.ROOT / name).is_file() for name in files), fault.name
 
 
 def test_odd_calls_are_told() -> None:

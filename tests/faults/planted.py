@@ -1,8 +1,8 @@
 """Plant faults in a copy of this tree, one at a time, and see which test notices: `python tests/faults/planted.py`
 
-Each fault of FAULTS is a plausible slip: a text that occurs once in a file, and what stands there in its place. Its tests
-are run on the copy with `-x`; one of them must fail. Words after the command choose faults by name. `noticed by <test>` or
-`NOT NOTICED` for each; exit code 1 if any was not noticed.
+Each fault of planted.toml is a plausible slip: a text that occurs once in a file, and what stands there in its place. Its
+tests are run on the copy with `-x`; one of them must fail. Words after the command choose faults by name. It prints
+`noticed by <test>` or `NOT NOTICED` for each; exit code 1 if any was not noticed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, NoReturn
@@ -35,8 +36,10 @@ class Fault(NamedTuple):
     tests: str
 
 
-FAULTS = (
-)
+def faults() -> list[Fault]:
+    """All of them."""
+    with Path(__file__).with_suffix(".toml").open("rb") as file:
+        return [Fault(**entry) for entry in tomllib.load(file)["fault"]]
 
 
 def plant(fault: Fault, tree: Path) -> str:
@@ -91,7 +94,7 @@ def copied(folder: Path) -> Path:
 
 def main() -> None:
     """The command line."""
-    chosen = [fault for fault in FAULTS if not sys.argv[1:] or any(word in fault.name for word in sys.argv[1:])]
+    chosen = [fault for fault in faults() if not sys.argv[1:] or any(word in fault.name for word in sys.argv[1:])]
     missed = 0
     for library in LIBRARIES:
         import_module(library)
