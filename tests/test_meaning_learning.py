@@ -168,7 +168,7 @@ def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
 
 
 def test_dagger_learns_what_the_expert_would_have_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Roll-outs whose actions are .5, and labels of -.5: the loss is of the labels, the memory's evidence of the actions."""
+    """Roll-outs whose actions are .5, and labels of -.5: the loss is of the labels, evidence of the actions."""
     seen: list[tuple[Tensor, Tensor]] = []
     loss = DaggerAgent.loss
 

@@ -36,7 +36,7 @@ def expected(name: str, policy_name: str) -> float:
 
 @pytest.mark.parametrize("name", TASKS)
 def test_returns_are_the_certificate_s(name: str) -> None:
-    """Of 24 episodes of the expert and of random actions, whose mean is within four standard errors, and 2% of range."""
+    """The means of 24 episodes of expert and random actions, to four standard errors and 2% of their difference."""
     env = envs.BatchEnv(envs.get(name), 24)
     made: dict[str, tuple[Any, ...]] = {
         "random": (RandomAgent(env.task.action_space), 1),
@@ -49,8 +49,8 @@ def test_returns_are_the_certificate_s(name: str) -> None:
         assert returns.mean() == pytest.approx(expected(name, kind), abs=tolerance), f"{kind} on {name}"
 
 
-# Task, index of its latent, a low and a high value of it, the action held, steps, joint whose velocity is read, and the sign of
-# the difference that the higher value makes to it.
+# Task, index of its latent, a low and a high value of it, the action held, steps, joint whose velocity is read, and the
+# sign of the difference that the higher value makes to it.
 DIRECTIONS = (
     ("tilted_cartpole", 0, (-0.2, 0.2), (0.0,), 10, "slider", 1),  # down the rail, whose x end sinks
     ("rolling_deck", 0, (-0.2, 0.2), (0.0,), 10, "slider", 1),
@@ -148,7 +148,7 @@ def test_a_reading_is_evidence_of_the_state_that_it_was_taken_in() -> None:
 
 
 def test_sensors_read_the_world_after_the_step() -> None:
-    """Readings of the environment fit the state that they are in, nine times in ten of steps; at 0 theta is told by none."""
+    """Four readings in five fit the state that they are in, as stated."""
     task = envs.get("cheetah_speed")
     assert isinstance(task, MujocoTask)
     env, right = envs.BatchEnv(task, 40), list[Array]()
@@ -162,7 +162,7 @@ def test_sensors_read_the_world_after_the_step() -> None:
 
 @pytest.mark.parametrize("conditional", [False, True])
 def test_actions_are_weighed_by_what_was_seen_before_them(conditional: bool) -> None:
-    """A step of the exact policies on a point on a line, by hand: Eq. (3) with the expert's density, Eq. (5) without."""
+    """A step of the exact policies, by hand: Eq. (3) with the expert's density, Eq. (5) without."""
     task = toys.Push()
     env = envs.BatchEnv(task, 5)
     expert = CallableExpert(task, toys.control, "control")

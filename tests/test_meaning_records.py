@@ -76,7 +76,7 @@ def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -
 
 
 def test_a_salted_record_is_verified_under_its_salt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To the bit; a record that says another salt is not the same, and neither is one whose returns are off a little."""
+    """To the bit; one whose returns are off by a millionth is not said to be of the same bits."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     task, changes = envs.get("bandit"), ["eval_trials=4"]
     settings = changed(preset("smoke", task, "cpu", ["random"]), changes)

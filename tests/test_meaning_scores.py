@@ -1,4 +1,4 @@
-"""Scores by what they mean: worked out again from the records, from returns, or from a simulation of what is claimed."""
+"""Scores by what they mean: worked out again from records or returns, or simulated."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_eq_1_is_over_the_steps_that_took_place() -> None:
 
 
 def test_intervals_over_tasks_are_of_95_percent() -> None:
-    """Of the interquartile mean over two tasks of 20 seeds each: they hold what is true about as often, in 150 tries."""
+    """Of the interquartile mean over two tasks of 20 seeds each: they hold the truth about as often, in 150 tries."""
     rng, held = np.random.default_rng(1), []
     for _ in range(150):
         found = statistics.over_tasks(statistics.iqm, {name: rng.standard_normal(20) for name in "ab"})

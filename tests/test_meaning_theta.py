@@ -1,4 +1,4 @@
-"""Theta by what it means: nothing that an imitator sees moves with it but through the world, and scoring has the true one."""
+"""Theta by what it means: imitators see it through the world alone, and scoring has the true one."""
 
 from __future__ import annotations
 
@@ -43,14 +43,17 @@ def test_later_episodes_start_alike_under_any_theta(name: str) -> None:
 
 
 def test_padding_of_trials_tells_nothing() -> None:
-    """After the end of an episode: no action, and the last observation again and again."""
+    """After the end of an episode: no action, and the last observation again and again, whatever was there before."""
     env = envs.BatchEnv(toys.Push(), 32)
-    trials = run_trials(env, RandomAgent(env.task.action_space), 2, 0).trials
+    trials, _, theta = run_trials(env, RandomAgent(env.task.action_space), 2, 0)
     assert 0.2 < trials.mask.mean() < 0.9
-    assert not trials.action[~trials.mask].any()
-    last = np.take_along_axis(trials.obs, trials.mask.sum(-1)[..., None, None], 2)
-    over = np.arange(trials.obs.shape[2]) >= trials.mask.sum(-1)[..., None]
-    np.testing.assert_array_equal(trials.obs[over], np.broadcast_to(last, trials.obs.shape)[over])
+    over = np.arange(trials.obs.shape[2]) >= 1 + trials.mask.sum(-1)[..., None]
+    obs = np.where(over[..., None], theta[:, :, None], trials.obs)
+    action = np.where(trials.mask[..., None], trials.action, theta[:, :, None])
+    for some in (trials, Trials(obs, action, trials.mask)):
+        assert not some.action[~some.mask].any()
+        last = np.take_along_axis(trials.obs, trials.mask.sum(-1)[..., None, None], 2)
+        np.testing.assert_array_equal(some.obs[over], np.broadcast_to(last, trials.obs.shape)[over])
 
 
 def test_episodes_of_a_data_set_hold_no_theta(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """Plant faults in a copy of this tree, one at a time, and see which test notices: `python tests/faults/planted.py`
 
-Each fault of planted.toml is a plausible slip: a text that occurs once in a file, and what stands there in its place. Its
-tests are run on the copy with `-x`; one of them must fail. Words after the command choose faults by name. It prints
+Each fault of planted.toml is a plausible slip: a text that occurs once in a file, and what stands there in its place.
+Its tests are run on the copy with `-x`; one of them must fail. Words after the command choose faults by name. It prints
 `noticed by <test>` or `NOT NOTICED` for each; exit code 1 if any was not noticed.
 """
 
