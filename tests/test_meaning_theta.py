@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import progress
+from deconfounded.benchmarks.engine import guest, progress, provider
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
-from deconfounded.deconf.method import USES
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import USES, uses
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.contract.probe import far_thetas
 from deconfounded.experts import datasets
@@ -168,3 +169,43 @@ def test_a_later_episode_s_expert_acts_on_its_own_theta() -> None:
     env = envs.BatchEnv(toys.Drift(), 64)
     made = run_trials(env, ExpertAgent(env, CallableExpert(env.task, toys.control, "control")), 3, 1)
     assert TestDrift.off(made.trials, made.trials.action, made.theta) == pytest.approx([0.1] * 3, abs=0.02)
+
+
+def test_data_is_for_training_and_an_oracle_s_theta_for_acting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a method of ours may ask for when it has been trained: the theta that it acts under, and no more data."""
+    handed: list[Given] = []
+
+    @uses("demonstrations", "exploration", "queries", "theta")
+    def greedy(given: Given) -> RandomAgent:
+        handed.append(given)
+        assert len(given.demonstrations) == len(given.explore()) == len(given.theta) == 4
+        return RandomAgent(given.action_space)
+
+    context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
+    monkeypatch.setattr(provider.methods, "load", lambda name: greedy)
+    provider.fit(context, "greedy")
+    context.env.reset(0)
+    np.testing.assert_array_equal(handed[0].acting_theta(), context.env.theta)  # which is encoded as it is, in [-1, 1]
+    for ask in (handed[0].explore, handed[0].query, lambda: handed[0].demonstrations, lambda: handed[0].theta):
+        with pytest.raises(envs.InputError, match="after training"):
+            ask()
+
+
+def test_a_guest_does_not_act_on_theta(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever it declares, the theta that it acts under is not to be had; that of demonstrations is, if declared."""
+
+    class Silent:
+        """A channel to nobody."""
+
+        def send(self, message: Any) -> None: ...
+        def close(self) -> None: ...
+
+    monkeypatch.setattr(guest.sys, "executable", "true")
+    monkeypatch.setattr(guest.Guest, "_connect", lambda self, reference: Silent())
+    monkeypatch.setattr(guest.Guest, "_fit", lambda self: None)
+    context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
+    made = guest.Guest(context, "mine", "mine.py:fit", ["demonstrations", "theta"])
+    made.close()
+    assert len(made.provider("theta")) == 4
+    with pytest.raises(envs.InputError, match="it asked for acting theta"):
+        made.provider("acting theta")
