@@ -286,6 +286,19 @@ def test_learned_agents_are_scored_for_twice_the_episodes() -> None:
 
 def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1."""
-    scores = certify.stakes(PUSH, EXPERT, 32)[1]
+    _, scores, returns = certify.stakes(PUSH, EXPERT, 32)
     assert np.diag(scores) == pytest.approx(1)
-    assert max(scores[0, -1], scores[-1, 0]) < 0.8
+    assert returns[0, -1] < 0.6 * returns[0, 0]
+    assert returns[-1, 0] < 0.6 * returns[-1, -1]
+
+
+def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPatch) -> None:
+    """0 is its random actions, 1 its expert; checks are of the last episode; a clone that learned nothing is at 0."""
+    monkeypatch.setattr(certify.memoryless_bc, "train", lambda *_: RandomAgent(PUSH.action_space))
+    found = certify.certify(PUSH, EXPERT, trials=12, grid=5)
+    for name in ("interventional", "conditional"):
+        zero, one = found["return_random"], found["return_expert"]
+        scores = [(value - zero) / (one - zero) for value in found[name]["return"]]
+        assert found[name]["score"] == pytest.approx(scores)
+        assert found["checks"][f"{name}_last"]["measured"] == pytest.approx(scores[-1], abs=1e-4)
+    assert found["checks"]["blind_bc"]["measured"] == 0

@@ -50,13 +50,13 @@ def plant(fault: Fault, tree: Path) -> str:
     return text
 
 
-def noticed(fault: Fault, tree: Path, tests: str = "") -> str:
+def noticed(fault: Fault, tree: Path) -> str:
     """What became of a fault in a tree, which is put back as it was; begins with `noticed` if a test fails for it."""
     text, log = plant(fault, tree), tree.parent / f"{tree.name}.log"
     try:
         child = os.fork()  # with the libraries that are imported already, which takes most of the time
         if not child:
-            _run_tests(tree, log, shlex.split(tests or fault.tests))
+            _run_tests(tree, log, shlex.split(fault.tests))
         code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     finally:
         (tree / fault.file).write_text(text, encoding="utf-8")
