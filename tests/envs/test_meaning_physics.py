@@ -20,7 +20,7 @@ from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
 from tests import toys
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 TASKS = envs.names()
 PHYSICAL = [name for name in TASKS if isinstance(envs.get(name), MujocoTask)]
 

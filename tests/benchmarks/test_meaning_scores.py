@@ -21,13 +21,14 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.output import records, report, score, statistics
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
 from tests import toys
 from tests.tools import tiny_preset
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PUSH = toys.Push()
 EXPERT = CallableExpert(PUSH, toys.control, "control")
 
@@ -294,7 +295,7 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
 
 def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """0 is its random actions, 1 its expert; checks are of the last episode; a clone that learned nothing is at 0."""
-    monkeypatch.setattr(certify.memoryless_bc, "train", lambda *_: RandomAgent(PUSH.action_space))
+    monkeypatch.setattr(memoryless_bc, "train", lambda *_: RandomAgent(PUSH.action_space))
     found = certify.certify(PUSH, EXPERT, trials=12, grid=5)
     for name in ("interventional", "conditional"):
         zero, one = found["return_random"], found["return_expert"]
