@@ -13,10 +13,6 @@ import numpy as np
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, whole
-from deconfounded.benchmarks.engine.benchmark import spaces
-from deconfounded.benchmarks.engine.guest import Stranger
-from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 from deconfounded.envs.support.files import check_file
 from deconfounded.experts import store
 from deconfounded.experts.rollout import Agent
@@ -24,8 +20,13 @@ from deconfounded.experts.rollout import Agent
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    about, agent = store.describe(folder), deconfounded.load(folder)
-    ours, theirs = spaces(task), about.get("spaces")
+    theirs = store.describe(folder).get("spaces")
+    from deconfounded.benchmarks.engine.benchmark import spaces  # torch takes seconds: what is no agent goes without
+    from deconfounded.benchmarks.engine.guest import Stranger
+    from deconfounded.deconf.core.agents import LearnedAgent
+    from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
+
+    agent, ours = deconfounded.load(folder), spaces(task)
     if theirs not in (None, ours):
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
@@ -62,11 +63,11 @@ def main() -> None:
     parser.add_argument("--video", type=Path, help="an .mp4 file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
-    agent = ready(args.agent, task)
     if args.video is not None:
         if args.video.suffix != ".mp4":
             raise envs.InputError(f"--video was {args.video}; it must end in .mp4")
         check_file(args.video)
+    agent = ready(args.agent, task)
     env = envs.GymEnv(task, render_mode="rgb_array" if args.video else None)
     returns, frames = play(agent, env, args.episodes or task.episodes, args.seed, args.theta)
     pairs = zip(task.latents, env.batch.theta[0], strict=True)

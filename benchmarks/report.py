@@ -10,7 +10,6 @@ from pathlib import Path
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import store
-from deconfounded.benchmarks.output import report
 from deconfounded.envs.support.files import read_sealed
 
 
@@ -26,4 +25,6 @@ def main() -> None:
     finished = store.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
+    from deconfounded.benchmarks.output import report  # it takes seconds; bad input is refused at once
+
     print(report.write(task, about, finished, folder))

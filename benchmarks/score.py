@@ -12,8 +12,6 @@ from typing import Any
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine.catalogue import check_names
-from deconfounded.benchmarks.engine.context import EVALUATION, stream
-from deconfounded.benchmarks.output import score
 from deconfounded.benchmarks.play import ready
 from deconfounded.envs.support.files import check_file, write_json
 from deconfounded.experts import policy
@@ -45,6 +43,8 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
 
 def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
     """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
+    from deconfounded.benchmarks.output import score
+
     env = envs.BatchEnv(where, trials)
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
@@ -66,12 +66,16 @@ def main() -> None:
     parser.add_argument("--out", type=place, help="a .json file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
-    agent, expert, where = ready(args.agent, task), policy.load(task, args.expert), elsewhere(task, args.range)
+    expert, where = policy.load(task, args.expert), elsewhere(task, args.range)
     if args.out is not None:
         check_file(args.out)
+    agent = ready(args.agent, task)
+    from deconfounded.benchmarks.engine.context import EVALUATION, stream  # torch takes seconds
+    from deconfounded.benchmarks.output.score import two_decimals
+
     scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
     last = "last {:.2f} to {:.2f}, 95% over trials".format(*scored["ci95_last"])
-    scores = " ".join(map(score.two_decimals, scored["score"]))
+    scores = " ".join(map(two_decimals, scored["score"]))
     print(f"{task.name}, {args.trials} trials: score of each episode {scores} (0 random, 1 expert; {last})")
     if args.out is not None:
         asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}

@@ -46,8 +46,8 @@ class BatchEnv:
             seed = [None] * self.n
         elif isinstance(seed, int | np.integer) and is_seed(seed):
             seed = [int(seed) + i for i in range(self.n)]
-        whole = isinstance(seed, list | tuple | np.ndarray) and np.shape(seed) == (self.n,)
-        if isinstance(seed, int) or not whole or not all(value is None or is_seed(value) for value in seed):
+        shape = seed.shape if isinstance(seed, np.ndarray) else (len(seed),) if isinstance(seed, list | tuple) else None
+        if isinstance(seed, int) or shape != (self.n,) or not all(value is None or is_seed(value) for value in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [generators(value) for value in seed]
 

@@ -207,7 +207,7 @@ class Task(ABC):
             raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
         for column, lat in zip(array.T, self.latents, strict=True):
             whole = lat.distribution == "categorical"
-            bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column % 1 != 0)]
+            bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column != np.floor(column))]
             if bad.size:
                 right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
                 raise InputError(f"{lat.name} of {self.name} was {bad[0]:g}; it must be {right}")
