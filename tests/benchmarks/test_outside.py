@@ -538,12 +538,6 @@ def watch_resets(monkeypatch: pytest.MonkeyPatch) -> tuple[list[Any], list[Any]]
     return seeds, thetas
 
 
-def test_salt_draws_other_thetas() -> None:
-    """Evaluation's alone: without a salt they are as they always were."""
-    assert stream(EVALUATION, 0, "") == stream(EVALUATION, 0)
-    assert len({stream(EVALUATION, 0, salt) for salt in ("", "a", "b", "ab")}) == 4
-
-
 def test_ours_get_what_they_declare() -> None:
     """A provider opens what a method declares, and nothing else; and no data after training."""
     context = Context(envs.get(CONTROL), tiny_preset(), [0])

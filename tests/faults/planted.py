@@ -52,19 +52,26 @@ def plant(fault: Fault, tree: Path) -> str:
 
 def noticed(fault: Fault, tree: Path) -> str:
     """What became of a fault in a tree, which is put back as it was; begins with `noticed` if a test fails for it."""
-    text, log = plant(fault, tree), tree.parent / f"{tree.name}.log"
+    text = plant(fault, tree)
     try:
-        child = os.fork()  # with the libraries that are imported already, which takes most of the time
-        if not child:
-            _run_tests(tree, log, shlex.split(fault.tests))
-        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        code, output = run_tests(tree, shlex.split(fault.tests))
     finally:
         (tree / fault.file).write_text(text, encoding="utf-8")
-    said = log.read_text(encoding="utf-8", errors="replace")
-    failed = re.search(r"^FAILED (\S+::.*?)(?: - |$)", said, re.M)
-    if not failed and code:  # a file that cannot be imported, say, is no test that tells what is wrong
-        return f"NOT NOTICED, pytest ended with {code}\n{said}"
-    return f"noticed by {failed[1]}" if failed else "NOT NOTICED"
+    failed = re.search(r"^FAILED (\S+::.*?)(?: - |$)", output, re.M)
+    if not failed:  # a file that cannot be imported, say, is no test that tells what is wrong
+        return f"NOT NOTICED{f', pytest ended with {code}: {output}' if code else ''}"
+    if run_tests(tree, [failed[1]])[0]:
+        return f"NOT NOTICED, {failed[1]} fails without it too"
+    return f"noticed by {failed[1]}"
+
+
+def run_tests(tree: Path, tests: list[str]) -> tuple[int, str]:
+    """Pytest's exit code and output. It runs in a fork, with libraries imported already, which takes most of the time."""
+    log = tree.parent / f"{tree.name}.log"
+    if not (child := os.fork()):
+        _run_tests(tree, log, tests)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    return code, log.read_text(encoding="utf-8", errors="replace")
 
 
 def _run_tests(tree: Path, log: Path, tests: list[str]) -> NoReturn:
