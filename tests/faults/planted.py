@@ -66,7 +66,7 @@ def noticed(fault: Fault, tree: Path) -> str:
 
 
 def run_tests(tree: Path, tests: list[str]) -> tuple[int, str]:
-    """Pytest's exit code and output. It runs in a fork, with libraries imported already, which takes most of the time."""
+    """Pytest's exit code and output. It runs in a fork, with libraries imported already: they take most of the time."""
     log = tree.parent / f"{tree.name}.log"
     if not (child := os.fork()):
         _run_tests(tree, log, tests)
