@@ -123,7 +123,7 @@ class NoCamera(SlipperyCartpole):
 @pytest.mark.parametrize(
     ("task", "says"),
     [
-        (MissingFile, r"the model \(tests/nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
+        (MissingFile, r"the model \(envs/nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
         (MisspeltJoint, "process_noise of slippery_cartpole: .*'slyder'"),
         (MisspeltElement, "apply_latent of slippery_cartpole: .*'pool'"),
         (OneTooMany, r"observe of slippery_cartpole gave \(2, 6\) of 2 environments; it must be \(2, 7\)"),
