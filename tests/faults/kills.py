@@ -67,8 +67,9 @@ def came_out(out: Path) -> dict[str, str]:
                 digest.update(json.dumps(timeless(job.pop("meta"))).encode())
                 for key in sorted(job):
                     digest.update(key.encode() + np.ascontiguousarray(job[key]).tobytes())
-        elif file.suffix == ".json":
-            digest.update(json.dumps(timeless(json.loads(file.read_text()))).encode())
+        elif file.suffix in (".json", ".jsonl"):
+            texts = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
+            digest.update(json.dumps([timeless(json.loads(text)) for text in texts]).encode())
         elif (
             file.suffix in (".html", ".mp4", ".png") or name == ".lock"
         ):  # the report tells of time, pictures are its own
