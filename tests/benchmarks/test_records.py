@@ -350,7 +350,7 @@ class TestVerify:
     def test_same_bits(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """A seed run again, alone in another process, under its salt, gives the same bits; a record that lies, others."""
+        """A seed run again, alone in another process, under its salt, has the same bits; a record that lies, others."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         small = ["eval_trials=4", "expert_trials=4", "blind_bc.updates=3"]
         from deconfounded.benchmarks.engine.presets import changed, preset
