@@ -12,12 +12,10 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from deconfounded import envs
-from deconfounded.benchmarks import verify
 from deconfounded.benchmarks.engine import identity, progress, store
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.jobs import JobMonitor
-from deconfounded.benchmarks.engine.presets import changed, preset
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table
 from deconfounded.experts import policy
@@ -73,23 +71,6 @@ def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -
     store.prepare(tmp_path, described, resume=True)
     with pytest.raises(envs.InputError, match=f"holds a run that differs in its {key}"):
         store.prepare(tmp_path, {**described, key: "b"}, resume=True)
-
-
-def test_a_salted_record_is_verified_under_its_salt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """To the bit; one whose returns are off by a millionth is not said to be of the same bits."""
-    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-    task, changes = envs.get("bandit"), ["eval_trials=4"]
-    settings = changed(preset("smoke", task, "cpu", ["random"]), changes)
-    job = BenchmarkJob("bandit", settings, "random", (1,), tmp_path, salt="any text")
-    job.run()
-    data = job.load(1)
-    assert data is not None
-    (record,) = records.of_job(data, "smoke", changes, 1)
-    assert record["salt"] == "any text"
-    again = verify.rerun(record, task, "random", None, "cpu")
-    assert verify.verdict(record, again)[0] == "same bits"
-    off = {**record, "returns": [record["returns"][0] + 1e-6], "bits": records.bits(data["random/returns"] + 1e-6)}
-    assert verify.verdict(off, again)[0] != "same bits"
 
 
 def test_what_the_table_lacks_is_of_today_s_settings_and_expert(

@@ -279,12 +279,6 @@ def test_features_are_kept_as_they_were_when_overwritten(monkeypatch: pytest.Mon
     assert found["returns"].shape == found["objective"].shape == found["theta"].shape[:2] == (4, 4)
 
 
-def test_learned_agents_are_scored_for_twice_the_episodes() -> None:
-    context = Context(PUSH, tiny_preset(), [0], expert="tests.toys:control")
-    episodes = [evaluate(context, RandomAgent(PUSH.action_space), x)[0]["returns"].shape[1] for x in (False, True)]
-    assert episodes == [2, 4]
-
-
 def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1."""
     _, scores, returns = certify.stakes(PUSH, EXPERT, 32)

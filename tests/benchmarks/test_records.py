@@ -350,14 +350,14 @@ class TestVerify:
     def test_same_bits(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        """A seed run again, alone and in another process, gives the bits of the run; a record that lies does not."""
+        """A seed run again, alone in another process, under its salt, has the same bits; a record that lies, others."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         small = ["eval_trials=4", "expert_trials=4", "blind_bc.updates=3"]
         from deconfounded.benchmarks.engine.presets import changed, preset
 
         settings = changed(preset("smoke", envs.get("bandit"), "cpu"), small)
         (tmp_path / "jobs").mkdir()
-        made = BenchmarkJob("bandit", settings, "blind_bc", (2, 3), tmp_path / "jobs")
+        made = BenchmarkJob("bandit", settings, "blind_bc", (2, 3), tmp_path / "jobs", salt="any text")
         made.run()
         data = made.load(3)
         assert data is not None

@@ -191,3 +191,31 @@ def test_a_grid_is_of_mid_quantiles(distribution: Any) -> None:
     np.testing.assert_allclose(quantiles, [0.1, 0.3, 0.5, 0.7, 0.9])
     by_hand = 0.5 * 16**quantiles if distribution == "loguniform" else 0.5 + 7.5 * quantiles
     np.testing.assert_allclose(latent.grid(5), by_hand)
+
+
+SERVOS = (  # task, joint, and its velocity under an action held at .5, without noise, as the task's page has it
+    ("dragged_sled", "hand", 2 + 3 * 0.5),
+    ("heavy_payload", "hook", 3 * 0.5),
+    ("icy_stop", "wheel", 3 * (1 + 0.5) / 0.1),
+)
+
+
+@pytest.mark.parametrize(("name", "joint", "velocity"), SERVOS)
+def test_servos_reach_the_speed_that_is_asked_for(name: str, joint: str, velocity: float) -> None:
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    env = envs.BatchEnv(task, 1)
+    env.reset(3)
+    state = env.state.copy()
+    for _ in range(30):
+        state = env.simulator.outcome(state, np.full((1, 1), 0.5))
+    assert task.qvel(state, joint)[0] == pytest.approx(velocity, rel=0.05)
+
+
+def test_a_stone_is_worth_most_at_the_tee() -> None:
+    """At rest 7 m past the hog line it is worth 1, and 1.7 m off exp(-.5); before the hog line nothing."""
+    task = envs.get("curling")
+    assert isinstance(task, MujocoTask)
+    rest = task.state(slide=([7.0, 8.7, 5.3, -1.0], 0.0))
+    made = task.reward(rest, np.full((4, 1), -1.0), rest, np.full((4, 1), 0.05))
+    np.testing.assert_allclose(made, [1, np.exp(-0.5), np.exp(-0.5), 0], atol=1e-9)
