@@ -21,6 +21,13 @@ from deconfounded.envs.task import Mask, Renderer, Task
 Info = dict[str, Any]
 
 
+def _array(action: Any) -> NDArray[Any]:
+    try:
+        return np.asarray(action)
+    except ValueError:  # lists of several lengths
+        raise InputError(f"action was {action!r}; it must be numbers, as many in each row") from None
+
+
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
     base, more = task.observation_space, np.ones(task.theta_width if privileged else 0, np.float32)
     return spaces.Box(np.append(base.low, -more), np.append(base.high, more))
@@ -74,7 +81,7 @@ class GymEnv(gym.Env[Any, Any]):
         return self.batch.reset(seed, options)[0], {}
 
     def step(self, action: Any) -> tuple[Obs, float, bool, bool, Info]:
-        row, alive = np.asarray(action), self.batch.alive
+        row, alive = _array(action), self.batch.alive
         obs, reward, terminated, truncated = self.batch.step(row.reshape(1, 1) if row.size == 1 else row[None])
         if not alive[0] and not self._warned:
             gym.logger.warn(f"step of {self.task.name} was called after the end of an episode; it moves nothing: reset")
@@ -113,7 +120,7 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return obs, {}
 
     def step(self, actions: Any) -> tuple[Obs, NDArray[Any], Mask, Mask, Info]:
-        rows, alive = np.asarray(actions), self.batch.alive
+        rows, alive = _array(actions), self.batch.alive
         ended = self.batch.advance(rows[:, None] if rows.ndim == 1 else rows)
         if alive.all():
             return self.batch.observe(), *ended, {}
@@ -142,7 +149,7 @@ class DmEnv(dm_env.Environment):
     def step(self, action: Any) -> dm_env.TimeStep:
         if not self._batch.alive[0]:
             return self.reset()
-        obs, reward, terminated, truncated = self._batch.step(np.reshape(action, (1, -1)))
+        obs, reward, terminated, truncated = self._batch.step(_array(action).reshape(1, -1))
         ended = dm_env.truncation if truncated[0] else dm_env.transition
         return (dm_env.termination if terminated[0] else ended)(float(reward[0]), obs[0])
 

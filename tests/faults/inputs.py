@@ -232,7 +232,8 @@ def calls() -> dict[str, Callable[[], Any]]:
         odd[f"env.reset(options={options!r})"] = lambda o=options: env.reset(options=o)
         odd[f"vec.reset(options={options!r})"] = lambda o=options: vec.reset(options=o)
         odd[f"dm.reset(options={options!r})"] = lambda o=options: dm.reset(options=o)
-    for act in ("left", ["0.1"], None, [np.nan], [np.inf], [0.1, 0.2], [[0.1, 0.2]], {}, object(), b"1", [[]], [1j]):
+    wrong = ("left", ["0.1"], None, [np.nan], [np.inf], [0.1, 0.2], [[0.1, 0.2]], {}, object(), b"1", [[]], [1j])
+    for act in (*wrong, [None, []]):
         odd[f"env.step({act!r})"] = lambda a=act: env.step(a)
         odd[f"vec.step({act!r})"] = lambda a=act: vec.step(a)
         odd[f"dm.step({act!r})"] = lambda a=act: dm.step(a)
