@@ -1,7 +1,7 @@
 """Reference policies, without learning, on the environments that evaluation steps.
 
 The exact policies hold the posterior of theta on a grid: `conditional` takes its own actions for evidence, Eq. (2), and
-`interventional` does not, Eq. (4).
+`interventional` does not, Eq. (5).
 """
 
 from __future__ import annotations
