@@ -43,10 +43,10 @@ def check_rounding(obs: NDArray[Any], mask: NDArray[np.bool_]) -> None:
     wide = obs.astype(float)
     lost = np.abs(wide - wide.astype(np.float32)).max((0, 1, 2))
     change = np.diff(wide, axis=2)[mask]
-    for what, size in (("spread", wide.std((0, 1, 2))), ("change in a step", np.sqrt((change**2).mean(0)))):
-        if (bad := (size > 1e-6) & (size < 10 * lost)).any():
+    for what, extent in (("spread", wide.std((0, 1, 2))), ("change in a step", np.sqrt((change**2).mean(0)))):
+        if (bad := (extent > 1e-6) & (extent < 10 * lost)).any():
             i = int(np.flatnonzero(bad)[0])
             raise InputError(
-                f"observation {i} of Trials is about {wide[..., i].mean():.9g}, and its {what} {size[i]:.3g}: float32"
+                f"observation {i} of Trials is about {wide[..., i].mean():.9g}, and its {what} {extent[i]:.3g}: float32"
                 f" rounds it by up to {lost[i]:.2g}; subtract its mean"
             )

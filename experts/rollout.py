@@ -194,14 +194,20 @@ def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
     return np.stack(by_episode, 1)
 
 
-def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
-    """The environments' seeds for n trials, in equal groups. Raises InputError where n is no multiple of the seeds."""
+def _group_seeds(seed: Seeds) -> list[int]:
+    """The seed of each group of trials. Raises InputError for anything else."""
     seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes) else [seed]
     if not seeds or not all(is_seed(first) for first in seeds):
         raise InputError(f"seed was {seed!r}; it must be a whole number from 0 up, or one for each group of trials")
+    return [int(group) for group in seeds]
+
+
+def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
+    """The environments' seeds for n trials, in equal groups. Raises InputError where n is no multiple of the seeds."""
+    seeds = _group_seeds(seed)
     if n % len(seeds):
         raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
-    return [int(first) + i for first in seeds for i in range(n // len(seeds))]
+    return [first + i for first in seeds for i in range(n // len(seeds))]
 
 
 class Rollout(NamedTuple):
@@ -223,8 +229,7 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     """
     task, n = env.task, env.n
     check_number("episodes", episodes)
-    each = trial_seeds(n, seed)
-    seeds = [seed] if isinstance(seed, int | np.integer) else list(seed)
+    each, seeds = trial_seeds(n, seed), _group_seeds(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))

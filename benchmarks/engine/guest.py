@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import queue
 import secrets
@@ -34,19 +33,6 @@ from deconfounded.envs.task import Array
 from deconfounded.experts.rollout import Agent
 
 MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
-
-
-def die_with_parent() -> None:
-    """End this process when the one that started it has ended, however that came about."""
-
-    def wait() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _environ(mark: str) -> dict[str, str]:
@@ -175,11 +161,11 @@ class Guest(Agent):
         self._do("observe", obs, action, next_obs, alive)
 
     def features(self) -> NDArray[np.float32] | None:
-        known = self._do("features")
-        fits = isinstance(known, np.ndarray) and known.ndim == 2 and bool(np.isfinite(known).all())
-        if known is not None and not fits:
+        features = self._do("features")
+        fits = isinstance(features, np.ndarray) and features.ndim == 2 and bool(np.isfinite(features).all())
+        if features is not None and not fits:
             raise envs.InputError(f"method {self.name}: features must be None, or finite [N, F]")
-        return known
+        return features
 
     def keep(self, folder: Path, about: dict[str, Any]) -> str:
         """Let the guest save its agent; returns why it could not."""

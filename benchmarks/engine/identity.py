@@ -38,14 +38,17 @@ AMOUNTS = {  # of a preset, by what a method uses
 
 
 def identity(job: Job) -> dict[str, Any]:
-    """All that the results of a job's seeds depend on, but for the seed. `outside` is empty where all is ours."""
+    """All that the results of a job's seeds depend on, but for the seed, as json holds it.
+
+    `outside` is empty where all is ours.
+    """
     task, method, preset = envs.get(job.task), job.about, job.preset
     amounts = ["eval_trials", *(name for use in method.uses for name in AMOUNTS.get(use, ()))]
     settings = {name: getattr(preset, name) for name in amounts}
     texts = {"task": sources.of_task(task)}
     if method.reference:
         texts["method"] = sources.of_reference(method.reference)
-    return {
+    made_of = {
         "kind": type(job).__name__,
         "protocol": PROTOCOL,
         "task": task.name,
@@ -58,6 +61,7 @@ def identity(job: Job) -> dict[str, Any]:
         "versions": versions(),
         "outside": {kind: sources.digest(files) for kind, files in texts.items() if files},
     }
+    return json.loads(json.dumps(made_of))
 
 
 def demonstrations(task: envs.Task, source: str | None, trials: int, seed: int) -> str:

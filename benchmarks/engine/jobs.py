@@ -79,13 +79,14 @@ class Job(ABC):
         i = self.seeds.index(seed)
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
-        if monitor.identity != json.loads(json.dumps(identity(self))):
+        if monitor.identity != identity(self):
             raise envs.InputError(f"files that {self.method} is made of were edited while it ran; run it again")
-        known = {"identity": monitor.identity, "seed": seed, "commit": commit(), "machine": machine(monitor.device)}
-        if monitor.last_edit != last_edit() and known["commit"]:  # not the code of that commit alone
-            known["commit"] = f"{known['commit'].rstrip('+')}+"
-        known |= {"reference": self.about.reference, "arrays": list(arrays)}
-        whole = {**meta, **known, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
+        version = commit()
+        if monitor.last_edit != last_edit() and version:  # not the code of that commit alone
+            version = f"{version.rstrip('+')}+"
+        origin = {"identity": monitor.identity, "seed": seed, "commit": version, "machine": machine(monitor.device)}
+        origin |= {"reference": self.about.reference, "arrays": list(arrays)}
+        whole = {**meta, **origin, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
@@ -98,7 +99,7 @@ class Job(ABC):
         """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
         if why := store.broken(found):
             return why
-        meta, expected = found["meta"], json.loads(json.dumps(identity(self)))
+        meta, expected = found["meta"], identity(self)
         told = meta["identity"]
         if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
             return f"it was made with another {differ[0].replace('_', ' ')}"
@@ -139,7 +140,7 @@ class JobMonitor(Monitor):
 
     def __init__(self, job: Job, share: float) -> None:
         super().__init__()
-        self.identity, self.last_edit = json.loads(json.dumps(identity(job))), last_edit()
+        self.identity, self.last_edit = identity(job), last_edit()
         self.ticks, self.share, self.told = job.ticks, share, 0
         self.device = job.preset.device
         self.file = job.checkpoint

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -15,9 +16,21 @@ from multiprocessing.queues import Queue
 from deconfounded import envs
 from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine import progress
-from deconfounded.benchmarks.engine.guest import die_with_parent
 from deconfounded.benchmarks.engine.scheduler import Engine, Some, run_job
 from deconfounded.envs.physics import cores
+
+
+def die_with_parent() -> None:
+    """End this process when the one that started it has ended, however that came about."""
+
+    def wait() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def start_worker(ticks: Queue[int]) -> None:

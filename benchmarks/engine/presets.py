@@ -9,6 +9,7 @@ from typing import Any, get_args, get_type_hints
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.deconf.core.sizes import fits
 
 MOST = 1e9  # of any amount
 
@@ -80,9 +81,7 @@ def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
         value = json.loads(text)
     except ValueError:
         value = text
-    right = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
     least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not right or (number and not least <= value < MOST):
+    if not fits(value, kinds, least, MOST):
         raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
     return value

@@ -140,7 +140,7 @@ def _forget(number: int) -> None:
 
 
 class NumberedMonitor(Monitor):
-    """Passes what a method reports on to the monitor of its provider."""
+    """Forwards updates and checkpoints to the monitor of the provider of that number."""
 
     def __init__(self, number: int) -> None:
         self._number = number

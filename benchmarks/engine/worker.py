@@ -52,12 +52,12 @@ def work(
         courier = Courier(folder, number, mailbox)
         progress.tell(courier)
         try:
-            told = run_job(job)
+            line = run_job(job)
         finally:
             courier.over.set()
         left = {str(file.relative_to(folder)): file for file in folder.rglob("*") if file.is_file()}
         new = {name for name in left if name not in names and not name.startswith("outside/")}
-        return told, {name: left[name].read_bytes() for name in new}
+        return line, {name: left[name].read_bytes() for name in new}
 
 
 def check(expected: dict[str, Any], here: dict[str, Any]) -> None:

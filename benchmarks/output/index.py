@@ -219,8 +219,8 @@ def page(
     docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str], tiers: dict[str, str]
 ) -> str:
     """The file. tiers: what each tier of tasks says; command: what makes a task's results, or those of one method."""
-    shown = data(docs, found, certificates, command)
-    counts = [entry["n"] for entry in shown["rows"]]
-    opened = next((task["name"] for task in shown["tasks"] if task["episodes"] > 1), "")
+    content = data(docs, found, certificates, command)
+    counts = [entry["n"] for entry in content["rows"]]
+    opened = next((task["name"] for task in content["tasks"] if task["episodes"] > 1), "")
     head = {"records": sum(counts), "seeds": score.fewest_to_most(counts), "peer": PEER, "opened": opened}
-    return template("index.html.jinja").render(data=shown, tiers=tiers, **head) + "\n"
+    return template("index.html.jinja").render(data=content, tiers=tiers, **head) + "\n"

@@ -98,8 +98,7 @@ def check(record: Any, where: str) -> Record:
 
 def stale(record: Record, identity: Mapping[str, Any]) -> list[str]:
     """What a record was made of that is no longer so, of `MADE_OF`; identity: of the job that would make it today."""
-    today = json.loads(json.dumps(identity))
-    return [key for key in MADE_OF if record[key] != today[key]]
+    return [key for key in MADE_OF if record[key] != identity[key]]
 
 
 def place(task: str) -> str:

@@ -163,5 +163,5 @@ def page(results: dict[str, Any], folder: Path) -> str:
         "methods": sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]),
         "how": json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2),
     }
-    shown = {"results": results, "pictures": pictures, "certified": certified, "movie": movie}
-    return template("report.html.jinja", filters).render(**parts, **shown)
+    run = {"results": results, "pictures": pictures, "certified": certified, "movie": movie}
+    return template("report.html.jinja", filters).render(**parts, **run)

@@ -142,14 +142,14 @@ def write() -> str:
 
     Returns README's table of results.
     """
-    found = results.published()
-    for file, text in texts(found).items():
+    by_task = results.published()
+    for file, text in texts(by_task).items():
         if file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
-    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
+    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(by_task)])
     redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
-    return results.summary(found)
+    return results.summary(by_task)
 
 
 def redraw(file: Path, draw: Callable[..., None], data: Any) -> None:

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from deconfounded.envs.support.errors import InputError
 
 LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
 LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker
+
+
+def fits(value: object, kinds: tuple[Any, ...], least: float, most: float = math.inf) -> bool:
+    """Whether a value is of the types, or one of the values, in `kinds`; a number also from `least` to below `most`."""
+    if not (value in kinds or type(value) in kinds or (type(value) is int and float in kinds)):
+        return False
+    return not isinstance(value, int | float) or isinstance(value, bool) or least <= value < most
 
 
 class Configuration:
@@ -20,10 +27,8 @@ class Configuration:
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
             value, kinds = getattr(self, name), get_args(kind) or (kind,)
-            valid = value in kinds or type(value) in kinds or (type(value) is int and float in kinds)
             least = 0 if float in kinds or name.endswith(("updates", "grid")) else 1
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not valid or (number and not least <= value < math.inf):
-                right = " or ".join(getattr(one, "__name__", repr(one)) for one in kinds)
+            if not fits(value, kinds, least):
+                right = " or ".join(getattr(kind, "__name__", repr(kind)) for kind in kinds)
                 limit = f", from {least} up" if {int, float} & set(kinds) else ""
                 raise InputError(f"{name} of {type(self).__name__} was {value!r}; it must be {right}{limit}")

@@ -15,7 +15,7 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
+from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 class ActionDropoutMemory(GruMemory):
@@ -57,18 +57,13 @@ class ActionDropoutAgent(RecurrentAgent):
         finally:
             self.memory.action_mask = None
 
-    @torch.no_grad()
-    def held_out_loss(self, batch: Batch) -> Tensor:
-        return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
-
 
 @uses(
     "demonstrations",
     cost=2,
     on_control=DropoutConfig(learning_rate=9e-4),
     on_bandit=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
-    smoke={"updates": 60},
-    smoke_bandit={"updates": 500},
+    **SMOKE,
 )
 def fit(given: Given) -> ActionDropoutAgent:
     """Clone the demonstrations."""

@@ -13,7 +13,7 @@ from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
+from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 class ObsMemory(GruMemory):
@@ -34,8 +34,7 @@ class ObsAgent(RecurrentAgent):
     cost=2,
     on_control=RecurrentConfig(learning_rate=9e-4),
     on_bandit=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),
-    smoke={"updates": 60},
-    smoke_bandit={"updates": 500},
+    **SMOKE,
 )
 def fit(given: Given) -> ObsAgent:
     """Clone the demonstrations."""

@@ -11,7 +11,7 @@ from deconfounded.deconf.core.data import Rngs, Source
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
+from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor | None = None) -> RecurrentAgent:
@@ -24,8 +24,7 @@ def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor |
     cost=2,
     on_control=RecurrentConfig(),
     on_bandit=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    smoke={"updates": 60},
-    smoke_bandit={"updates": 500},
+    **SMOKE,
     paper=RecurrentConfig(width=256, updates=5000, batch=100, chunk=100, learning_rate=1e-3, cooled=False),
 )
 def fit(given: Given) -> RecurrentAgent:

@@ -16,7 +16,7 @@ from deconfounded.deconf.core.data import Batch, take_steps
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, train_recurrent
+from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent
 
 
 @dataclass(frozen=True)
@@ -79,18 +79,13 @@ class PalrAgent(RecurrentAgent):
         values = torch.stack([hscic(x, y, given, self.config.ridge) for x, y, given in zip(*samples, strict=True)])
         return values * (later.mask.flatten(1).sum(1) > 0)  # 0 for padding alone
 
-    @torch.no_grad()
-    def held_out_loss(self, batch: Batch) -> Tensor:
-        return super().loss(batch, batch.action, self.memory.start(len(batch)))[0]
-
 
 @uses(
     "demonstrations",
     cost=4,
     on_control=PalrConfig(penalty=1.0),
     on_bandit=PalrConfig(penalty=1.0, updates=2000, batch=128, chunk=50, learning_rate=1e-2),
-    smoke={"updates": 60},
-    smoke_bandit={"updates": 500},
+    **SMOKE,
 )
 def fit(given: Given) -> PalrAgent:
     """Clone the demonstrations."""

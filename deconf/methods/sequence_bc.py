@@ -139,8 +139,8 @@ class RecurrentAgent(LearnedAgent):
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:
-        """The imitation loss [S] on the expert's trials."""
-        return self.loss(batch, batch.action, self.memory.start(len(batch)))[0]
+        """The imitation loss [S] on the expert's trials, without what a subclass adds to it in training."""
+        return RecurrentAgent.loss(self, batch, batch.action, self.memory.start(len(batch)))[0]
 
 
 class RecurrentTrainer:
@@ -182,3 +182,6 @@ def train_recurrent(
         return RecurrentTrainer(agent, config, steps, monitor)
 
     return train_sequence(trials, config, rng, new_agent, new_trainer, monitor)
+
+
+SMOKE: dict[str, Any] = {"smoke": {"updates": 60}, "smoke_bandit": {"updates": 500}}  # of methods of recurrent BC

@@ -54,8 +54,8 @@ class Late(Agent):
 @pytest.mark.parametrize("salt", ["", "any text"])
 def test_evaluation_is_under_the_salt_s_thetas(salt: str) -> None:
     context = Context(PUSH, tiny_preset(), [0, 1], expert="tests.toys:control")
-    found = evaluate(context, RandomAgent(PUSH.action_space), False, salt)[0]
-    np.testing.assert_array_equal(found["theta"], thetas(PUSH, 8, 2, [stream(EVALUATION, s, salt) for s in (0, 1)]))
+    measured = evaluate(context, RandomAgent(PUSH.action_space), False, salt)[0]
+    np.testing.assert_array_equal(measured["theta"], thetas(PUSH, 8, 2, [stream(EVALUATION, s, salt) for s in (0, 1)]))
 
 
 def test_a_kept_agent_s_score() -> None:
@@ -64,17 +64,17 @@ def test_a_kept_agent_s_score() -> None:
     agents = {"late": Late(env), "expert": ExpertAgent(env, EXPERT), "random": RandomAgent(PUSH.action_space)}
     # `rescore` steps environments of its own, whose theta an expert among the agents would have to see.
     returns = {name: run_trials(env, agent, 2, 7).returns for name, agent in agents.items()}
-    zero, one = returns["random"].mean(), returns["expert"].mean()
-    found = score_command.rescore(agents["random"], PUSH, EXPERT, 64, 7, PUSH)
-    assert np.mean(found["score"]) == pytest.approx(0, abs=1e-4)
-    assert found["return"]["expert"] == pytest.approx(returns["expert"].mean(0), abs=1e-4)
+    random_return, expert_return = returns["random"].mean(), returns["expert"].mean()
+    result = score_command.rescore(agents["random"], PUSH, EXPERT, 64, 7, PUSH)
+    assert np.mean(result["score"]) == pytest.approx(0, abs=1e-4)
+    assert result["return"]["expert"] == pytest.approx(returns["expert"].mean(0), abs=1e-4)
     replayed = Replayed(run_trials(env, agents["late"], 2, 7).trials.action)
-    found = score_command.rescore(replayed, PUSH, EXPERT, 64, 7, PUSH)
-    by_trial = (returns["late"] - zero) / (one - zero)
-    assert found["score"] == pytest.approx(by_trial.mean(0), abs=1e-4)
-    assert found["score"][0] < 0.3 < 0.8 < found["score"][1]
+    result = score_command.rescore(replayed, PUSH, EXPERT, 64, 7, PUSH)
+    by_trial = (returns["late"] - random_return) / (expert_return - random_return)
+    assert result["score"] == pytest.approx(by_trial.mean(0), abs=1e-4)
+    assert result["score"][0] < 0.3 < 0.8 < result["score"][1]
     half = 1.96 * by_trial[:, 1].std() / 8
-    assert found["ci95_last"] == pytest.approx((by_trial[:, 1].mean() - half, by_trial[:, 1].mean() + half), abs=0.02)
+    assert result["ci95_last"] == pytest.approx((by_trial[:, 1].mean() - half, by_trial[:, 1].mean() + half), abs=0.02)
 
 
 class Replayed(Agent):
@@ -95,29 +95,29 @@ def test_eq_1_is_over_the_steps_that_took_place() -> None:
     """By hand, of episodes that end early: the log-density of the expert's normal noise of .1 about its mean."""
     env = envs.BatchEnv(PUSH, 16)
     trials, _, theta = run_trials(env, RandomAgent(PUSH.action_space), 2, 3)
-    found = objective(EXPERT, trials, theta)
+    by_episode = objective(EXPERT, trials, theta)
     for b in range(16):
         for e in range(2):
             n = int(trials.mask[b, e].sum())
             mean = toys.control(trials.obs[b, e, :n], np.tile(theta[b, e], (n, 1)))
             by_hand = norm.logpdf(trials.action[b, e, :n], mean, 0.1).sum()
-            assert found[b, e] == pytest.approx(by_hand, rel=1e-4)
+            assert by_episode[b, e] == pytest.approx(by_hand, rel=1e-4)
 
 
 def test_intervals_over_tasks_are_of_95_percent() -> None:
     """Of the interquartile mean over two tasks of 20 seeds each: they hold the truth about as often, in 150 tries."""
     rng, held = np.random.default_rng(1), []
     for _ in range(150):
-        found = statistics.over_tasks(statistics.iqm, {name: rng.standard_normal(20) for name in "ab"})
-        assert found is not None
-        assert found.interval is not None
-        held.append(found.interval[0] <= 0 <= found.interval[1])
+        figure = statistics.over_tasks(statistics.iqm, {name: rng.standard_normal(20) for name in "ab"})
+        assert figure is not None
+        assert figure.interval is not None
+        held.append(figure.interval[0] <= 0 <= figure.interval[1])
     assert 0.89 < np.mean(held) < 0.98
 
 
 def last_of_records() -> dict[str, dict[str, tuple[float, float]]]:
     """By task and method, the score in the last episode and the return there: from the lines of docs/records alone."""
-    found: dict[str, dict[str, tuple[float, float]]] = {}
+    last_by_task: dict[str, dict[str, tuple[float, float]]] = {}
     for file in (ROOT / "docs" / "records").glob("*.jsonl"):
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         newest = max(line["task_version"] for line in lines)
@@ -126,16 +126,16 @@ def last_of_records() -> dict[str, dict[str, tuple[float, float]]]:
             if line["task_version"] == newest and line["preset"] == "default" and not line["set"] and not line["salt"]:
                 name = f"{line['method']}_{line['deployment']}" if line["deployment"] else line["method"]
                 by_method.setdefault(name, []).append(line["returns"][: line["episodes"]])
-        zero, one = np.mean(by_method["random"]), np.mean(by_method["expert"])
+        low, high = np.mean(by_method["random"]), np.mean(by_method["expert"])
         last = {name: np.mean(returns, 0)[-1] for name, returns in by_method.items()}
-        found[file.stem] = {name: ((value - zero) / (one - zero), value) for name, value in last.items()}
-    return found
+        last_by_task[file.stem] = {name: ((value - low) / (high - low), value) for name, value in last.items()}
+    return last_by_task
 
 
 def tables(text: str) -> list[list[list[str]]]:
     """The cells of each table of a page in Markdown, its head first."""
-    found = re.findall(r"(?:^\|.*\|\n)+", text + "\n", re.M)
-    return [[[x.strip() for x in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
+    blocks = re.findall(r"(?:^\|.*\|\n)+", text + "\n", re.M)
+    return [[[x.strip() for x in line.strip("|").split("|")] for line in table.splitlines()] for table in blocks]
 
 
 @pytest.fixture(scope="module")
@@ -236,9 +236,9 @@ def test_episodes_beyond_training_move_no_score() -> None:
     seeds = {"random": [0.0, 0.0, 9.0, 9.0], "expert": [10.0, 10.0, 50.0, 50.0]}
     by_method = {name: [record(name, returns)] * 2 for name, returns in seeds.items()}
     by_method["other"] = [record("other", [2.0, 4.0, 30.0, 40.0]), record("other", [2.0, 6.0, 30.0, 40.0])]
-    found = score.summarise(by_method, 2)["other"]
-    assert (found["score"], found["score_last"], found["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
-    assert found["ci95"] == pytest.approx([0.4, 0.6])
+    summary = score.summarise(by_method, 2)["other"]
+    assert (summary["score"], summary["score_last"], summary["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
+    assert summary["ci95"] == pytest.approx([0.4, 0.6])
 
 
 def test_rows_csv_is_row_by_row_what_came_of_it() -> None:
@@ -274,9 +274,9 @@ def test_features_are_kept_as_they_were_when_overwritten(monkeypatch: pytest.Mon
     seen: list[Any] = []
     monkeypatch.setattr(benchmark, "probe", lambda features, theta: (seen.append(features[0, 0]), (0.0, None))[1])
     context = Context(PUSH, tiny_preset(), [0], expert="tests.toys:control")
-    found = evaluate(context, Remembering(PUSH.action_space), True)[0]
+    measured = evaluate(context, Remembering(PUSH.action_space), True)[0]
     assert seen == [0, 1, 2, 3]
-    assert found["returns"].shape == found["objective"].shape == found["theta"].shape[:2] == (4, 4)
+    assert measured["returns"].shape == measured["objective"].shape == measured["theta"].shape[:2] == (4, 4)
 
 
 def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
@@ -290,10 +290,10 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
 def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """0 is its random actions, 1 its expert; checks are of the last episode; a clone that learned nothing is at 0."""
     monkeypatch.setattr(memoryless_bc, "train", lambda *_: RandomAgent(PUSH.action_space))
-    found = certify.certify(PUSH, EXPERT, trials=12, grid=5)
+    certificate = certify.certify(PUSH, EXPERT, trials=12, grid=5)
     for name in ("interventional", "conditional"):
-        zero, one = found["return_random"], found["return_expert"]
-        scores = [(value - zero) / (one - zero) for value in found[name]["return"]]
-        assert found[name]["score"] == pytest.approx(scores)
-        assert found["checks"][f"{name}_last"]["measured"] == pytest.approx(scores[-1], abs=1e-4)
-    assert found["checks"]["blind_bc"]["measured"] == 0
+        random_return, expert_return = certificate["return_random"], certificate["return_expert"]
+        scores = [(value - random_return) / (expert_return - random_return) for value in certificate[name]["return"]]
+        assert certificate[name]["score"] == pytest.approx(scores)
+        assert certificate["checks"][f"{name}_last"]["measured"] == pytest.approx(scores[-1], abs=1e-4)
+    assert certificate["checks"]["blind_bc"]["measured"] == 0

@@ -94,11 +94,11 @@ def test_a_job_s_file_has_its_own_seed_s_thetas(salt: str, tmp_path: Path, monke
     job = BenchmarkJob("rolling_deck", replace(tiny_preset(), eval_trials=3), "random", (0, 1), tmp_path, salt=salt)
     job.run()
     for seed in (0, 1):
-        found = job.load(seed)
-        assert found is not None
+        data = job.load(seed)
+        assert data is not None
         task = envs.get("rolling_deck")
         expected = thetas(task, 3, task.episodes, stream(EVALUATION, seed, salt))
-        np.testing.assert_array_equal(found["random/theta"], expected)
+        np.testing.assert_array_equal(data["random/theta"], expected)
         assert (expected != thetas(task, 3, task.episodes, stream(EVALUATION, seed, f"{salt}x"))).all()
 
 
@@ -143,8 +143,8 @@ class TestDrift:
         trials, theta = context.explore_with_theta(None, context.rngs)
         velocity = trials.obs[..., 1]
         force = (velocity[..., 1:] - 0.8 * velocity[..., :-1]) / 0.4 - trials.action[..., 0]
-        shown = [(force[:, e] - theta[:, e])[trials.mask[:, e]] for e in range(2)]
-        assert [np.sqrt(np.mean(x**2)) for x in shown] == pytest.approx([0.125, 0.125], abs=0.02)
+        offsets = [(force[:, e] - theta[:, e])[trials.mask[:, e]] for e in range(2)]
+        assert [np.sqrt(np.mean(x**2)) for x in offsets] == pytest.approx([0.125, 0.125], abs=0.02)
 
     def test_an_oracle_reads_the_theta_of_the_episode(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Trials whose action is their episode's theta: so is the feature beside every step that it clones."""

@@ -102,11 +102,11 @@ def test_no_theta_can_be_drawn_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for seed in range(20):
         for salt in ("", SALT, training):
             assert not np.isin(thetas(task, n, 1, stream(EVALUATION, seed, salt)), theta).any()
-    shown = np.load(tmp_path / "shown.npz")["obs"]
-    np.testing.assert_array_equal(shown, Context(task, tiny_preset(), [0], salt=training).demonstrations.obs)
+    demonstrated = np.load(tmp_path / "shown.npz")["obs"]
+    np.testing.assert_array_equal(demonstrated, Context(task, tiny_preset(), [0], salt=training).demonstrations.obs)
     for salt in ("", SALT):
         other = Context(task, tiny_preset(), [0], salt=salt).demonstrations.obs
-        assert not np.isin(other[:, :, 1], shown[:, :, 1]).any()
+        assert not np.isin(other[:, :, 1], demonstrated[:, :, 1]).any()
     assert not list((tmp_path / "jobs").glob("demonstrations-*"))
     state = (tmp_path / "state").read_text()
     again = run(tmp_path, steal, monkeypatch)

@@ -143,8 +143,8 @@ def test_a_reading_is_evidence_of_the_state_that_it_was_taken_in() -> None:
     assert isinstance(task, MujocoTask)
     before, after = task.state(rootx=([0.0, 0.0], [0.0, 0.0])), task.state(rootx=([0.0, 0.0], [2.0, 2.0]))
     before[:, -1], after[:, -1] = -1, 1
-    told = exact.log_next(task.simulator(2), before, np.zeros((2, 6)), after, np.array([[1.0], [3.0]]))
-    np.testing.assert_allclose(np.exp(told), [0.8, 0.2])
+    log_likelihood = exact.log_next(task.simulator(2), before, np.zeros((2, 6)), after, np.array([[1.0], [3.0]]))
+    np.testing.assert_allclose(np.exp(log_likelihood), [0.8, 0.2])
 
 
 def test_sensors_read_the_world_after_the_step() -> None:
@@ -173,14 +173,14 @@ def test_actions_are_weighed_by_what_was_seen_before_them(conditional: bool) -> 
     state, action = env.state, agent.act(obs)
     following = env.step(action)[0]
     agent.observe(obs, action, following, np.ones(5, bool))
-    told = np.zeros((5, 7))
+    log_belief = np.zeros((5, 7))
     for k, theta in enumerate(task.theta_grid(7)):
         thetas = np.tile(theta, (5, 1))
-        told[:, k] = task.log_prob(env.state, task.outcome(state, action, thetas))
+        log_belief[:, k] = task.log_prob(env.state, task.outcome(state, action, thetas))
         if conditional:
-            told[:, k] += expert.log_prob(obs, action, thetas)
-    told -= np.logaddexp.reduce(told, -1, keepdims=True)
-    np.testing.assert_allclose(agent.log_belief, told, atol=1e-6)
+            log_belief[:, k] += expert.log_prob(obs, action, thetas)
+    log_belief -= np.logaddexp.reduce(log_belief, -1, keepdims=True)
+    np.testing.assert_allclose(agent.log_belief, log_belief, atol=1e-6)
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "loguniform"])
