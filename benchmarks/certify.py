@@ -4,8 +4,6 @@ Four measurements, none of which needs a trained imitator but the last: what it 
 loudly actions and dynamics speak of theta, what the exact policies make of it, and what a policy without memory does.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

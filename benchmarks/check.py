@@ -3,8 +3,6 @@
 `check_task`, and then every check of the contract that all tasks are held to, a line for each; 1 if any failed.
 """
 
-from __future__ import annotations
-
 import sys
 
 from deconfounded import envs

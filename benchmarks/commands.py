@@ -1,7 +1,5 @@
 """Commands that train methods share this: arguments, their checks, the engine, and the description of a run."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -71,7 +69,13 @@ def check_device(device: str) -> None:
 
 
 def about(
-    kind: type[Job], task: envs.Task, name: str, settings: Preset, changes: Sequence[str], expert: str | None, salt: str
+    kind: "type[Job]",
+    task: envs.Task,
+    name: str,
+    settings: "Preset",
+    changes: Sequence[str],
+    expert: str | None,
+    salt: str,
 ) -> dict[str, Any]:
     """What a folder is for: another run is not to write there. What else matters, each job checks."""
     ours = {method: values for method, values in settings.configs.items() if method not in METHODS.outside}
@@ -81,7 +85,7 @@ def about(
     return {"kind": kind.__name__, **made_of, "salt": salt, "episodes": task.episodes}
 
 
-def engine(cluster: str | None) -> Engine:
+def engine(cluster: str | None) -> "Engine":
     """What jobs run on: processes of this machine, or the Ray cluster of that address."""
     if cluster is None:
         from deconfounded.benchmarks.engine.local import Local
@@ -93,8 +97,8 @@ def engine(cluster: str | None) -> Engine:
 
 
 def run(
-    kind: type[Job], task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
-) -> tuple[Finished, dict[str, Any]]:
+    kind: "type[Job]", task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
+) -> "tuple[Finished, dict[str, Any]]":
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all

@@ -1,7 +1,5 @@
 """What commands share: their arguments, and one line for bad input and for signals. It imports what is quick alone."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io
@@ -136,7 +134,7 @@ class Stoppable:
 
     stopped: int | None = None  # by which signal
 
-    def __enter__(self) -> Stoppable:
+    def __enter__(self) -> "Stoppable":
         self._last = -CLEANING_S
         self._before = _heed(self._stop)
         return self

@@ -4,8 +4,6 @@ The expert's trials are those that seed 0 of a run imitates; --explore writes tr
 sha256 is of the contents: made again anywhere with the same versions, it is the same.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib.util import find_spec
 

@@ -5,8 +5,6 @@ folder, or an .npz as `Trials.save` writes it; each trial is under a hidden thet
 diagnosis.json. Interrupted, it goes on where it was.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import time
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
     from deconfounded.experts.rollout import Trials
 
 
-def trials_of(source: Path) -> Trials:
+def trials_of(source: Path) -> "Trials":
     """What a file or a data set's folder holds. Raises InputError if that is no trials."""
     from deconfounded.experts.rollout import Trials
 
@@ -40,7 +38,7 @@ class Refit:
 
     trials: Path
     explore: Path | None
-    amounts: Amounts
+    amounts: "Amounts"
     index: int
     seed: int
     refits: int
@@ -58,7 +56,7 @@ class Refit:
     def file(self) -> Path:
         return self.folder / f"refit-{self.index}.json"
 
-    def findings(self) -> Findings | None:
+    def findings(self) -> "Findings | None":
         """What was measured, if it was of the same."""
         from deconfounded.deconf.diagnosis.measures import Findings
 
@@ -89,7 +87,7 @@ class Refit:
         return f"measured in {time.time() - start:.0f} s"
 
 
-def run(source: Path, exploration: Path | None, seed: int, folder: Path, command: str) -> tuple[Diagnosis, str]:
+def run(source: Path, exploration: Path | None, seed: int, folder: Path, command: str) -> "tuple[Diagnosis, str]":
     """Diagnose, and write the page and the json; returns what to print too. What the folder has of the same, stays.
 
     Raises InputError for data that cannot be judged.

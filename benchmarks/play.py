@@ -3,8 +3,6 @@
 Prints the return of each episode of a trial, under one theta; --video writes what it looked like.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

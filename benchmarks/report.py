@@ -3,8 +3,6 @@
 Nothing is trained, and nothing is made that is not there.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from deconfounded import envs

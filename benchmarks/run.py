@@ -6,8 +6,6 @@ Seeds of a method run side by side in one program, in as many groups as there ar
 (method, seed) has a file, written when it is done, and --resume goes on from the files that are there.
 """
 
-from __future__ import annotations
-
 if __name__ == "__main__":  # this file is `deconf run` too
     from deconfounded.__main__ import main as deconf
 

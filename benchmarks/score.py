@@ -4,8 +4,6 @@ Thetas are drawn from p(theta) by --seed and --salt, or with --range from anothe
 you like: what the expert, random actions and the agent then make of it are measured side by side.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

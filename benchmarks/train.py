@@ -1,7 +1,5 @@
 """Train a task's expert with PPO on the view that sees theta: `deconf train --task slippery_cartpole`."""
 
-from __future__ import annotations
-
 import os
 import platform
 import time

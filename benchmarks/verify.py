@@ -4,8 +4,6 @@ Says `same bits`, `inside the interval` (the mean return of every episode within
 `not the same`, and what differs in how they were made. Exit code 1 for `not the same`.
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -5,8 +5,6 @@ Arrays and tensors may have more axes in front; losses average over the last one
 bandit: envs/tasks/bandit.py.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -46,18 +44,18 @@ def belief_update(log_belief: Values, log_dynamics: Values, log_policy: Values |
     return joint - joint.logsumexp(-1, keepdim=True)
 
 
-def gaussian_kl(mean: Tensor, std: Tensor, prior_mean: Tensor, prior_std: Tensor) -> Tensor:
+def gaussian_kl(mean: "Tensor", std: "Tensor", prior_mean: "Tensor", prior_std: "Tensor") -> "Tensor":
     """KL( N(mean, std^2) || N(prior_mean, prior_std^2) ), summed over the last axis: [..., D] -> [...]."""
     ratio = std / prior_std
     return 0.5 * (((mean - prior_mean) / prior_std) ** 2 + ratio**2 - 1 - 2 * ratio.log()).sum(-1)
 
 
-def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
+def masked_mean(x: "Tensor", mask: "Tensor") -> "Tensor":
     """The mean over the last axis of entries [..., M] whose mask is 1; 0 where there is none."""
     return (x * mask).sum(-1) / mask.sum(-1).clamp(min=1)
 
 
-def inference_loss(log_next: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
+def inference_loss(log_next: "Tensor", kl: "Tensor", beta: float, mask: "Tensor") -> "Tensor":
     """The negative of Eq. (6), averaged over steps.
 
     log_next: log p_psi(s_{t+1} | s_t, a_t, theta_hat) for theta_hat ~ q_phi(. | tau_:t), and kl: of q_phi(. | tau_:t)
@@ -66,7 +64,7 @@ def inference_loss(log_next: Tensor, kl: Tensor, beta: float, mask: Tensor) -> T
     return -masked_mean(log_next - beta * kl, mask)
 
 
-def offline_loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, mask: Tensor) -> Tensor:
+def offline_loss(log_next: "Tensor", log_policy: "Tensor", kl: "Tensor", beta: float, mask: "Tensor") -> "Tensor":
     """The negative of Eq. (7), averaged over trajectories.
 
     log_next, log_policy, mask [..., B, T]: of steps, for theta_hat ~ q_phi_off(. | tau_e); kl [..., B]: of
@@ -75,12 +73,12 @@ def offline_loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, 
     return -(((log_next + log_policy) * mask).sum(-1) - beta * kl).mean(-1)
 
 
-def imitation_loss(log_policy: Tensor, mask: Tensor) -> Tensor:
+def imitation_loss(log_policy: "Tensor", mask: "Tensor") -> "Tensor":
     """The last line of Algorithm 1: the mean over steps of -log pi_eta(a | s, ...) [..., M]."""
     return -masked_mean(log_policy, mask)
 
 
-def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
+def marginal_loss(log_prior: "Tensor", log_next: "Tensor", mask: "Tensor") -> "Tensor":
     """Footnote 4: -log sum_k p(k) prod_t p_psi(s_{t+1} | s_t, a_t, k), divided by the number of steps.
 
     log_prior [..., K], log_next [..., B, T, K], mask [..., B, T] -> [...].
@@ -90,6 +88,6 @@ def marginal_loss(log_prior: Tensor, log_next: Tensor, mask: Tensor) -> Tensor:
     return -marginal.sum(-1) / mask.sum((-2, -1)).clamp(min=1)
 
 
-def reparametrise(mean: Tensor, std: Tensor, noise: Tensor) -> Tensor:
+def reparametrise(mean: "Tensor", std: "Tensor", noise: "Tensor") -> "Tensor":
     """theta_hat ~ N(mean, std^2), differentiable, from noise ~ N(0, 1); [..., D]."""
     return mean + std * noise

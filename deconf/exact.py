@@ -5,8 +5,6 @@ density of the process noise about the simulation of one control step. Values of
 simulation (`Grid.log_dynamics`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ requests more of them. A method from outside runs in a process of its own. This 
 cheating: files can be read, and the seeds of a run without a salt are public.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -40,7 +38,7 @@ class Given:
     """
 
     def __init__(
-        self, ask: Ask, about: Mapping[str, Any], config: Any, rngs: Sequence[np.random.Generator], monitor: Monitor
+        self, ask: Ask, about: Mapping[str, Any], config: Any, rngs: Sequence[np.random.Generator], monitor: "Monitor"
     ) -> None:
         self._ask, self.config, self.rngs, self.monitor = ask, config, list(rngs), monitor
         self.observations: int = about["observations"]
@@ -81,7 +79,7 @@ class Given:
         """Roll out an agent as in `explore`, with the expert's action at each step [B, E, T, A]."""
         return self._ask("queries", trials, agent=agent)
 
-    def environments(self, seed: int, n: int) -> Environments:
+    def environments(self, seed: int, n: int) -> "Environments":
         """n environments of the seed of that index, under fresh thetas, for exploration step by step."""
         return Environments(self._ask, self._ask("environments", seed, n), n)
 

@@ -1,7 +1,5 @@
 """A guest's end of the connection: requests of a method from outside for data, and calls of its agent."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

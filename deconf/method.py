@@ -1,7 +1,5 @@
 """A method's declaration: the data that it uses, its version, and its configuration by kind of task and preset."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -65,7 +63,7 @@ class Method:
             return "sees theta"
         return "3" if "queries" in self.uses else "2" if "exploration" in self.uses else "1"
 
-    def amounts(self, preset: str, task: Task, device: str) -> dict[str, Any]:
+    def amounts(self, preset: str, task: "Task", device: str) -> dict[str, Any]:
         """The configuration on a task, in a preset, as plain values; empty if there is none."""
         discrete = task.n_actions > 0
         config = self.on_bandit if discrete and self.on_bandit is not None else self.on_control

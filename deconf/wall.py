@@ -4,8 +4,6 @@ It holds no tasks, experts, benchmarks or simulators, and refuses to import them
 simple attacks, not all: the process has the rights of its user.
 """
 
-from __future__ import annotations
-
 import sys
 from importlib.abc import MetaPathFinder
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Messages of a guest: json and plain arrays as bytes, so that reading them runs none of the guest's code."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -5,8 +5,6 @@ install goes without. Importing this package imports none of them, so that who w
 more than these.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +14,7 @@ if TYPE_CHECKING:
     from deconfounded.experts.rollout import Agent
 
 
-def load(folder: Path | str) -> Agent:
+def load(folder: Path | str) -> "Agent":
     """The agent that `agent.save(folder)` or a run left in a folder; see `experts.saved`."""
     from deconfounded.experts import store
 

@@ -3,8 +3,6 @@
 Each name below is a module whose `main` reads the rest of the line; `deconf NAME --help` shows it.
 """
 
-from __future__ import annotations
-
 import importlib
 import sys
 

@@ -1,7 +1,5 @@
 """What holds for every test: tasks that it registers are gone after it; those that need dm_control are skipped."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from importlib.util import find_spec
 

@@ -8,8 +8,6 @@ Records are kept as long as versions stay (`benchmarks/engine/identity.py`), so 
 precision: then threads and CPU kernels move a number by some 1e-12, and a change of behaviour by far more.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import datetime

@@ -1,7 +1,5 @@
 """What is kept in fingerprints.json is what today's code does, on any CPU; and a change of behaviour moves it."""
 
-from __future__ import annotations
-
 import functools
 import os
 import subprocess

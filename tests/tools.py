@@ -1,7 +1,5 @@
 """What tests share."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Small tasks for methods' fingerprints, which do not move when a task of the suite changes."""
 
-from __future__ import annotations
-
 import numpy as np
 from gymnasium import spaces
 

@@ -8,8 +8,6 @@ states of the file, under its actions, half of them the expert's and half unifor
 these. *Expert*: returns of two episodes of it, which acts on what it sees. docs/versions.md says what follows from it.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmark's job: train one method with some seeds, deploy it, and write down what came of it."""
 
-from __future__ import annotations
-
 import contextlib
 import secrets
 from collections.abc import Callable, Sequence

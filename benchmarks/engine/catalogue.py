@@ -1,7 +1,5 @@
 """What there is to run, by name: methods and presets. It imports next to nothing, so that a command can list them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

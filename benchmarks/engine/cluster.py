@@ -1,7 +1,5 @@
 """Jobs on a Ray cluster. Files go to a worker and come back by value: machines share nothing but what is installed."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,7 +1,5 @@
 """The data of one task and some seeds, made when first asked for. What of it a method is handed: see provider.py."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -38,7 +36,7 @@ class Context:
     def __init__(
         self,
         task: envs.Task,
-        preset: Preset,
+        preset: "Preset",
         seeds: Sequence[int],
         monitor: Monitor | None = None,
         folder: Path | None = None,

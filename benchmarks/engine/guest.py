@@ -4,8 +4,6 @@ This side keeps them. It answers what the method asks for if it declared that it
 environments in which the method's agent acts.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

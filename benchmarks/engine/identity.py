@@ -6,8 +6,6 @@ behaviour without a new version is noticed. The text of this package is in no id
 change nothing. What is from outside has no version: theirs is the text of their files (`sources.py`).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -37,7 +35,7 @@ AMOUNTS = {  # of a preset, by what a method uses
 }
 
 
-def identity(job: Job) -> dict[str, Any]:
+def identity(job: "Job") -> dict[str, Any]:
     """All that the results of a job's seeds depend on, but for the seed, as json holds it.
 
     `outside` is empty where all is ours.

@@ -1,7 +1,5 @@
 """A job: one method with some seeds, its files, its checkpoint, and its progress."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -73,7 +71,7 @@ class Job(ABC):
         """Of progress: in proportion to how long a job takes."""
         return 100 * self.about.cost * len(self.seeds)
 
-    def save(self, seed: int, arrays: dict[str, Any], monitor: JobMonitor, meta: dict[str, Any]) -> None:
+    def save(self, seed: int, arrays: dict[str, Any], monitor: "JobMonitor", meta: dict[str, Any]) -> None:
         """Write the file of a seed, atomically; beside `meta` it holds the seed's budget, and when work went on."""
         buffer = io.BytesIO()
         i = self.seeds.index(seed)

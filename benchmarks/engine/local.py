@@ -1,7 +1,5 @@
 """Jobs in processes of this machine, one a core."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal
@@ -33,7 +31,7 @@ def die_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def start_worker(ticks: Queue[int]) -> None:
+def start_worker(ticks: "Queue[int]") -> None:
     """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
     die_with_parent()
     escape_output()
@@ -63,7 +61,7 @@ class Local(Engine):
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("spawn")
-        self._ticks: Queue[int] = self._context.Queue()
+        self._ticks: "Queue[int]" = self._context.Queue()
         self._executor: ProcessPoolExecutor | None = None
 
     def __exit__(self, *error: object) -> None:

@@ -1,7 +1,5 @@
 """How much data each preset spends, by kind of task, and with what amounts each method trains."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -27,7 +25,7 @@ class Preset:
     device: str = "cpu"
     configs: dict[str, dict[str, Any]] = field(default_factory=dict, hash=False)  # of methods, by name
 
-    def configured(self, method: str, **changes: Any) -> Preset:
+    def configured(self, method: str, **changes: Any) -> "Preset":
         """The same with other values of a method's configuration."""
         return replace(self, configs={**self.configs, method: self.configs[method] | changes})
 

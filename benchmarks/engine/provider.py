@@ -4,8 +4,6 @@ The methods of this package are handed it in this process: what they hold refers
 A method from outside asks from a process of its own (`guest.py`).
 """
 
-from __future__ import annotations
-
 import itertools
 import weakref
 from collections.abc import Callable, Sequence

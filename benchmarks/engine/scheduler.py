@@ -1,7 +1,5 @@
 """Jobs side by side on an engine: those whose files are missing or stale, longest first."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence

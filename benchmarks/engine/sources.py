@@ -4,8 +4,6 @@ A digest covers the file named, the modules and packages beside it that it impor
 Installed libraries count by their versions instead (`identity.versions`).
 """
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import inspect

@@ -1,7 +1,5 @@
 """What jobs leave in a run's folder, one file a (method, seed): what is in it is finished, and kept."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A job in a worker of a cluster, in a folder of its own: what it needs is sent there, what it leaves is sent back."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """A diagnosis for people: index.html, which needs no other file, and diagnosis.json for programs."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The film of a run: agents side by side under one theta, and under each what it believes of theta as time goes by."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """docs/index.html: all results as one static file, to sort, filter and look into; made of the records alone."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures: panels to draw in, the colour of each method, and marks in files that say what they are made of."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io

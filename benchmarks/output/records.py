@@ -4,8 +4,6 @@ A file `<task>.jsonl` holds a record a line, each with its own checksum; `read` 
 it. Records of different versions of a task or a method, or of different presets, never stand in one table.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence

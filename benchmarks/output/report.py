@@ -1,7 +1,5 @@
 """Pictures, video and a self-contained report.html from the files of a finished run."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

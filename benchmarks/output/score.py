@@ -1,7 +1,5 @@
 """Scores from returns: 0 = random actions, 1 = the expert that sees theta. No training happens here."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ its seeds [S]. A run is a seed of a task; tasks may differ in S. Intervals are o
 intervals of the stratified bootstrap: seeds are drawn anew within each task.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

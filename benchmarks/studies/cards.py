@@ -1,7 +1,5 @@
 """docs/tasks.md: the card of every task, read off its class, its models and its certificate."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Iterable, Sequence

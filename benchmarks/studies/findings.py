@@ -1,7 +1,5 @@
 """What studies left in docs/, as parts of pages: of speed.json, validation.json, spectrum.json and tuning.json."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

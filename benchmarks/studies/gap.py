@@ -1,7 +1,5 @@
 """Over all tasks: the gap that the exact policies predict, against the one measured between learned agents."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Process noise is that of every joint, times a factor; the expert's is its action
 experts' networks are the suite's own.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import mujoco

@@ -4,8 +4,6 @@ Figure 2: roll-outs of expert, conditional and interventional policy. Figure 3: 
 and online (b), imitation loss (c) and best-arm pulls (d) during training; learned agents against the exact policies.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -7,8 +7,6 @@ come for free. cost: score in the last episode against CPU seconds, for each lea
 preset's updates; where the curve is flat, a smaller share does. Each part writes a .json, and most a .png.
 """
 
-from __future__ import annotations
-
 import argparse
 import platform
 import time
@@ -118,7 +116,7 @@ def growth(args: argparse.Namespace) -> None:
             axes.legend(frameon=False)
 
 
-def few(full: Preset) -> Preset:
+def few(full: "Preset") -> "Preset":
     """The preset's networks and batches, on little data and for few updates."""
     small = {"rounds": 1, "final_updates": 0, "inference_updates": UPDATES, "imitation_updates": UPDATES}
     little = replace(full, expert_trials=128, explore_trials=128, eval_trials=1, fresh=0)
@@ -126,7 +124,7 @@ def few(full: Preset) -> Preset:
     return little.configured("naive_rnn", updates=UPDATES, chunk=min(full.configs["naive_rnn"]["chunk"], 50))
 
 
-def update_seconds(task: envs.Task, settings: Preset, method: str, seeds: int) -> dict[str, float]:
+def update_seconds(task: envs.Task, settings: "Preset", method: str, seeds: int) -> dict[str, float]:
     """Seconds of an update of so many seeds in one program, by kind of update."""
     from deconfounded.benchmarks.engine.context import Context
     from deconfounded.benchmarks.engine.provider import fit

@@ -6,8 +6,6 @@ it is looked at before anything is changed. Without a run it writes the pages al
 README's picture of docs/index.html, which takes Chromium.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil
@@ -165,7 +163,7 @@ def chromium() -> str | None:
 
 
 @contextmanager
-def browser(width: int, height: int, dark: bool = False) -> Iterator[Page]:
+def browser(width: int, height: int, dark: bool = False) -> "Iterator[Page]":
     """An empty page of that size, px. Raises InputError without a browser, without Playwright, or for what it says."""
     path = chromium()
     if path is None:

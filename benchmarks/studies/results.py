@@ -1,7 +1,5 @@
 """Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and opponents.md."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

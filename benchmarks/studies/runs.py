@@ -3,8 +3,6 @@
 What a folder has of either stays, so that an interrupted study goes on where it was.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 
 def run(
     task: envs.Task,
-    settings: Preset,
+    settings: "Preset",
     methods: Sequence[str],
     seeds: Sequence[int],
     folder: Path,
@@ -31,8 +29,8 @@ def run(
     preset: str = "default",
     changes: Sequence[str] = (),
     cluster: str | None = None,
-    base: Preset | None = None,
-) -> list[Record]:
+    base: "Preset | None" = None,
+) -> "list[Record]":
     """The records of the methods' seeds on a task; base: the settings the folder is for, if others follow there."""
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.scheduler import listed, run_all

@@ -5,8 +5,6 @@ The cartpole on a tilted rail and the car on an icy road, with process noise or 
 Interrupted, it goes on where it was.
 """
 
-from __future__ import annotations
-
 from itertools import chain
 from pathlib import Path
 from typing import Any

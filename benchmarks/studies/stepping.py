@@ -6,8 +6,6 @@ SyncVectorEnv over our single env, and raw mj_step in one thread times the threa
 on their own model.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import version

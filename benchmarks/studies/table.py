@@ -5,8 +5,6 @@ exact policies, and five of all others. A record of today's versions, settings a
 and kept as soon as they are done. Stopped, it goes on where it was. The first five seeds of everything come first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,7 +26,7 @@ def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
     return tuple(range(least, most if method in (*DEFAULT, *REFERENCES) else min(most, FEWER)))
 
 
-def missing(job: Job, preset: str, kept: Sequence[Record]) -> tuple[int, ...]:
+def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...]:
     """The job's seeds of which there is no record among those kept of its task, or one that is stale today."""
     from deconfounded.benchmarks.engine.identity import identity
     from deconfounded.benchmarks.output import records

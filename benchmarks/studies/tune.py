@@ -5,8 +5,6 @@ rail and the bandit. Their seeds are no others' (`SEEDS`). What came of each set
 once. Interrupted, it goes on where it was; what is there of today's versions and amounts stays.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,7 +49,7 @@ BEFORE: dict[str, Change] = {
 """What was chosen, undone: so the search begins where it began, whatever today's preset has of it."""
 
 
-def other(settings: Preset, method: str, change: Change) -> Preset:
+def other(settings: "Preset", method: str, change: Change) -> "Preset":
     """The amounts with a change of a method's configuration."""
     values = {}
     for name, by in change.items():
@@ -60,7 +58,7 @@ def other(settings: Preset, method: str, change: Change) -> Preset:
     return settings.configured(method, **values)
 
 
-def began(today: Preset) -> Preset:
+def began(today: "Preset") -> "Preset":
     """The amounts that the search begins with."""
     for method, change in BEFORE.items():
         today = other(today, method, change)

@@ -1,7 +1,5 @@
 """Tasks that are not confounded, each for a reason of its own, and their experts."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

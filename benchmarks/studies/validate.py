@@ -6,8 +6,6 @@ thresholds were set. Each row of docs/diagnose/validation.json has the verdict, 
 that were measured; a case that is diagnosed again takes its row's place. Interrupted, it goes on where it was.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -45,7 +43,7 @@ KEPT = "diagnose/validation"
 FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # of the table
 
 
-def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
+def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
     """Whether a diagnosis says what is so; of a certified task, that Tier 2 cures it.
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
@@ -59,7 +57,7 @@ def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
     return alike or (diagnosis.verdict, diagnosis.tier) == truth
 
 
-def predicted(diagnosis: Diagnosis) -> float:
+def predicted(diagnosis: "Diagnosis") -> float:
     """The gap that Tier 2 could close, in scores; 0 where nothing is confounded, or alike, or queries are needed."""
     from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 

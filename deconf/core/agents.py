@@ -1,7 +1,5 @@
 """Checkpoints of training, and the agent of S seeds that learned methods return."""
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -126,7 +124,7 @@ class LearnedAgent(Agent):
 
     @classmethod
     @abstractmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> LearnedAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "LearnedAgent":
         """An untrained agent with networks of that shape."""
 
     def state(self) -> State:
@@ -135,7 +133,7 @@ class LearnedAgent(Agent):
         return settings, {key: x.cpu().numpy().copy() for key, x in named}
 
     @classmethod
-    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> LearnedAgent:
+    def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> "LearnedAgent":
         signature, seeds = Signature(**settings["signature"]), settings["seeds"]
         zeros = torch.zeros(seeds, 2, signature.obs)
         draws = Draws([np.random.default_rng(0) for _ in range(seeds)], "cpu")
@@ -146,7 +144,7 @@ class LearnedAgent(Agent):
             part.eval()
         return agent
 
-    def of_seed(self, i: int) -> LearnedAgent:
+    def of_seed(self, i: int) -> "LearnedAgent":
         """The agent of the i-th seed alone, on the CPU."""
         settings, arrays = self.state()
         own = {key: x[i : i + 1] if x.ndim else x for key, x in arrays.items()}  # the first axis is of seeds

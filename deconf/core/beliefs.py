@@ -4,8 +4,6 @@ A belief keeps a memory of a history and reads a Gaussian over theta_hat from it
 prefixes of a batch of trials at once (`forward`), or one transition at a time (`start`, `update`), alike.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import torch

@@ -1,7 +1,5 @@
 """Random numbers and trials of S seeds side by side, as tensors with a leading axis of S."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -81,7 +79,7 @@ class Signature:
     binary: bool
 
     @staticmethod
-    def of(trials: Trials) -> Signature:
+    def of(trials: Trials) -> "Signature":
         """The signature of trials. Observations that are all 0 or 1 are modelled as Bernoulli, others as Gaussian."""
         trials = trials_of(trials)
         binary = bool(np.isin(trials.obs, (0, 1)).all())
@@ -133,7 +131,7 @@ class Batch:
     mask: Tensor
 
     @staticmethod
-    def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> Batch:
+    def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> "Batch":
         """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
         trials = trials_of(trials)
         if len(trials) % seeds:
@@ -151,7 +149,7 @@ class Batch:
     @staticmethod
     def step(
         obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> Batch:
+    ) -> "Batch":
         """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
         rows = [torch.as_tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
         action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
@@ -162,14 +160,14 @@ class Batch:
         """obs, action, next_obs and mask."""
         return self.obs, self.action, self.next_obs, self.mask
 
-    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int | None, ...]) -> Batch:
+    def __getitem__(self, index: slice | Tensor | tuple[slice | Tensor | int | None, ...]) -> "Batch":
         return Batch(*(x[index] for x in self.tensors))
 
-    def trials(self, index: Tensor) -> Batch:
+    def trials(self, index: Tensor) -> "Batch":
         """Trials index[s] of each seed s, [S, K]."""
         return Batch(*(take(x, index) for x in self.tensors))
 
-    def steps(self, index: Tensor) -> Batch:
+    def steps(self, index: Tensor) -> "Batch":
         """Steps index[s] [S, K] of each seed s, indices as in `draw_steps`; without a time axis."""
         return Batch(*(take_steps(x, index) for x in self.tensors))
 
@@ -177,7 +175,7 @@ class Batch:
     def _step_count(self) -> Tensor:
         return self.mask.flatten(1).cumsum(1, dtype=torch.int64)
 
-    def joined(self, other: Batch) -> Batch:
+    def joined(self, other: "Batch") -> "Batch":
         """The trials of both batches, padded to the same length."""
         steps = max(self.mask.shape[2], other.mask.shape[2])
 
@@ -188,7 +186,7 @@ class Batch:
             *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
         )
 
-    def beginnings(self, update: int, shortest: float) -> Batch:
+    def beginnings(self, update: int, shortest: float) -> "Batch":
         """The first n steps of every trial; over updates 0, 1, 2, ... n is log-uniform between a share of them and all.
 
         In deployment beliefs are about beginnings of trials, and most is learned there. Long sequences are needed, but
@@ -198,7 +196,7 @@ class Batch:
         golden = (5**0.5 - 1) / 2
         return self[:, :, : max(1, round(self.mask.shape[2] * shortest ** (golden * update % 1)))]
 
-    def draw_trials(self, k: int | None, draws: Draws) -> Batch:
+    def draw_trials(self, k: int | None, draws: Draws) -> "Batch":
         """k trials of each seed, uniformly, with replacement; None: all."""
         return self if k is None else self.trials(draws.integers(len(self), k))
 

@@ -5,8 +5,6 @@ earlier episodes keeps a share of its memory: evidence is tempered, p(theta | ea
 share is chosen without theta, by how well the belief predicts the next observations of exploration trials.
 """
 
-from __future__ import annotations
-
 import torch
 
 from deconfounded.deconf.core.data import Batch, Draws, trials_of

@@ -1,7 +1,5 @@
 """A GRU (Cho et al., 2014) along time, with a gradient of its own that takes a CPU less time than autograd's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

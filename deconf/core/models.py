@@ -4,8 +4,6 @@ Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a, theta_hat), trained on 
 dynamics, and exact Bayesian inference over which one it is (footnote 4).
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 

@@ -1,7 +1,5 @@
 """The monitor of training: progress, checkpoints, and the amounts of data used."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +24,7 @@ class Monitor:
         before = self.budget.get(kind, [0] * len(amounts))
         self.budget[kind] = [int(a + b) for a, b in zip(before, amounts, strict=True)]
 
-    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
+    def update(self, done: int, total: int, losses: dict[str, float], agent: "Agent | None" = None) -> None:
         """Report updates done and in all, losses by name (means over seeds), and the agent so far, if it can act."""
 
     def save(self, state: Callable[[], Training]) -> None:

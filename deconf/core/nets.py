@@ -4,8 +4,6 @@ S seeds train in one program: every parameter and every tensor has a leading axi
 seed's numbers are the same, bit for bit, whatever runs beside it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import Any

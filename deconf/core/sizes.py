@@ -1,7 +1,5 @@
 """Sizes of networks, by the width of observations, and the values that configurations can hold."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, get_args, get_type_hints
 

@@ -1,7 +1,5 @@
 """A termination model, p(terminated | s'), for rollouts in learned dynamics. The horizon is no termination."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -1,7 +1,5 @@
 """Deviation of trajectories from a reference set, by a few features of each episode, relative to chance."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -3,8 +3,6 @@
 `measures.measure` computes the figures on several splits of the trials; here they are judged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -72,7 +70,7 @@ class Figure(NamedTuple):
     high: float
 
     @staticmethod
-    def of(refits: Sequence[float]) -> Figure:
+    def of(refits: Sequence[float]) -> "Figure":
         """The figure of the refits' values."""
         return Figure(sum(refits) / len(refits), min(refits), max(refits))
 

@@ -1,7 +1,5 @@
 """Exploration near the expert's trajectories, blind to theta: a memoryless clone with some random actions."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from deconfounded.deconf.core.data import Rngs

@@ -1,7 +1,5 @@
 """A latent that explains an expert's trials: inferred from the dynamics alone, or from actions and dynamics."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple

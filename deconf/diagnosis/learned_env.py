@@ -1,7 +1,5 @@
 """The learned environment: rollouts of policies in learned dynamics, under latents inferred from the data."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Protocol

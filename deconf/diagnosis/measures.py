@@ -7,8 +7,6 @@ rollouts in the learned dynamics, under latents of the data: the naive clone and
 the dynamics are compared with the expert policy given it, by trajectories and by actions, as in Eq. (1).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -57,7 +55,7 @@ class Amounts:
         default_factory=lambda: DeconfoundedConfig(inference_updates=2000, shortest=1 / 4)
     )  # with shorter sets the bandit's latent is ignored for too long
 
-    def fitting(self, width: int) -> Amounts:
+    def fitting(self, width: int) -> "Amounts":
         """Hyperparameters with networks that are large enough for observations of that width."""
         if width < LARGE_OBSERVATION:
             return self

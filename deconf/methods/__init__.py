@@ -3,8 +3,6 @@
 A method is a function with the decorator `uses` (deconf/method.py), given here as module:function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from importlib import import_module
 

@@ -1,7 +1,5 @@
 """Blind behavioural cloning: pi(a | s), without memory and without theta."""
 
-from __future__ import annotations
-
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc

@@ -11,8 +11,6 @@ The memory is a sum of evidence over transitions, in any order (see EvidenceBeli
 as long, and scored .11 on `swapped_lander`, not .9.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -67,14 +65,14 @@ class DaggerAgent(LearnedAgent):
     @staticmethod
     def new(
         width: int, latent: int, forgets: bool, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> DaggerAgent:
+    ) -> "DaggerAgent":
         """An untrained agent. forgets: its memory is reset at each episode."""
         memory = EvidenceBelief(latent, width, signature, obs, change, draws)
         policy = ActionHead(memory.inputs.obs_width + latent, width, signature, draws)
         return DaggerAgent(memory.eval(), policy, latent, forgets)
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DaggerAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DaggerAgent":
         sizes = (shape["width"], shape["latent"], shape["forgets"])
         return cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
 

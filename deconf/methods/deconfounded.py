@@ -5,8 +5,6 @@ trials, given which a latent-conditional policy pi_eta(a | s, theta_hat) is clon
 theta_hat from its belief (posterior sampling), acts, and updates the belief on the transition.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -74,13 +72,13 @@ class DeconfoundedAgent(LearnedAgent):
     @staticmethod
     def new(
         kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> DeconfoundedAgent:
+    ) -> "DeconfoundedAgent":
         """An untrained agent. Raises InputError for an unknown kind of model."""
         model = new_model(kind, latent, width, signature, obs, change, draws)
         return DeconfoundedAgent(model.eval(), ActionHead(model.inputs.obs_width + latent, width, signature, draws))
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> DeconfoundedAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DeconfoundedAgent":
         sizes = (shape["model"], shape["latent"], shape["width"])
         agent = cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
         agent.resample = shape["resample"]

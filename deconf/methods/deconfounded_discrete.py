@@ -1,7 +1,5 @@
 """Deconfounded imitation with a discrete latent: a mixture of K dynamics models, with an exact posterior."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from deconfounded.deconf.given import Given

@@ -1,7 +1,5 @@
 """Deconfounded imitation with the paper's belief: a GRU over transitions, not a sum of evidence."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from deconfounded.deconf.given import Given

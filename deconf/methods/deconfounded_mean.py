@@ -6,8 +6,6 @@ not the belief after the whole trial. The KL divergence is from the belief of th
 latent of a step predicts several transitions, not one. The reconstruction loss is the squared error.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
@@ -58,7 +56,7 @@ class MeanAgent(DeconfoundedAgent):
     @staticmethod
     def new(
         kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> MeanAgent:
+    ) -> "MeanAgent":
         """An untrained agent. Raises InputError for a model without a mean."""
         if kind not in ("evidence", "gru"):
             raise InputError(f"model was {kind!r}; it must be evidence or gru")

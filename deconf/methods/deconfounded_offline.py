@@ -6,8 +6,6 @@ evidence, but the dynamics do not: synthetic trials are rolled out in them under
 and an online encoder is trained on these, Eq. (6). It is deployed as in Tier 2, by Algorithm 2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -9,8 +9,6 @@ RecurrentPPO is sb3-contrib's. An episode of PPO is a whole trial, so that the L
 trains seeds one after another, each with random numbers of its own; discriminators are trained side by side.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -99,7 +97,7 @@ class GailAgent(LearnedAgent):
         self.lstm, self.obs, self.width = lstm, obs, lstm.width
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> GailAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "GailAgent":
         width = shape["width"]
         lstm = Lstm(signature.obs + signature.action_features + 1, width, draws)
         return cls(lstm, PpoHead(width, signature, draws), obs)
@@ -175,7 +173,7 @@ class Discriminator(nn.Module):
         obs, action, next_obs = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
         return self(Batch(obs, action, next_obs, obs[..., 0]))[0].cpu().numpy()
 
-    def of_seed(self, i: int) -> Discriminator:
+    def of_seed(self, i: int) -> "Discriminator":
         """A copy of the i-th seed's discriminator."""
         single = copy.deepcopy(self)
         for tensor in (*single.parameters(), *single.buffers()):
@@ -204,7 +202,7 @@ def train(
     agent = GailAgent.blank({"width": config.width}, signature, obs, draws)
     mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
 
-    def vector(i: int) -> TrialVecEnv:
+    def vector(i: int) -> "TrialVecEnv":
         reward = discriminator.of_seed(i).reward
         return TrialVecEnv(environments(i, config.envs), space, mean[i], std[i], reward)
 

@@ -1,7 +1,5 @@
 """GAIL's PPO: vector environments without theta, whose episode is a whole trial, and the recurrent policy."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
@@ -120,7 +118,7 @@ class PpoState:
         self.ppo.policy.optimizer.load_state_dict(state["adam"])
 
 
-def new_ppo(env: TrialVecEnv, config: GailConfig, seed: int) -> RecurrentPPO:
+def new_ppo(env: TrialVecEnv, config: "GailConfig", seed: int) -> RecurrentPPO:
     """An untrained RecurrentPPO. Its actions have a mean near 0 and a std of .6."""
     widths = [config.width, config.width]
     policy = {

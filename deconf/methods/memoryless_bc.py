@@ -1,7 +1,5 @@
 """Memoryless behavioural cloning: blind BC, pi(a | s), and oracle BC, pi(a | s, theta)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -39,7 +37,7 @@ class MemorylessAgent(LearnedAgent):
         self.scaler, self.side = scaler, side
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> MemorylessAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "MemorylessAgent":
         """An untrained agent. An oracle's `side` has to be set before it is deployed."""
         return cls(ActionHead(signature.obs + shape["theta"], shape["width"], signature, draws), obs, None)
 

@@ -4,8 +4,6 @@ The memory reads each past action with probability 1 - dropout in training, and 
 naive_rnn's.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ Without past actions the imitator cannot take its own for evidence of theta, but
 where theta shows only there, as on the bandit, nothing is learned of it. All else is naive_rnn's.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

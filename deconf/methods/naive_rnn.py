@@ -5,8 +5,6 @@ comparison it is trained on whole trials, its memory outlives resets, and its hi
 belief.
 """
 
-from __future__ import annotations
-
 from deconfounded.deconf.core.data import Rngs, Source
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.given import Given

@@ -6,8 +6,6 @@ Positions are rotary (Su et al., 2021), and so relative: deployment may be longe
 `window` tokens, as many as a trial of training has.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,14 +121,14 @@ class TransformerAgent(LearnedAgent):
         self.net, self.obs = net, obs
 
     @staticmethod
-    def new(shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> TransformerAgent:
+    def new(shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "TransformerAgent":
         """An untrained agent."""
         inputs = 2 * signature.obs + signature.action_features + 1
         net = Transformer(inputs, shape["width"], shape["layers"], shape["heads"], shape["window"], draws)
         return TransformerAgent(net, ActionHead(shape["width"] + signature.obs, shape["width"], signature, draws), obs)
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> TransformerAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "TransformerAgent":
         return cls.new(shape, signature, obs, draws)
 
     def shape(self) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Oracle behavioural cloning: pi(a | s, theta), which sees theta in training and when it is deployed."""
 
-from __future__ import annotations
-
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc

@@ -5,8 +5,6 @@ memory and previous action, given the expert's next action, by kernels; 0 where 
 covers the last action alone: older actions may leak, and so may a theta that was wrongly inferred from them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

@@ -4,8 +4,6 @@ The exact policies hold the posterior of theta on a grid: `conditional` takes it
 `interventional` does not, Eq. (5).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from deconfounded.deconf.core.sizes import Configuration

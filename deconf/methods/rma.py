@@ -5,8 +5,6 @@ teacher's policy on an estimate of theta, which a recurrent network regresses on
 are the student's, and so no evidence of theta. The estimate is a point, the mean, without uncertainty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +69,7 @@ class RmaAgent(LearnedAgent):
         self.adapter, self.obs = adapter, obs
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RmaAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "RmaAgent":
         width, theta = shape["width"], shape["theta"]
         policy = ActionHead(signature.obs + theta, shape["teacher"], signature, draws)
         return cls(Adapter(width, theta, signature, obs, draws), policy, obs)

@@ -3,8 +3,6 @@
 A recurrent policy pi_eta(a_t | s_1, a_1, ..., s_t) is trained by maximum likelihood with truncated backpropagation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, TypeVar
@@ -108,7 +106,7 @@ class RecurrentAgent(LearnedAgent):
         """Take over further settings that the loss needs."""
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> RecurrentAgent:
+    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "RecurrentAgent":
         return cls.new(shape["width"], signature, obs, draws)
 
     def shape(self) -> dict[str, Any]:

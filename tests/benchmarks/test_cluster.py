@@ -1,7 +1,5 @@
 """Jobs on Ray: two nodes on this machine, one of which dies; what travels, and what is told where it cannot be."""
 
-from __future__ import annotations
-
 import os
 import queue
 import time

@@ -1,7 +1,5 @@
 """Commands as a user runs them: bad input, resuming, and the examples in the documents."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import json

@@ -1,7 +1,5 @@
 """A few of what the programs in tests/faults/ do at length; see docs/faults.md."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Jobs of a run: a checkpoint within one, and what it must not change."""
 
-from __future__ import annotations
-
 import json
 import queue
 from collections.abc import Iterator

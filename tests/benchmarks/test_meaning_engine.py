@@ -1,7 +1,5 @@
 """The engine and commands by what they claim: done is what is done, and an exit code of 0 says that all went well."""
 
-from __future__ import annotations
-
 import os
 import queue
 import signal

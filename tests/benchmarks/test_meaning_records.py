@@ -1,7 +1,5 @@
 """Records by what they claim: what they were made of decides whether they are kept, and they can be made again."""
 
-from __future__ import annotations
-
 import queue
 import shutil
 from dataclasses import replace

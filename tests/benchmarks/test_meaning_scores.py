@@ -1,7 +1,5 @@
 """Scores by what they mean: worked out again from records or returns, or simulated."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Theta by what it means: imitators see it through the world alone, and scoring has the true one."""
 
-from __future__ import annotations
-
 import queue
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; README's."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib.metadata
 import json

@@ -1,7 +1,5 @@
 """Figures over seeds and tasks, and the pages that show them, in a real browser where there is one."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator
@@ -283,7 +281,7 @@ class TestIndex:
 
 
 @pytest.fixture(scope="module", params=[(1280, False), (400, True)], ids=["desk", "phone, dark"])
-def seen(request: pytest.FixtureRequest) -> Iterator[Page]:
+def seen(request: pytest.FixtureRequest) -> "Iterator[Page]":
     """A page of two sizes."""
     if publish.chromium() is None:
         pytest.skip(f"no browser: none of {', '.join(publish.BROWSERS)} is installed")
@@ -294,7 +292,7 @@ def seen(request: pytest.FixtureRequest) -> Iterator[Page]:
 
 
 @pytest.fixture
-def errors(seen: Page) -> list[str]:
+def errors(seen: "Page") -> list[str]:
     """What the page complains of from now on."""
     heard = list[str]()
     seen.on("pageerror", lambda error: heard.append(str(error)))
@@ -305,7 +303,7 @@ def errors(seen: Page) -> list[str]:
 CELLS = "[...document.querySelectorAll('#matrix td[data-task={}]')].map(c => c.dataset.method)"
 
 
-def choose(seen: Page, **what: str) -> None:
+def choose(seen: "Page", **what: str) -> None:
     """Use the page's filter."""
     for name, value in what.items():
         change = f"form.{name}.value = {json.dumps(value)}; form.dispatchEvent(new Event('change'))"
@@ -314,10 +312,10 @@ def choose(seen: Page, **what: str) -> None:
 
 class TestInABrowser:
     @pytest.fixture(autouse=True)
-    def fresh(self, seen: Page, errors: list[str]) -> None:
+    def fresh(self, seen: "Page", errors: list[str]) -> None:
         seen.goto((DOCS / "index.html").as_uri())
 
-    def test_it_fits_and_does_not_complain(self, seen: Page, errors: list[str]) -> None:
+    def test_it_fits_and_does_not_complain(self, seen: "Page", errors: list[str]) -> None:
         """No error, no request that leaves the disk, nothing wider than the screen, with all tasks open."""
         seen.evaluate("document.querySelectorAll('details').forEach(one => { one.open = true })")
         seen.evaluate("new Promise(done => setTimeout(done, 100))")
@@ -332,7 +330,7 @@ class TestInABrowser:
             "[...document.querySelectorAll('.adaptation, .learning > figure')].every(one => one.querySelector('svg'))"
         )
 
-    def test_sorting(self, seen: Page, made: dict[str, Any]) -> None:
+    def test_sorting(self, seen: "Page", made: dict[str, Any]) -> None:
         task = made["tasks"][0]["name"]
         of_task = [row for row in made["rows"] if row["task"] == task]
         expected = [row["method"] for row in sorted(of_task, key=lambda row: -row["value"])]
@@ -349,7 +347,7 @@ class TestInABrowser:
         assert cpu == sorted(cpu, reverse=True)
         assert len(cpu) == len(made["rows"])
 
-    def test_filters(self, seen: Page, made: dict[str, Any], errors: list[str]) -> None:
+    def test_filters(self, seen: "Page", made: dict[str, Any], errors: list[str]) -> None:
         tiers = {task["name"]: task["tier"] for task in made["tasks"]}
         counted = "document.getElementById('count').textContent"
         total = len(made["rows"])
@@ -369,7 +367,7 @@ class TestInABrowser:
         assert seen.evaluate(counted) == f"0 of {total} results"
         assert errors == []
 
-    def test_the_card_of_a_number(self, seen: Page, made: dict[str, Any]) -> None:
+    def test_the_card_of_a_number(self, seen: "Page", made: dict[str, Any]) -> None:
         """On hover, or on a tap: seeds, interval, curves and the command; it lies on the screen."""
         row = next(row for row in made["rows"] if row["method"] == "naive_rnn" and row["trained"] > 1)
         cell = f"#matrix td[data-task={row['task']}][data-method=naive_rnn]"
@@ -391,7 +389,7 @@ class TestInABrowser:
         seen.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {key: 'Escape'}))")
         assert seen.evaluate("document.getElementById('card').hidden")
 
-    def test_curves_tell_on_hover(self, seen: Page) -> None:
+    def test_curves_tell_on_hover(self, seen: "Page") -> None:
         chart = "details[open] .adaptation"
         seen.hover(f"{chart} svg")
         told = seen.evaluate(f"document.querySelector('{chart} .readout').textContent")
@@ -399,7 +397,7 @@ class TestInABrowser:
         assert seen.evaluate(f"document.querySelectorAll('{chart} .mark.on').length") == 1
 
 
-def test_report_in_a_browser(seen: Page, errors: list[str], tmp_path: Path) -> None:
+def test_report_in_a_browser(seen: "Page", errors: list[str], tmp_path: Path) -> None:
     """A run's report fits as well; its table scrolls, and each method has its curves."""
     results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
     report.adaptation(results, tmp_path / "adaptation.png")

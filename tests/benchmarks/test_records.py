@@ -1,7 +1,5 @@
 """What is kept of a run: when it is believed, what becomes of it, and whether it comes out again."""
 
-from __future__ import annotations
-
 import json
 import platform
 import queue

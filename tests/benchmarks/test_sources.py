@@ -1,7 +1,5 @@
 """The files that a task from outside depends on: they are its identity, and go where it goes."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import struct

@@ -1,7 +1,5 @@
 """Tasks under more and less noise, and the pictures over tasks."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the studies share, and what the benchmark costs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

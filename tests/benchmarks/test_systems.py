@@ -1,7 +1,5 @@
 """What other systems do differently: the spawn start method, forks, copies, no symbolic links, an ASCII locale."""
 
-from __future__ import annotations
-
 import ast
 import copy
 import json

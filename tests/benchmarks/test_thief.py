@@ -1,7 +1,5 @@
 """Attacks of a method from outside on what it did not declare: each must fail."""
 
-from __future__ import annotations
-
 import json
 import os
 import queue

@@ -1,7 +1,5 @@
 """The sdist and the wheel: what they hold, and that commands work as installed; all in folders with spaces."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

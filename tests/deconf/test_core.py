@@ -1,7 +1,5 @@
 """The core: equations against numbers by hand, beliefs, data types, and methods on little data."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

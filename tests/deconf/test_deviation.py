@@ -1,7 +1,5 @@
 """Deviation of trajectories: 1 by chance, more with distance, and of the coordinate that deviates alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

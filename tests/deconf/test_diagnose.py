@@ -1,7 +1,5 @@
 """Diagnosis: bad input is refused in one line, figures lead to their verdicts, and the commands run."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """Evidence of a latent in the dynamics, and the size of their noise, in a small world where both are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Theta does not leak, and protocols do not change: each test fails on a fault that others had not noticed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Learning by what it means: padding is read by nobody, gradients are clipped, exploration is what it says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Opponents: past actions are hidden or dropped, transformers are causal, GAIL's environments hide theta."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Episodes that terminate early do so in the learned environment too."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where the theory ends: on each task marked so, what must fail fails, and what must work works."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 from typing import Any
 

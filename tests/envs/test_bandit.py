@@ -1,7 +1,5 @@
 """The bandit's closed forms: Eq. (3), (4), (5), (8) and (9), by hand and against science's Monte Carlo."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A slip in a task file is one line that names the part, whoever runs the task."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What every registered task must hold, and no task escapes: the contract over the registry, and what is left of it."""
 
-from __future__ import annotations
-
 import gymnasium
 import mujoco
 import numpy as np

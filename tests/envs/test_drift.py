@@ -1,7 +1,5 @@
 """Latents that drift from episode to episode: their distribution, the exact filter, and how learned beliefs forget."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """What users of gymnasium and dm_env are in the habit of doing: trials in vectors, pictures, videos, time limits."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings

@@ -1,7 +1,5 @@
 """Physics by what it means: returns of known policies, directions, sizes of noise, and what evidence is of."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

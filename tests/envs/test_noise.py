@@ -1,7 +1,5 @@
 """Process noise by hand, and on rotations: normalised, blind to a quaternion's sign, and of the std it states."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """MuJoCo as tasks from outside use it: a simulation that fails says so, and edits mean what the MJCF means."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """Pictures beside what else is loaded in their process."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

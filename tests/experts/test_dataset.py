@@ -1,7 +1,5 @@
 """Data that travels: Trials to a Minari data set and back."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

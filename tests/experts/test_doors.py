@@ -1,7 +1,5 @@
 """What comes in from outside is what it says it is, or one line: nothing is converted, cut or broadcast in silence."""
 
-from __future__ import annotations
-
 import os
 import pickle
 import re

@@ -6,8 +6,6 @@ processes, bit for bit; what was finished at a kill must be the same file in the
 Exit code 1 if not.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import os

@@ -5,8 +5,6 @@ again, or told of in one line); *harmless*: what is read is equal to what was wr
 is *believed* or an *error* of another kind, and makes this end with 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import queue
 import shutil

@@ -5,8 +5,6 @@ is replaced by a mark that it was reached. *told*: one line and exit code 2 (of 
 *accepted*: taken as it is, which the case must say is right. Anything else is a traceback, or accepted in silence.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import importlib

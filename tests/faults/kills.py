@@ -6,8 +6,6 @@ bit: returns of every trial, agents, records and results, but for the time they 
 from what is in --out.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

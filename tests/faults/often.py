@@ -1,7 +1,5 @@
 """`deconf run` that leaves a checkpoint within a job every .3 s, in its worker processes too: for kills.py."""
 
-from __future__ import annotations
-
 from deconfounded.__main__ import main
 from deconfounded.benchmarks.engine import jobs
 

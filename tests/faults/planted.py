@@ -5,8 +5,6 @@ Its tests are run on the copy with `-x`; one of them must fail. Words after the 
 `noticed by <test>` or `NOT NOTICED` for each; exit code 1 if any was not noticed.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
