@@ -61,7 +61,7 @@ class Local(Engine):
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("spawn")
-        self._ticks: "Queue[int]" = self._context.Queue()
+        self._ticks: Queue[int] = self._context.Queue()
         self._executor: ProcessPoolExecutor | None = None
 
     def __exit__(self, *error: object) -> None:
