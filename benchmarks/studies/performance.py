@@ -55,10 +55,11 @@ def speed(args: argparse.Namespace) -> None:
 
 def by_steps(steps: int) -> dict[str, float]:
     """CPU seconds of an update of the evidence belief, and of a pass of the RNN, on 16 trials of so many steps."""
+    from deconfounded.deconf.core.adam import Adam
     from deconfounded.deconf.core.data import Batch, Draws, Signature
     from deconfounded.deconf.core.models import VariationalModel
     from deconfounded.deconf.core.monitor import Monitor
-    from deconfounded.deconf.core.nets import Adam, scalers
+    from deconfounded.deconf.core.nets import scalers
     from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
     from deconfounded.experts.rollout import Trials
 

@@ -12,7 +12,8 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.gru import GruScan
-from deconfounded.deconf.core.nets import Embedding, Inputs, Linear, Scaler, Whitener, mlp, per_seed
+from deconfounded.deconf.core.layers import Linear, Mlp
+from deconfounded.deconf.core.nets import Embedding, Inputs, Scaler, Whitener, per_seed
 
 MAX_PRODUCTS = 16  # of actions and changes, as inputs of the evidence network
 
@@ -83,9 +84,9 @@ class EvidenceBelief(Belief):
         products = signature.obs * signature.action_features
         self.products = products if products <= MAX_PRODUCTS else 0
         inputs = 2 * signature.obs + signature.action_features + self.products
-        self.evidence = mlp(inputs, width, self.width, draws)
+        self.evidence = Mlp(inputs, width, self.width, draws)
         self.whiten = Whitener(self.width, draws)
-        self.out = mlp(2 * self.width + 1, width, 2 * latent, draws)
+        self.out = Mlp(2 * self.width + 1, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
 
     def _terms(self, batch: Batch) -> Tensor:
@@ -101,7 +102,7 @@ class EvidenceBelief(Belief):
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
-        if self.training:
+        if self.training and torch.is_grad_enabled():
             self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
         return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 

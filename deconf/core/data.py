@@ -103,7 +103,8 @@ class Signature:
 
 def take(x: Tensor, index: Tensor) -> Tensor:
     """x [S, M, ...] at each seed's indices [S, K] -> [S, K, ...]."""
-    return x[torch.arange(len(index), device=index.device)[:, None], index]
+    rows = index if len(x) == 1 else index + x.shape[1] * torch.arange(len(x), device=index.device)[:, None]
+    return x.flatten(0, 1).index_select(0, rows.flatten()).unflatten(0, index.shape)
 
 
 def take_steps(x: Tensor, index: Tensor) -> Tensor:

@@ -4,65 +4,67 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from deconfounded.deconf.core.nets import affine
-
-tanh_backward = torch.ops.aten.tanh_backward.grad_input  # fused
-sigmoid_backward = torch.ops.aten.sigmoid_backward.grad_input
+from deconfounded.deconf.core.layers import add_product, parameter_gradients
 
 
 class GruScan(torch.autograd.Function):
     """Inputs x [S, B, T, 3 W] after a memory h [S, B, W] -> memories [S, B, T + 1, W].
 
     The last axis holds the gates r and z and the candidate n: r, z = sigmoid(x + h U + b), n = tanh(x + r (h U + b)).
-    Where mask [S, B, T] is 1, h <- z h + (1 - z) n; where it is 0, h stays. weight U [S, W, 3 W], bias b [S, 1, 3 W].
+    Where mask [S, B, T] is 1, h <- z h + (1 - z) n; where it is 0, h stays: z is 1. weight U [S, W, 3 W], bias b
+    [S, 1, 3 W]. Time is the first axis within, and a step of time is as few operations as there can be.
     """
 
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, mask: Tensor) -> Tensor:
         w, steps = memory.shape[-1], inputs.shape[2]
-        gate_inputs, new_inputs = inputs.permute(2, 0, 1, 3).contiguous().split((2 * w, w), -1)
-        masks = mask.permute(2, 0, 1)[..., None]
+        x = inputs.permute(2, 0, 1, 3)
+        recurrent = bias.expand(*x.shape).clone(memory_format=torch.contiguous_format)  # x + h U + b, b alone for n
+        recurrent[..., : 2 * w] += x[..., : 2 * w]
+        new = x[..., 2 * w :].contiguous()
+        padding = (mask == 0).permute(2, 0, 1)[..., None]
+        paddings = padding.unbind() if padding.any() else [None] * steps
+        gates = memory.new_empty(steps, *memory.shape[:-1], 2 * w)
         memories = memory.new_empty(steps + 1, *memory.shape)
-        gates, news, recurrents = (memory.new_empty(steps, *memory.shape[:-1], k * w) for k in (2, 1, 1))
         memories[0] = memory
-        columns = (gate_inputs, new_inputs, masks, memories[:-1], memories[1:])
-        for gate_input, new_input, real, before, after, gate, reset, keep, new, recurrent in zip(
-            *map(torch.unbind, (*columns, gates, *gates.chunk(2, -1), news, recurrents)), strict=True
+        columns = (recurrent, *recurrent.split((2 * w, w), -1), gates, *gates.chunk(2, -1), new, memories[1:])
+        before = memories[0]
+        for padded, (whole, to_gates, to_new, gate, reset, keep, n, after) in zip(
+            paddings, zip(*map(torch.unbind, columns), strict=True), strict=True
         ):
-            to_gates, to_new = affine(bias, before, weight).split((2 * w, w), -1)
-            torch.add(gate_input, to_gates, out=gate).sigmoid_()
-            recurrent.copy_(to_new)
-            torch.addcmul(new_input, reset, to_new, out=new).tanh_()
-            torch.lerp(before, new, (1 - keep) * real, out=after)
-        ctx.save_for_backward(memories, gates, news, recurrents, masks, weight)
+            add_product(whole, before, weight)
+            torch.sigmoid(to_gates, out=gate)
+            n.addcmul_(reset, to_new).tanh_()
+            if padded is not None:
+                keep.masked_fill_(padded, 1)
+            before = torch.lerp(n, before, keep, out=after)
+        ctx.save_for_backward(memories, gates, new, recurrent, weight)
         return memories.permute(1, 2, 0, 3).contiguous()
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, None]:
-        memories, gates, news, recurrents, masks, weight = ctx.saved_tensors
-        w = news.shape[-1]
+        memories, gates, new, recurrent, weight = ctx.saved_tensors
+        w = new.shape[-1]
+        reset, keep = gates.chunk(2, -1)
+        moved = 1 - keep
+        to_new = (1 - new.square()).mul_(moved)  # of n's input, for each unit of the gradient of the memory
+        # inner: of h U + b, which this gradient multiplies as well.
+        by_reset, by_keep = (
+            (recurrent[..., 2 * w :] * to_new).mul_(reset).mul_(1 - reset),
+            (memories[:-1] - new).mul_(keep).mul_(moved),
+        )
+        inner = torch.stack([by_reset, by_keep, to_new * reset], -2)
         grad = grads[0].permute(2, 0, 1, 3).contiguous()
-        inner = gates.new_empty(*news.shape[:-1], 3 * w)  # gradient of h U + b
-        outer = torch.empty_like(inner)  # gradient of x
-        by_gate = torch.empty_like(gates[0])
-        by_reset, by_keep = by_gate.split(w, -1)
-        gate_grads, new_grads = inner.split((2 * w, w), -1)
-        columns = (memories[:-1], gates, *gates.chunk(2, -1), news, recurrents, masks, grad[:-1])
-        columns = (*columns, inner, gate_grads, new_grads, outer[..., 2 * w :])
-        h, transposed = grad[-1], weight.transpose(1, 2).contiguous()
-        backwards = zip(*(column.unbind()[::-1] for column in columns), strict=True)
-        for before, gate, reset, keep, new, recurrent, real, direct, whole, to_gate, to_new, to_input in backwards:
-            moved = (1 - keep).mul_(real)
-            tanh_backward(h * moved, new, grad_input=to_input)
-            torch.mul(to_input, reset, out=to_new)
-            torch.mul(to_input, recurrent, out=by_reset)
-            torch.mul(torch.sub(before, new).mul_(real), h, out=by_keep)
-            sigmoid_backward(by_gate, gate, grad_input=to_gate)
-            h = affine(torch.addcmul(direct, h, 1 - moved), whole, transposed)
-        outer[..., : 2 * w] = gate_grads
-        rows, out = (x.transpose(0, 1).flatten(1, 2) for x in (memories[:-1], inner))
-        # Seed by seed: a product or a sum over a stack has another order for one seed than for several.
-        by_weight = torch.cat([a.transpose(1, 2) @ b for a, b in zip(rows.split(1), out.split(1), strict=True)])
-        by_bias = torch.cat([row.sum(1, keepdim=True) for row in out.split(1)])
-        return outer.permute(1, 2, 0, 3).contiguous(), h, by_weight, by_bias, None
+        transposed = weight.transpose(1, 2).contiguous()
+        columns = (inner, inner.flatten(-2), keep, grad[:-1])
+        h = grad[-1]
+        for whole, flat, kept, before in zip(*(column.unbind()[::-1] for column in columns), strict=True):
+            whole.mul_(h[..., None, :])
+            h = add_product(before.addcmul_(h, kept), flat, transposed)
+        flat = inner.flatten(-2)
+        outer = torch.cat([flat[..., : 2 * w], to_new.mul_(grad[1:])], -1)
+        by_weight, by_bias = parameter_gradients(*(x.transpose(0, 1).flatten(1, 2) for x in (memories[:-1], flat)))
+        return outer.permute(1, 2, 0, 3), h, by_weight, by_bias, None

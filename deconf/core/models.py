@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
-from deconfounded.deconf.core.nets import Adam, DynamicsHead, Inputs, Scaler, per_seed, sample_index
+from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scaler, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
@@ -77,9 +78,7 @@ class LatentModel(nn.Module, ABC):
 
     def learn(self, optimizer: Adam, batch: Batch, steps: int | None, beta: float, draws: Draws) -> float:
         """One update on `loss`; returns its mean over seeds."""
-        self.train()
         loss = self.loss(batch, steps, beta, draws)
-        self.eval()
         optimizer.step(loss)
         return loss.mean().item()
 

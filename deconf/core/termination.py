@@ -6,8 +6,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Draws, take
-from deconfounded.deconf.core.nets import Adam, Scaler, mlp
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.nets import Scaler
 from deconfounded.experts.rollout import Trials
 
 UPDATES, ROWS, WIDTH, RATE = 600, 1024, 32, 3e-3
@@ -18,7 +20,7 @@ class TerminationModel:
 
     def __init__(self, scaler: Scaler, draws: Draws) -> None:
         self.scaler = scaler
-        self.net = mlp(len(scaler.mean[0]), WIDTH, 1, draws)
+        self.net = Mlp(len(scaler.mean[0]), WIDTH, 1, draws)
 
     def logit(self, obs: Tensor) -> Tensor:
         """Log-odds [1, ...] that the episode ends with next observations [1, ..., O]."""

@@ -7,11 +7,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.core.nets import ActionHead, scalers
 from deconfounded.deconf.diagnosis.learned_env import valid_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
@@ -119,14 +120,12 @@ def _train_dynamics(
         batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, config.shortest)
         half = draws.uniform(*batch.mask.shape[1:]) < 0.5
         context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
-        model.train()
         belief = model.belief(model.last(context))
         index = rest.draw_steps(config.inference_steps, draws)
         steps, trial = rest.steps(index), index // batch.mask.shape[2]
         theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
         loss = model.bound(steps, mean, std, theta_hat, beta)
-        model.eval()
         optimizer.step(loss)
         monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model

@@ -21,12 +21,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, take_steps
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -69,7 +70,7 @@ class DaggerAgent(LearnedAgent):
         """An untrained agent. forgets: its memory is reset at each episode."""
         memory = EvidenceBelief(latent, width, signature, obs, change, draws)
         policy = ActionHead(memory.inputs.obs_width + latent, width, signature, draws)
-        return DaggerAgent(memory.eval(), policy, latent, forgets)
+        return DaggerAgent(memory, policy, latent, forgets)
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DaggerAgent":
@@ -144,9 +145,7 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
         for _ in range(updates[i]):
             index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)
             target = take(label[:, :, : batch.mask.shape[2]], index)
-            agent.memory.train()
             loss = agent.loss(batch.trials(index), target, config.steps, draws)
-            agent.memory.eval()
             optimizer.step(loss)
             done += 1
             monitor.update(done, sum(updates), {"imitation": loss.mean().item()}, agent)

@@ -15,12 +15,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -75,7 +76,7 @@ class DeconfoundedAgent(LearnedAgent):
     ) -> "DeconfoundedAgent":
         """An untrained agent. Raises InputError for an unknown kind of model."""
         model = new_model(kind, latent, width, signature, obs, change, draws)
-        return DeconfoundedAgent(model.eval(), ActionHead(model.inputs.obs_width + latent, width, signature, draws))
+        return DeconfoundedAgent(model, ActionHead(model.inputs.obs_width + latent, width, signature, draws))
 
     @classmethod
     def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DeconfoundedAgent":
@@ -177,7 +178,7 @@ def train(
     # Changes are scaled by both: those of random actions alone can be far smaller, and theta is then learned poorly.
     obs, change = scalers(explored.joined(expert))
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
-    model, policy = agent.model, agent.policy  # the model is in eval mode except in its updates
+    model, policy = agent.model, agent.policy
     inference_batch = config.inference_batch
     if config.drifts:
         model.kept.fill_(0.5)  # during exploration

@@ -12,11 +12,12 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
@@ -61,7 +62,7 @@ class MeanAgent(DeconfoundedAgent):
         if kind not in ("evidence", "gru"):
             raise InputError(f"model was {kind!r}; it must be evidence or gru")
         model = VariationalModel(kind, latent, width, signature, obs, change, draws)
-        return MeanAgent(model.eval(), ActionHead(signature.obs + latent, width, signature, draws))
+        return MeanAgent(model, ActionHead(signature.obs + latent, width, signature, draws))
 
     def latent(self) -> Tensor:
         return self.model.point(self.model.belief(self._memory))
@@ -158,9 +159,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
             explored = explored.joined(Batch.of(explore(agent), len(rngs), device))
         for j in range(config.inference_updates):
             beginnings = explored.beginnings(i * config.inference_updates + j, config.shortest)
-            model.train()
             loss = inference_loss(model, beginnings.draw_trials(config.inference_batch, draws), config, draws)
-            model.eval()
             inference.step(loss)
             done += 1
             monitor.update(done, total, {"inference": loss.mean().item()}, agent)

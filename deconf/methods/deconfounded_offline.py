@@ -11,12 +11,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, scalers
+from deconfounded.deconf.core.nets import ActionHead, scalers
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
@@ -78,7 +79,7 @@ def explain(
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
-    return offline.eval(), online, policy
+    return offline, online, policy
 
 
 def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | None = None) -> DeconfoundedAgent:

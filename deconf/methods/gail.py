@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators
+from deconfounded.deconf.core.layers import Linear, Mlp
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, Linear, Scaler, mlp, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
@@ -79,7 +81,7 @@ class PpoHead(ActionHead):
 
     def __init__(self, width: int, signature: Signature, draws: Draws) -> None:
         super().__init__(width, width, signature, draws)
-        self.net = mlp(width, width, signature.actions or signature.action, draws)
+        self.net = Mlp(width, width, signature.actions or signature.action, draws)
         self.log_std = nn.Parameter(torch.zeros(len(draws), 1, signature.action, device=draws.device))
 
     def _gaussian(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,7 +158,7 @@ class Discriminator(nn.Module):
     def __init__(self, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws) -> None:
         super().__init__()
         self.signature, self.obs, self.change = signature, obs, change
-        self.net = mlp(2 * signature.obs + signature.action_features, width, 1, draws)
+        self.net = Mlp(2 * signature.obs + signature.action_features, width, 1, draws)
 
     def forward(self, batch: Batch) -> Tensor:
         """Steps [S, N] without a time axis -> [S, N]."""

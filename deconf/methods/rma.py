@@ -14,11 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
+from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Adam, Scaler, mlp
+from deconfounded.deconf.core.nets import ActionHead, Scaler
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
@@ -58,7 +60,7 @@ class Adapter(GruMemory):
 
     def __init__(self, width: int, theta: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
         super().__init__(width, signature, obs, draws)
-        self.theta, self.out = theta, mlp(width, width, theta, draws)
+        self.theta, self.out = theta, Mlp(width, width, theta, draws)
 
 
 class RmaAgent(LearnedAgent):

@@ -18,9 +18,10 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Embedding, Linear, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Embedding, Scaler, scalers
 from deconfounded.deconf.equations import (
     belief_update,
     gaussian_kl,
@@ -233,7 +234,7 @@ def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
     model = VariationalModel("evidence", 1, 8, signature, obs, change, draws)
     policy_ = ActionHead(2, 8, signature, draws)
     with torch.no_grad():
-        for layer in policy_.net[:-1:2]:
+        for layer in (policy_.net[0], policy_.net[2]):
             layer.weight.zero_()
             layer.bias.zero_()
         policy_.net[0].weight[0, 1, :2] = torch.tensor([1.0, -1.0])  # reads the latent's sign

@@ -7,9 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import new_model
-from deconfounded.deconf.core.nets import Adam, Linear, Scaler, scalers
+from deconfounded.deconf.core.nets import Scaler, scalers
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
 from deconfounded.deconf.methods import rma

@@ -16,11 +16,12 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import Provider, Vector, fit
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.monitor import Monitor, Training
-from deconfounded.deconf.core.nets import Adam, Scaler, scalers
+from deconfounded.deconf.core.nets import Scaler, scalers
 from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig

@@ -20,8 +20,9 @@ from deconfounded.benchmarks import check, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine.scheduler import run_job
 from deconfounded.deconf import methods
+from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Draws
-from deconfounded.deconf.core.nets import Adam, Linear
+from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.methods import deconfounded, deconfounded_mean, memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanConfig

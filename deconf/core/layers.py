@@ -1,0 +1,126 @@
+"""Layers of S seeds side by side: linear maps and MLPs.
+
+S seeds train in one program: every parameter and every tensor has a leading axis of S. Seeds share nothing, so that a
+seed's numbers are the same, bit for bit, whatever runs beside it.
+"""
+
+import ctypes
+import platform
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from deconfounded.deconf.core.data import Draws
+
+relu_backward = torch.ops.aten.threshold_backward.grad_input
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # of mallopt(3)
+ONEDNN_ABOVE = 16**3  # multiplications: torch hands larger products to oneDNN
+
+
+def prepare_torch() -> None:
+    """Set one thread, since networks are small; keep freed memory; and let oneDNN multiply where MKL is slow.
+
+    C's library gives freed memory back to the system, and to ask for it again takes longer than to use it. On AMD, MKL
+    does not use AVX-512, and oneDNN takes half the time; on Intel it takes twice the time. The setting that selects
+    oneDNN also allows it bfloat16, which it uses where there is AMX: there torch's default stays.
+    """
+    torch.set_num_threads(1)
+    if platform.libc_ver()[0] == "glibc":
+        for option, size in ((M_MMAP_THRESHOLD, 2**25), (M_TRIM_THRESHOLD, 2**30), (M_TOP_PAD, 2**26)):
+            ctypes.CDLL(None).mallopt(option, size)
+    capabilities, processor = torch.cpu.get_capabilities(), Path("/proc/cpuinfo")
+    amd = processor.exists() and "AuthenticAMD" in processor.read_text(encoding="utf-8", errors="replace")
+    if amd and capabilities.get("avx512_f") and not capabilities.get("amx_bf16"):
+        torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
+
+
+prepare_torch()
+
+
+def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
+    """Add rows [S, R, I] weight [S, I, O] to out [S, R, O], with the same bits for a seed however many are stacked."""
+    seeds, inputs, outputs = weight.shape
+    # A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors: bits would differ.
+    if seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1):
+        for operands in zip(out.split(1), rows.split(1), weight.split(1), strict=True):
+            operands[0].baddbmm_(*operands[1:])
+        return out
+    return out.baddbmm_(rows, weight)
+
+
+def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
+    """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
+    seeds, inputs, outputs = weight.shape
+    # A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors: bits would differ.
+    if seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1):
+        by_seed = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
+        return torch.cat([torch.baddbmm(*operands) for operands in by_seed])
+    return torch.baddbmm(bias, rows, weight)
+
+
+class Linear(nn.Module):
+    """S linear maps side by side: [S, ..., I] -> [S, ..., O]."""
+
+    def __init__(self, inputs: int, outputs: int, draws: Draws) -> None:
+        super().__init__()
+        bound = inputs**-0.5
+        self.weight = nn.Parameter((2 * draws.uniform(inputs, outputs) - 1) * bound)
+        self.bias = nn.Parameter((2 * draws.uniform(1, outputs) - 1) * bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = affine(self.bias, x.reshape(len(x), -1, x.shape[-1]), self.weight)
+        return out.reshape(*x.shape[:-1], out.shape[-1])
+
+
+def by_seed(a: Tensor, b: Tensor) -> Tensor:
+    """a [S, N, K] b [S, K, M], seed by seed: products of a stack have another order of sums than those of one seed."""
+    return torch.bmm(a, b) if len(a) == 1 else torch.cat([*map(torch.bmm, a.split(1), b.split(1))])
+
+
+def parameter_gradients(rows: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients [S, I, O] of a weight and [S, 1, O] of a bias; rows [S, R, I] went in, grad [S, R, O] comes back."""
+    bias = [row.sum(1, keepdim=True) for row in grad.split(1)]
+    return by_seed(rows.transpose(1, 2), grad), bias[0] if len(bias) == 1 else torch.cat(bias)
+
+
+class MlpFunction(torch.autograd.Function):
+    """Rows [S, R, I] through three linear maps with ReLU between: one node of the graph, which writes in place."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, *parameters: Tensor) -> Tensor:
+        inputs, weights = [rows], parameters[::2]
+        for weight, bias in zip(weights, parameters[1::2], strict=True):
+            inputs.append(affine(bias, inputs[-1], weight))
+            if len(inputs) <= len(weights):
+                inputs[-1].relu_()
+        ctx.save_for_backward(*inputs[:-1], *weights)
+        return inputs[-1]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        saved = ctx.saved_tensors
+        half, grad, by_parameter = len(saved) // 2, grads[0].contiguous(), list[Tensor]()
+        for i in range(half - 1, -1, -1):
+            by_parameter[:0] = parameter_gradients(saved[i], grad)
+            if i or ctx.needs_input_grad[0]:
+                grad = by_seed(grad, saved[half + i].transpose(1, 2))
+            if i:
+                relu_backward(grad, saved[i], 0, grad_input=grad)
+        return grad if ctx.needs_input_grad[0] else None, *by_parameter
+
+
+class Mlp(nn.Sequential):
+    """An MLP with two hidden layers and ReLU: [S, ..., I] -> [S, ..., O]."""
+
+    def __init__(self, inputs: int, width: int, outputs: int, draws: Draws) -> None:
+        first, second = Linear(inputs, width, draws), Linear(width, width, draws)
+        super().__init__(first, nn.ReLU(), second, nn.ReLU(), Linear(width, outputs, draws))
+
+    def forward(self, x: Tensor) -> Tensor:
+        parameters = [p for layer in (self[0], self[2], self[4]) for p in (layer.weight, layer.bias)]
+        out = MlpFunction.apply(x.reshape(len(x), -1, x.shape[-1]), *parameters)
+        return out.reshape(*x.shape[:-1], out.shape[-1])
