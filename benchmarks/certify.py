@@ -18,7 +18,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.score import normalise
+from deconfounded.benchmarks.output.scoring import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
 from deconfounded.envs.streams import Array

@@ -16,10 +16,10 @@ from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
+    from deconfounded.benchmarks.engine.job_files import Finished
     from deconfounded.benchmarks.engine.jobs import Job
     from deconfounded.benchmarks.engine.presets import Preset
     from deconfounded.benchmarks.engine.scheduler import Engine
-    from deconfounded.benchmarks.engine.store import Finished
 
 
 def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
@@ -100,9 +100,9 @@ def run(
     kind: "type[Job]", task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> "tuple[Finished, dict[str, Any]]":
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
+    from deconfounded.benchmarks.engine.job_files import know_guests, prepare
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import know_guests, prepare
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds

@@ -12,15 +12,15 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, whole
 from deconfounded.envs.support.files import check_file
-from deconfounded.experts import store
+from deconfounded.experts import saved_agents
 from deconfounded.experts.rollout import Agent
 
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    theirs = store.describe(folder).get("spaces")
+    theirs = saved_agents.describe(folder).get("spaces")
     from deconfounded.benchmarks.engine.benchmark import spaces  # torch takes seconds: what is no agent goes without
-    from deconfounded.benchmarks.engine.guest import Stranger
+    from deconfounded.benchmarks.engine.guest_host import ReseededAgent
     from deconfounded.deconf.core.agents import LearnedAgent
     from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 
@@ -29,7 +29,7 @@ def ready(folder: Path, task: envs.Task) -> Agent:
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
-    return agent if isinstance(agent, LearnedAgent) else Stranger(agent)
+    return agent if isinstance(agent, LearnedAgent) else ReseededAgent(agent)
 
 
 def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = None) -> tuple[list[float], list[Any]]:

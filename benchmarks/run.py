@@ -53,8 +53,8 @@ def main() -> None:
     if args.track and not find_spec("tensorboard"):
         raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.output import report  # it takes seconds; bad input is told at once
+    from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is told at once
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, about = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
-    print(report.write(task, about, finished, folder))
+    print(run_report.write(task, about, finished, folder))

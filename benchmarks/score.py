@@ -41,13 +41,13 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
 
 def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
     """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
-    from deconfounded.benchmarks.output import score
+    from deconfounded.benchmarks.output import scoring
 
     env = envs.BatchEnv(where, trials)
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
-    by_trial = score.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
-    interval = score.bootstrap(by_trial[:, -1])
+    by_trial = scoring.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
+    interval = scoring.bootstrap(by_trial[:, -1])
     return {
         "score": by_trial.mean(0).round(4).tolist(),
         "ci95_last": None if interval is None else interval.tolist(),
@@ -69,7 +69,7 @@ def main() -> None:
         check_file(args.out)
     agent = ready(args.agent, task)
     from deconfounded.benchmarks.engine.context import EVALUATION, stream  # torch takes seconds
-    from deconfounded.benchmarks.output.score import two_decimals
+    from deconfounded.benchmarks.output.scoring import two_decimals
 
     scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
     last = "last {:.2f} to {:.2f}, 95% over trials".format(*scored["ci95_last"])

@@ -29,7 +29,7 @@ from deconfounded.benchmarks.engine.benchmark import Recorder
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.presets import Preset, preset
-from deconfounded.benchmarks.output import index, score, statistics
+from deconfounded.benchmarks.output import index, scoring, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
@@ -217,7 +217,7 @@ def of_scores(name: str) -> Numbers:
             ]
             for method, mean in level.items()
         }
-        methods = score.summarise(records, 2)
+        methods = scoring.summarise(records, 2)
         last[task] = index.last_scores(methods)
         for key in ("score", "score_last", "score_beyond", "ci95", "band", "objective", "theta_r2", "cpu_s", "return"):
             numbers[f"{key} of the {task} task"] = sums(
@@ -275,7 +275,7 @@ KINDS: dict[str, Kind] = {
         "`version` in its file in deconf/methods",
     ),
     "protocol": (of_protocol, lambda name: identity.PROTOCOL, ["all"], "PROTOCOL in benchmarks/engine/identity.py"),
-    "scores": (of_scores, lambda name: score.VERSION, ["all"], "VERSION in benchmarks/output/score.py"),
+    "scores": (of_scores, lambda name: scoring.VERSION, ["all"], "VERSION in benchmarks/output/scoring.py"),
     "diagnosis": (of_diagnosis, lambda name: diagnose.VERSION, ["all"], "VERSION in deconf/diagnosis/diagnose.py"),
 }
 EVERY = [f"{kind}:{name}" for kind, (_, _, names, _) in KINDS.items() for name in names]

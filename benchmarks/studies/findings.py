@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output import scoring
 from deconfounded.benchmarks.studies import spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
@@ -20,9 +20,9 @@ def rates() -> str:
     for name, by_size in kept("speed/speed")["tasks"].items():
         few, middle, many = (by_size[n] for n in sizes)
         closed = (f"{by_size[n]['closed_loop']:,.0f}" for n in sizes)
-        shares = (score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
+        shares = (scoring.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
         peers = (f"{few[way]:,.0f}" for way in ("mj_step", "sync_vector_env"))
-        slowdown = score.two_decimals(middle["closed_loop"] / many["closed_loop"])
+        slowdown = scoring.two_decimals(middle["closed_loop"] / many["closed_loop"])
         rows.append((name, *closed, *shares, *peers, slowdown, f"{many['kib']:.0f}"))
     loops = [f"{what} loop, {n}" for what in ("closed", "of open") for n in sizes]
     others = ("mj_step x threads", "SyncVectorEnv, 64", "a step, 4096 / 256", "KiB each")
@@ -67,7 +67,7 @@ def tuning() -> str:
         of = [row for row in tried if row["method"] == method]
         best = chosen(of) if len(of) == BUDGET else None
         for row in of:
-            scores = [score.two_decimals(np.mean(row["scores"][task])) for task in tasks]
+            scores = [scoring.two_decimals(np.mean(row["scores"][task])) for task in tasks]
             cpu = [f"{row['cpu_s'][task]:.0f}" for task in tasks]
             word = "" if row is not best else "kept" if method == UNTUNED else "chosen"
             rows.append((method, row["setting"], *scores, *cpu, word))

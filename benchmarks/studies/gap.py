@@ -8,7 +8,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 
 FORETOLD = "exact interventional less conditional"

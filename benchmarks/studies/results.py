@@ -7,7 +7,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import index, records, score
+from deconfounded.benchmarks.output import index, records, scoring
 from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
@@ -48,19 +48,19 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
 
 def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
-    seeds = score.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
+    seeds = scoring.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
     commits = ", ".join(dict.fromkeys(commit[:7] for commit in results["commits"]))
     rows = []
-    for row in score.rows(results["methods"]):
+    for row in scoring.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
-        rows.append((*row, score.two_decimals(beyond[-1]) if beyond else ""))
+        rows.append((*row, scoring.two_decimals(beyond[-1]) if beyond else ""))
     parts = [
         f"## {task.name}",
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
         f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
-        markdown_table((*score.COLUMNS, "after as many again"), rows),
+        markdown_table((*scoring.COLUMNS, "after as many again"), rows),
         f"![score by episode]({task.name}.png)",
     ]
     if older := outdated(task, results):
@@ -109,9 +109,9 @@ def gaps(found: index.Found) -> list[gap.Gap]:
 
 def summary(found: index.Found) -> str:
     """README's table: scores in the last episode."""
-    rows, column = [], score.COLUMNS.index("last")
+    rows, column = [], scoring.COLUMNS.index("last")
     for task, results in found:
-        last = {row[0]: row[column] for row in score.rows(results["methods"])}
+        last = {row[0]: row[column] for row in scoring.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
@@ -128,7 +128,7 @@ def controls(found: index.Found) -> str:
         returns = {name: np.mean(entry["return"], 0)[-1] for name, entry in entries.items()}
         scores = {name: entry["score_last"] for name, entry in entries.items()}
         for what, last in (("the return here", returns), ("the score here", scores)):
-            rows.append(("", what, *(score.two_decimals(last[name]) if name in last else "" for name in methods)))
+            rows.append(("", what, *(scoring.two_decimals(last[name]) if name in last else "" for name in methods)))
     return markdown_table(("task", "in the last episode", *methods), rows)
 
 
@@ -149,7 +149,7 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
         ends = (end(means, key=means.__getitem__) for end in (min, max))
-        extremes = (f"{task}, {score.two_decimals(means[task])}" for task in ends)
+        extremes = (f"{task}, {scoring.two_decimals(means[task])}" for task in ends)
         figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
         rows.append((name, METHODS[name].tier, str(len(means)), *figures, *extremes))
     summary = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
@@ -158,5 +158,5 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
 
 def _with_interval(figure: dict[str, Any] | None) -> str:
     """Two decimals, and from where to where."""
-    value, *ends = map(score.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
+    value, *ends = map(scoring.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
     return f"{value} ({' to '.join(ends)})" if ends else value

@@ -15,7 +15,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES, check_names
 from deconfounded.benchmarks.output.pictures import colour, panels
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import noise, runs
 from deconfounded.benchmarks.studies.cards import markdown_table, nats
 from deconfounded.envs.support.files import write_json

@@ -17,7 +17,7 @@ from scipy import stats
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import check_names
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
 from deconfounded.benchmarks.studies.cards import DOCS, kept, markdown_table
 from deconfounded.envs.support.files import write_json
