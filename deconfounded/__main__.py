@@ -28,7 +28,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),
     "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper", RESUMED),
     "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
-    "tune": ("benchmarks.studies.tune", "the opponents' tuning", REPEATED),
+    "tune": ("benchmarks.studies.tune", "the baselines' tuning", REPEATED),
     "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise", RESUMED),
 }
 

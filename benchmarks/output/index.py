@@ -16,9 +16,9 @@ from deconfounded.benchmarks.output.pictures import colour
 from deconfounded.envs.streams import Array
 
 NOTE = (
-    "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Opponents were"
+    "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Baselines were"
     " tuned on two of these tasks, with other seeds, to score best. naive_rnn kept its preset, though what else was"
-    " tried scores higher, see opponents.md."
+    " tried scores higher, see baselines.md."
 )
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",

@@ -8,8 +8,8 @@ from deconfounded.benchmarks.output import scoring
 from deconfounded.benchmarks.studies import spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
-UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
-BUDGET = 4  # settings of each opponent
+UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/baselines.md says why
+BUDGET = 4  # settings of each baseline
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
 
 
@@ -60,7 +60,7 @@ def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tuning() -> str:
-    """The table of docs/opponents.md: what `deconf tune` tried of each opponent, and what was best."""
+    """The table of docs/baselines.md: what `deconf tune` tried of each baseline, and what was best."""
     tried, rows = kept("tuning")["rows"], []
     tasks = list(tried[0]["scores"])
     for method in dict.fromkeys(row["method"] for row in tried):

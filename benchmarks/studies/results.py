@@ -1,4 +1,4 @@
-"""Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and opponents.md."""
+"""Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and baselines.md."""
 
 from typing import Any
 
@@ -115,7 +115,7 @@ def summary(found: index.Found) -> str:
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
-    return markdown_table(("task", "tier", *methods, "seconds"), rows)
+    return markdown_table(("task", "tier needed", *methods, "seconds"), rows)
 
 
 def controls(found: index.Found) -> str:
@@ -143,7 +143,7 @@ def costs(found: index.Found) -> str:
 
 
 def fared(found: index.Found, certified: dict[str, Any]) -> str:
-    """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
+    """The table of docs/baselines.md: each method over the tasks whose certificate is passed, best first."""
     scores, rows = index.certified(found, certified), list[tuple[str, ...]]()
     over = index.over_tasks(scores, list(scores))["methods"]
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):

@@ -81,7 +81,7 @@ def test_presets_are_what_tuning_chose() -> None:
     ],
 )
 def test_answers(score: float, naive: float, spread: float, word: str) -> None:
-    """By whether the opponent comes up to the one, or is no better than the other, on the tasks where all were run."""
+    """By whether the baseline comes up to the one, or is no better than the other, on the tasks where all were run."""
     seeds = {0: -0.06, 1: -0.02, 2: 0.0, 3: 0.02, 4: 0.06}
     runs = {"naive_rnn": (naive, 1), "deconfounded": (0.95, 1), "naive_transformer": (score, spread)}
     of = {name: {seed: mean + by * noise for seed, noise in seeds.items()} for name, (mean, by) in runs.items()}
