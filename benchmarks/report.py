@@ -1,6 +1,6 @@
-"""Make a run's tables, pictures and report again from what its jobs left: `deconf report results/bandit-default`
+"""Write a run's tables, pictures and report again, from its finished jobs: `deconf report results/bandit-default`
 
-Nothing is trained, and nothing is made that is not there.
+Nothing is trained. Of a run that is not finished, they show the jobs that are.
 """
 
 from pathlib import Path

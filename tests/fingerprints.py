@@ -246,7 +246,7 @@ def of_diagnosis(name: str) -> Numbers:
         amounts = diagnose.DiagnoseConfig().amounts
         parts = {part: getattr(amounts, part) for part in ("cloning", "naive", "offline", "exploring")}
         less = {part: replace(config, **few(asdict(config))) for part, config in parts.items()}
-        amounts = replace(amounts, **less, rivals=4, dreams=8)
+        amounts = replace(amounts, **less, candidates=4, rollouts=8)
         measured = {
             label: measures.measure(trials, exploration, amounts, np.random.default_rng(5))
             for label, exploration in (("with exploration", explored), ("of expert trials alone", None))

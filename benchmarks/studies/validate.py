@@ -40,7 +40,10 @@ CASES: dict[str, str | None] = {
 TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
 KEPT = "diagnose/validation"
-FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # of the table
+FIGURES = (  # of the table
+    *("memory_gain", "latent_gain", "exploration_evidence", "expert_evidence", "ratio"),
+    *("stakes", "paired_stakes", "model_deviation"),
+)
 
 
 def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
@@ -144,7 +147,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         verdict = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
-        figures = (row["found"][key]["value"] if key in row["found"] else None for key in FIGURES)
+        figures = (row["figures"][key]["value"] if key in row["figures"] else None for key in FIGURES)
         cells = ("" if value is None else two_decimals(value) for value in (*figures, row["predicted"]))
         certified, judged = "passed" if row["certified"] else "failed", "" if row["right"] else "wrong"
         lines.append((row["task"], certified, verdict, judged, *cells, two_decimals(row["measured"])))
@@ -187,7 +190,7 @@ def main() -> None:
             "right": right(task, certified, diagnosis),
             "predicted": predicted(diagnosis),
             "measured": scores["deconfounded"] - scores["naive_rnn"],
-            "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
+            "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
         rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}

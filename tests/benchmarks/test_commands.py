@@ -58,7 +58,7 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
     (("run", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
     (("run",), "--task is missing"),
-    (("run", "--list", "--task", "nonsense"), "it lists all, and goes by itself"),
+    (("run", "--list", "--task", "nonsense"), "it lists all; give it alone"),
     (("run", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
     (("run", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
     (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),

@@ -117,8 +117,8 @@ def test_validation_has_what_the_spectrum_found() -> None:
 def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
     def row(case: str, right: bool, predicted: float, measured: float) -> dict[str, Any]:
         told = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
-        found = {"stakes": {"value": 2 * predicted}}
-        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "found": found}
+        figures = {"stakes": {"value": 2 * predicted}}
+        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "figures": figures}
 
     seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
     ranked = "verdicts are right; predicted and measured gaps rank alike by"
