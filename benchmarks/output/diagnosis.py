@@ -89,8 +89,8 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
                 f" trial's in exploration, whose actions do not depend on it, and {in_trials} in expert trials. If the"
                 f" latter is below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do"
                 f" not identify it. The expert's actions are evidence of it by {in_actions} nats a step,"
-                f" {figure['ratio']} times as much: this is the false confidence of a clone that takes its own actions for"
-                " the expert's.",
+                f" {figure['ratio']} times as much: this is the false confidence of a clone that takes its own actions"
+                " for the expert's.",
                 _bars(evidence, "nats a step", NEGLIGIBLE),
             )
         )
