@@ -16,9 +16,9 @@ from deconfounded.benchmarks.output.pictures import colour
 from deconfounded.envs.streams import Array
 
 NOTE = (
-    "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Baselines were"
-    " tuned on two of these tasks, with other seeds, to score best. naive_rnn kept its preset, though what else was"
-    " tried scores higher, see baselines.md."
+    "Scores in the last episode, over all tasks whose certificate is passed and where all three were run. Baselines"
+    " were tuned for their scores on two of these tasks, with other seeds. naive_rnn kept its preset, though other"
+    " settings score higher, see baselines.md."
 )
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",
@@ -184,7 +184,7 @@ def answers(scores: Scores) -> list[str]:
 
 
 def _answer(scores: Scores, method: str, question: str) -> str | None:
-    """By intervals of 95%: does the method's reach up to that of PEER, and does it keep clear of that of NAIVE?"""
+    """Whether a method's 95% interval overlaps or exceeds that of PEER, and whether it exceeds that of NAIVE."""
     names = (method, NAIVE, PEER)
     tasks = [task for task, of in scores.items() if all(len(of.get(name, ())) > 1 for name in names)]
     if not tasks:
@@ -194,7 +194,7 @@ def _answer(scores: Scores, method: str, question: str) -> str | None:
     (_, low, high), (_, _, naive), (_, peer, _) = means.values()
     helps, enough = low > naive, high >= peer
     if peer <= naive or (enough and not helps):
-        word = "It cannot be told yet"
+        word = "It cannot be decided yet"
     else:
         word = "Yes" if enough else "It helps, but it is not enough" if helps else "No"
     ranges = ("{} {} ({} to {})".format(name, *map(scoring.two_decimals, mean)) for name, mean in means.items())

@@ -60,7 +60,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
         f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
-        markdown_table((*scoring.COLUMNS, "after as many again"), rows),
+        markdown_table((*scoring.COLUMNS, "twice as long"), rows),
         f"![score by episode]({task.name}.png)",
     ]
     if older := outdated(task, results):
@@ -86,18 +86,18 @@ def results_page(found: index.Found, certified: dict[str, Any]) -> str:
     """docs/results.md."""
     head = """# Results
 
-Made by `deconf publish` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
-expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
-theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
-mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
-those of training."""
+Made by `deconf publish` from the [records](records) alone, of which each is of one seed. Scores: 0 = random actions,
+1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that
+sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
+Intervals are 95% bootstrap intervals over seeds; of few seeds they are too narrow: with normal scores an interval of
+five seeds contains the mean in five of six cases, one of ten seeds in nine of ten. *Twice as long*: the last score in a
+trial of twice as many episodes as in training."""
     parts = [head, in_short(found, certified), *(section(*of) for of in found), gap.section(gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def in_short(found: index.Found, certified: dict[str, Any]) -> str:
-    """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
+    """The part of docs/results.md that answers common questions, over the tasks whose certificate is passed."""
     lines = [f"- {answer}" for answer in answers(index.certified(found, certified))]
     return "\n".join(["## In short", "", *lines, "", NOTE]) if lines else ""
 

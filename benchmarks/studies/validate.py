@@ -132,12 +132,12 @@ def _unseen(row: dict[str, Any]) -> bool:
 def summary(rows: list[dict[str, Any]]) -> str:
     """How many are right, and Spearman's correlation of the predicted and the measured gap."""
     sentences = []
-    for what, unseen in (("that thresholds were set by", False), ("not looked at then", True)):
+    for what, unseen in (("by which thresholds were set", False), ("added later", True)):
         of = [row for row in rows if _unseen(row) is unseen]
         if len(of) > 2:
             share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
             rank = stats.spearmanr([row["predicted"] for row in of], [row["measured"] for row in of]).statistic
-            alike = f"predicted and measured gaps rank alike by {two_decimals(rank)}"
+            alike = f"the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
             sentences.append(f"Of cases {what}, {share}; {alike}.")
     return " ".join(sentences)
 

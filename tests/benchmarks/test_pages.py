@@ -77,7 +77,7 @@ def test_presets_are_what_tuning_chose() -> None:
     ("score", "naive", "spread", "word"),
     [
         *((0.95, 0.4, 1, "Yes"), (0.7, 0.4, 1, "It helps, but it is not enough"), (0.4, 0.4, 1, "No")),
-        *((0.7, 0.4, 20, "It cannot be told yet"), (0.95, 0.95, 1, "It cannot be told yet")),
+        *((0.7, 0.4, 20, "It cannot be decided yet"), (0.95, 0.95, 1, "It cannot be decided yet")),
     ],
 )
 def test_answers(score: float, naive: float, spread: float, word: str) -> None:
@@ -209,22 +209,22 @@ class TestOutcome:
             }
         )
         assert found == (
-            "good (0.90) learned what can be known, like the exact policy interventional (1.00); unsure (0.81) may be"
-            " on either side of the middle between the exact policies, 0.80; bad (0.50) fell in with the deluded exact"
-            " policy, conditional (0.60); mute (0.40) has no memory to learn with. Scores of the last episode, means of"
-            " 3 seeds."
+            "good (0.90) inferred theta, like the exact policy interventional (1.00); unsure (0.81) may be"
+            " on either side of the middle between the exact policies, 0.80; bad (0.50) scored like the deluded exact"
+            " policy, conditional (0.60); mute (0.40) has no memory to infer theta with. Scores of the last episode,"
+            " means of 3 seeds."
         )
 
     def test_what_cannot_be_told(self) -> None:
         near = {**self.EXACT, "conditional": entry(0.95, tier="reference"), "one": entry(0.9), "two": entry(0.8)}
         assert scoring.outcome(near).startswith(
-            "Nothing can be told here: the exact policies, interventional (1.00) and"
+            "Nothing can be concluded: the exact policies, interventional (1.00) and"
         )
         assert "no pair of exact policies was run" in scoring.outcome({"one": entry(0.9, None)})
         assert scoring.outcome({"one": entry(0.9, None)}).endswith("of one seed.")
         assert scoring.outcome({"expert": entry(1, tier="reference")}).startswith("No method that learns without theta")
         lone = {name: entry(one["score_last"], None, one["tier"]) for name, one in self.EXACT.items()}
-        assert "one (0.90) learned" in scoring.outcome({**lone, "one": entry(0.9, None)})
+        assert "one (0.90) inferred" in scoring.outcome({**lone, "one": entry(0.9, None)})
 
 
 @pytest.fixture(scope="module")
