@@ -44,8 +44,8 @@ def section(gaps: Sequence[Gap]) -> str:
     text = f"""## Predicted and measured
 
 What naive cloning loses in score, in the last episode: predicted by the exact policies (interventional less
-conditional), and measured (`deconfounded` less `naive_rnn`). Pearson's correlation is {_correlation(explored)}, without the tasks of
-Tier 3. With those, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
+conditional), and measured (`deconfounded` less `naive_rnn`). Without the tasks of Tier 3, Pearson's correlation
+is {_correlation(explored)}. With those, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
     rows = [(one.task.name, two_decimals(one.predicted), two_decimals(one.measured)) for one in gaps]
     table = markdown_table(("task", "predicted", "measured"), rows)
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
