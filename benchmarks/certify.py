@@ -1,7 +1,7 @@
 """Is a task confounded, and by how much? `deconf certify --task slippery_cartpole`
 
-Four measurements, none of which needs a trained imitator but the last: what it costs to expect the wrong theta, how
-loudly actions and dynamics speak of theta, what the exact policies make of it, and what a policy without memory does.
+Four measurements: how much evidence of theta the dynamics and the expert's actions hold, what the exact policies score,
+what it costs an expert to assume a wrong theta, and what a clone without memory scores. Only the last one is trained.
 """
 
 import time
@@ -18,7 +18,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.score import normalise
+from deconfounded.benchmarks.output.scoring import normalise
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid, log_next
 from deconfounded.envs.streams import Array
@@ -74,16 +74,16 @@ class EvidenceRecorder(ExpertAgent):
 
 
 def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, Array]:
-    """Levels [J, L]; scores [J, J] of the expert under the row's theta, told the column's; mean returns [J, J].
+    """Levels [J, L]; scores [J, J] of the expert under the row's theta, given the column's; mean returns [J, J].
 
     Each row is scored by its own expert and its own random actions.
     """
     levels = task.theta_grid(LEVELS)
     j = len(levels)
     true = np.repeat(levels, j * trials, 0)
-    told = np.tile(np.repeat(levels, trials, 0), (j, 1))
+    assumed = np.tile(np.repeat(levels, trials, 0), (j, 1))
     env = envs.BatchEnv(task, j * j * trials)
-    returns = run_trials(env, ExpertAgent(env, expert, told), 1, SEED, true).returns
+    returns = run_trials(env, ExpertAgent(env, expert, assumed), 1, SEED, true).returns
     random = run_trials(env, RandomAgent(task.action_space), 1, SEED, true).returns
     matrix = returns.reshape(j, j, trials).mean(-1)
     zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
@@ -108,7 +108,7 @@ def certify(
 ) -> dict[str, Any]:
     """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert.
 
-    done: is told of each stage that is over.
+    done: called with the name of each stage when it is over.
     """
     env = envs.BatchEnv(task, trials)
 
@@ -148,7 +148,7 @@ def certify(
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
-    ratio = actions / dynamics if dynamics else None  # None where expert trials tell nothing of theta
+    ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
     return {
         "task": task.name,
         "task_version": task.version,
@@ -186,7 +186,7 @@ def picture(result: dict[str, Any], file: Path) -> None:
             hue = "white" if value < 0.6 else "black"
             left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=8)
         ticks = ["\n".join(f"{x:.3g}" for x in level) for level in result["stakes"]["levels"]]
-        left.set(xlabel="theta told", ylabel="true theta", title="score of an expert told another theta")
+        left.set(xlabel="theta given", ylabel="true theta", title="score of an expert given a wrong theta")
         left.set_xticks(range(len(ticks)), ticks)
         left.set_yticks(range(len(ticks)), ticks)
         left.figure.colorbar(left.imshow(score, vmin=0, vmax=1, cmap="viridis"), ax=left)

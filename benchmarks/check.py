@@ -1,6 +1,6 @@
-"""Does a task hold together? `deconf check --task slippery_cartpole`, or path/file.py:Class
+"""Does a task meet the contract? `deconf check --task slippery_cartpole`, or path/file.py:Class
 
-`check_task`, and then every check of the contract that all tasks are held to, a line for each; 1 if any failed.
+Runs `check_task`, and then every check of the contract for tasks, with a line for each; exit code 1 if any fails.
 """
 
 import sys

@@ -16,10 +16,10 @@ from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import check_folder
 
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
+    from deconfounded.benchmarks.engine.job_files import Finished
     from deconfounded.benchmarks.engine.jobs import Job
     from deconfounded.benchmarks.engine.presets import Preset
     from deconfounded.benchmarks.engine.scheduler import Engine
-    from deconfounded.benchmarks.engine.store import Finished
 
 
 def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
@@ -28,12 +28,12 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     presets = "; ".join(f"{name}: {text}" for name, text in PRESETS.items())
     made.add_argument("--preset", default="default", help=presets)
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
-    made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="amounts, e.g. naive_rnn.updates=500")
+    made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="settings, e.g. naive_rnn.updates=500")
     made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
     cluster = "run on a Ray cluster: HOST:PORT, or auto for this machine's"
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
-    made.add_argument("--resume", action="store_true", help="keep what is finished in the output folder, and go on")
+    made.add_argument("--resume", action="store_true", help="run what is not finished in the output folder")
     made.set_defaults(expert=None, salt="", track=None)  # of run.py alone
     return made
 
@@ -64,7 +64,7 @@ def check_device(device: str) -> None:
 
     try:
         torch.zeros(1, device=device).item()
-    except Exception:  # torch tells in many ways
+    except Exception:  # torch raises errors of many types
         raise envs.InputError(f"--device {device} cannot be used here; cpu always can") from None
 
 
@@ -77,7 +77,7 @@ def about(
     expert: str | None,
     salt: str,
 ) -> dict[str, Any]:
-    """What a folder is for: another run is not to write there. What else matters, each job checks."""
+    """What a folder is for, so that no other run writes there. Each job checks the rest that its results depend on."""
     ours = {method: values for method, values in settings.configs.items() if method not in METHODS.outside}
     made_of = {"task": task.name, "task_version": task.version, "reference": task.reference, "preset": name}
     made_of |= {"set": list(changes), "settings": {**asdict(settings), "configs": ours}}
@@ -100,9 +100,9 @@ def run(
     kind: "type[Job]", task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
 ) -> "tuple[Finished, dict[str, Any]]":
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
+    from deconfounded.benchmarks.engine.job_files import know_guests, prepare
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
-    from deconfounded.benchmarks.engine.store import know_guests, prepare
 
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
@@ -128,7 +128,7 @@ def run(
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Nobody else is at work in the folder meanwhile; a lock dies with its owner. Raises InputError if somebody is."""
+    """Lock a folder against other commands; a lock ends with its process. Raises InputError if another one has it."""
     from filelock import FileLock, Timeout
 
     check_folder(folder)

@@ -1,7 +1,7 @@
 """Write demonstrations or explorations as a Minari data set: `deconf data --task slippery_cartpole --out data`
 
 The expert's trials are those that seed 0 of a run imitates; --explore writes trials of uniformly random actions. The
-sha256 is of the contents: made again anywhere with the same versions, it is the same.
+sha256 is of the contents: with the same versions of libraries it is the same everywhere.
 """
 
 from collections.abc import Callable

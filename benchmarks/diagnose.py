@@ -1,8 +1,8 @@
 """Is your data confounded? `deconf diagnose --trials expert.npz`
 
-From an expert's trials alone, and exploration if you have some: no theta, no simulator. Both are a Minari data set's
-folder, or an .npz as `Trials.save` writes it; each trial is under a hidden theta of its own. It writes index.html and
-diagnosis.json. Interrupted, it goes on where it was.
+It reads trials of an expert, and of exploration if you have some; it needs no theta and no simulator. Each file is an
+.npz as `Trials.save` writes it, or a Minari data set's folder; each trial is under a hidden theta of its own. It writes
+index.html and diagnosis.json. If it was interrupted, the same command goes on.
 """
 
 import json
@@ -62,7 +62,7 @@ class Refit:
 
         try:
             kept = json.loads(self.file.read_bytes())
-            return Findings(**kept["found"]) if kept["made_of"] == self.made_of else None
+            return Findings(**kept["figures"]) if kept["made_of"] == self.made_of else None
         except (OSError, ValueError, KeyError, TypeError):
             return None
 
@@ -83,7 +83,7 @@ class Refit:
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
         explore = None if self.explore is None else trials_of(self.explore)
         findings = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
-        write_json(self.file, {"made_of": self.made_of, "found": findings._asdict()})
+        write_json(self.file, {"made_of": self.made_of, "figures": findings._asdict()})
         return f"measured in {time.time() - start:.0f} s"
 
 
@@ -121,8 +121,13 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
 
 def main() -> None:
     parser = Parser(__doc__)
-    parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="of the expert")
-    parser.add_argument("--explore", type=place, metavar="FILE", help="theta-blind exploration of the same world")
+    parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="trials of the expert")
+    parser.add_argument(
+        "--explore",
+        type=place,
+        metavar="FILE",
+        help="trials of theta-blind exploration",
+    )
     parser.add_argument("--seed", type=whole(0), default=0, help="of the splits and of training")
     parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
     args = parser.parse_args()

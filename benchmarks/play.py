@@ -1,6 +1,6 @@
-"""Run a kept agent in one plain gymnasium environment: `deconf play --agent DIR --task slippery_cartpole`
+"""Run a saved agent in one gymnasium environment: `deconf play --agent DIR --task slippery_cartpole`
 
-Prints the return of each episode of a trial, under one theta; --video writes what it looked like.
+Prints the return of each episode of a trial, under one theta; --video writes a film of it.
 """
 
 from pathlib import Path
@@ -12,15 +12,17 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, whole
 from deconfounded.envs.support.files import check_file
-from deconfounded.experts import store
+from deconfounded.experts import saved_agents
 from deconfounded.experts.rollout import Agent
 
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    theirs = store.describe(folder).get("spaces")
-    from deconfounded.benchmarks.engine.benchmark import spaces  # torch takes seconds: what is no agent goes without
-    from deconfounded.benchmarks.engine.guest import Stranger
+    theirs = saved_agents.describe(folder).get("spaces")
+    from deconfounded.benchmarks.engine.benchmark import (
+        spaces,
+    )  # torch takes seconds; bad input is refused at once
+    from deconfounded.benchmarks.engine.guest_host import ReseededAgent
     from deconfounded.deconf.core.agents import LearnedAgent
     from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 
@@ -29,7 +31,7 @@ def ready(folder: Path, task: envs.Task) -> Agent:
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
-    return agent if isinstance(agent, LearnedAgent) else Stranger(agent)
+    return agent if isinstance(agent, LearnedAgent) else ReseededAgent(agent)
 
 
 def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = None) -> tuple[list[float], list[Any]]:
@@ -55,7 +57,7 @@ def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = 
 
 def main() -> None:
     parser = Parser(__doc__, "--agent", "--task")
-    parser.add_argument("--theta", type=float, nargs="+", help="forced; default: drawn")
+    parser.add_argument("--theta", type=float, nargs="+", help="its values; default: drawn from p(theta)")
     parser.add_argument("--episodes", type=whole(1, 1000), help="default: those of the task's trials")
     parser.add_argument("--seed", type=whole(0), default=0)
     parser.add_argument("--video", type=Path, help="an .mp4 file to write")

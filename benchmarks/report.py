@@ -1,13 +1,13 @@
-"""Make a run's tables, pictures and report again from what its jobs left: `deconf report results/bandit-default`
+"""Write a run's tables, pictures and report again, from its finished jobs: `deconf report results/bandit-default`
 
-Nothing is trained, and nothing is made that is not there.
+Nothing is trained. Of a run that is not finished, they show the jobs that are.
 """
 
 from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
-from deconfounded.benchmarks.engine import store
+from deconfounded.benchmarks.engine import job_files
 from deconfounded.envs.support.files import read_sealed
 
 
@@ -20,9 +20,9 @@ def main() -> None:
         task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
     except (OSError, KeyError):
         raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
-    finished = store.left_in(folder / "jobs")
+    finished = job_files.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
-    from deconfounded.benchmarks.output import report  # it takes seconds; bad input is refused at once
+    from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is refused at once
 
-    print(report.write(task, about, finished, folder))
+    print(run_report.write(task, about, finished, folder))

@@ -28,16 +28,16 @@ def main() -> None:
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
     parser.add_argument("--expert", **COMMON["--expert"])
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
-    parser.add_argument("--track", choices=["tensorboard"], help="show losses as they come, in the run's folder")
-    parser.add_argument("--salt", default="", help="draw other thetas in evaluation, that nobody can have seen")
+    parser.add_argument("--track", choices=["tensorboard"], help="log losses during training, in the run's folder")
+    parser.add_argument("--salt", default="", help="any text: evaluation draws other thetas by it")
     args = parser.parse_args()
     if args.list:
         if args.task is not None:
-            raise envs.InputError(f"--list was given with --task {args.task}; it lists all, and goes by itself")
+            raise envs.InputError(f"--list was given with --task {args.task}; it lists all; give it alone")
         for name in envs.names():
             try:
                 task = envs.get(name)
-            except envs.InputError as error:  # of somebody else's package
+            except envs.InputError as error:  # of another package
                 print(f"{name}: {error}")
                 continue
             latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
@@ -53,8 +53,8 @@ def main() -> None:
     if args.track and not find_spec("tensorboard"):
         raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
-    from deconfounded.benchmarks.output import report  # it takes seconds; bad input is told at once
+    from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is refused at once
 
     folder = args.out or Path("results") / f"{task.name}-{args.preset}"
     finished, about = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
-    print(report.write(task, about, finished, folder))
+    print(run_report.write(task, about, finished, folder))

@@ -1,7 +1,7 @@
-"""Score a kept agent anew, on thetas that it has not seen: `deconf score --agent DIR --task slippery_cartpole`
+"""Score a saved agent on fresh thetas: `deconf score --agent DIR --task slippery_cartpole`
 
-Thetas are drawn from p(theta) by --seed and --salt, or with --range from another range, outside of the task's own if
-you like: what the expert, random actions and the agent then make of it are measured side by side.
+Thetas are drawn from p(theta) by --seed and --salt, or with --range from another range, which may exceed the task's.
+The expert and random actions are run under the same thetas: the score is 1 for the expert, and 0 for random actions.
 """
 
 from dataclasses import replace
@@ -17,10 +17,10 @@ from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 
 
-def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
-    """The task with other ranges of its latents, name=low:high; the encoding of theta is the task's own still.
+def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
+    """The task with other ranges of its latents, name=low:high.
 
-    Raises InputError for a latent that there is not, or a range that cannot be.
+    Raises InputError for an unknown latent, or an invalid range.
     """
     latents = {latent.name: latent for latent in task.latents}
     for text in ranges:
@@ -41,13 +41,13 @@ def elsewhere(task: envs.Task, ranges: list[str]) -> envs.Task:
 
 def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
     """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
-    from deconfounded.benchmarks.output import score
+    from deconfounded.benchmarks.output import scoring
 
     env = envs.BatchEnv(where, trials)
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
-    by_trial = score.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
-    interval = score.bootstrap(by_trial[:, -1])
+    by_trial = scoring.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
+    interval = scoring.bootstrap(by_trial[:, -1])
     return {
         "score": by_trial.mean(0).round(4).tolist(),
         "ci95_last": None if interval is None else interval.tolist(),
@@ -58,18 +58,18 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
 def main() -> None:
     parser = Parser(__doc__, "--agent", "--task", "--expert")
     parser.add_argument("--trials", type=whole(2, 100_000), default=128)
-    parser.add_argument("--seed", type=whole(0), default=0, help="0 and no --salt: the thetas of a run's seed 0")
-    parser.add_argument("--salt", default="", help="any text")
-    parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from there")
+    parser.add_argument("--seed", type=whole(0), default=0, help="draws thetas; 0 without --salt: as a run's seed 0")
+    parser.add_argument("--salt", default="", help="any text: draw other thetas by it")
+    parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from this range")
     parser.add_argument("--out", type=place, help="a .json file to write")
     args = parser.parse_args()
     task = envs.get(args.task)
-    expert, where = policy.load(task, args.expert), elsewhere(task, args.range)
+    expert, where = policy.load(task, args.expert), with_ranges(task, args.range)
     if args.out is not None:
         check_file(args.out)
     agent = ready(args.agent, task)
     from deconfounded.benchmarks.engine.context import EVALUATION, stream  # torch takes seconds
-    from deconfounded.benchmarks.output.score import two_decimals
+    from deconfounded.benchmarks.output.scoring import two_decimals
 
     scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
     last = "last {:.2f} to {:.2f}, 95% over trials".format(*scored["ci95_last"])

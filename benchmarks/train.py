@@ -29,7 +29,7 @@ def main() -> None:
     args = parser.parse_args()
     task = envs.get(args.task)
     if not isinstance(task, envs.MujocoTask):
-        raise envs.InputError(f"the expert of {task.name} is its closed form; there is nothing to train")
+        raise envs.InputError(f"the expert of {task.name} is a closed form; there is nothing to train")
     file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":
         raise envs.InputError(f"--out was {file}; it must end in .safetensors")
@@ -71,4 +71,4 @@ def main() -> None:
         print(f"warning: the expert of {task.name} is hardly better than random actions: {remedy}")
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
     if file.resolve() != policy.path(task).resolve():
-        print(f"commands take it as --expert {file}; they look for {policy.path(task)} unasked")
+        print(f"commands use it if given --expert {file}; their default is {policy.path(task)}")

@@ -69,7 +69,7 @@ def pick(file: Path, method: str, seed: int) -> records.Record:
         raise envs.InputError(f"seed of {method} was {seed}; {file} has {seeds}")
     if len(fitting) > 1:  # of another preset, or other thetas
         several = f"{len(fitting)} records of {method} with seed {seed}"
-        raise envs.InputError(f"{file} has {several}; give one with one of them")
+        raise envs.InputError(f"{file} has {several}; give --records a file that has one")
     return fitting[0]
 
 

@@ -74,7 +74,7 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
     from deconfounded.deconf.given import Given
     from deconfounded.deconf.method import Method
     from deconfounded.envs.support import outside
-    from deconfounded.experts.store import save
+    from deconfounded.experts.saved_agents import save
 
     def send(*message: Any) -> None:
         with contextlib.suppress(OSError):  # the other end is gone

@@ -1,4 +1,4 @@
-"""The process of a method from outside, `python -m deconfounded.deconf.wall`, which a run starts (engine/guest.py).
+"""The process of a method from outside, `python -m deconfounded.deconf.wall`; engine/guest_host.py starts it.
 
 It holds no tasks, experts, benchmarks or simulators, and refuses to import them. This prevents accidental leakage and
 simple attacks, not all: the process has the rights of its user.

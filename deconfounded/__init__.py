@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def load(folder: Path | str) -> "Agent":
-    """The agent that `agent.save(folder)` or a run left in a folder; see `experts.saved`."""
-    from deconfounded.experts import store
+    """The agent that `agent.save(folder)` or a run left in a folder; see `experts.saved_agents`."""
+    from deconfounded.experts import saved_agents
 
-    return store.load(folder)
+    return saved_agents.load(folder)

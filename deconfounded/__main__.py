@@ -15,12 +15,12 @@ REPEATED = "what was finished is kept, and the same command goes on"
 COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "run": ("benchmarks.run", "train, deploy and score methods on a task", RESUMED),
     "train": ("benchmarks.train", "train a task's expert (PPO)", NOTHING),
-    "check": ("benchmarks.check", "does a task hold together? the contract tests", NOTHING),
+    "check": ("benchmarks.check", "does a task meet the contract? its tests", NOTHING),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?", NOTHING),
-    "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from an expert's trials alone", REPEATED),
+    "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from trials, without theta", REPEATED),
     "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?", REPEATED),
-    "play": ("benchmarks.play", "run a kept agent in one environment", NOTHING),
-    "score": ("benchmarks.score", "score a kept agent on fresh thetas, or a range never seen", NOTHING),
+    "play": ("benchmarks.play", "run a saved agent in one environment", NOTHING),
+    "score": ("benchmarks.score", "score a saved agent on fresh thetas, or on another range", NOTHING),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),
     "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
@@ -28,8 +28,8 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),
     "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper", RESUMED),
     "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
-    "tune": ("benchmarks.studies.tune", "the opponents' tuning", REPEATED),
-    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: more and less noise", RESUMED),
+    "tune": ("benchmarks.studies.tune", "the baselines' tuning", REPEATED),
+    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: scores under more and less noise", RESUMED),
 }
 
 

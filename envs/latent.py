@@ -1,4 +1,8 @@
-"""Hidden physical parameters and their distributions."""
+"""Hidden physical parameters and their distributions.
+
+A task lists them as `Task.latents`. Drawn values reach the physics in `Physics.set_theta` (envs/physics.py),
+which has the task's `apply_latent` edit the compiled model (envs/edits.py).
+"""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -12,18 +12,21 @@ Obs = NDArray[np.float32]
 
 
 class Streams:
-    """Random numbers for rows in equal consecutive groups, each of which draws from its own generator."""
+    """Random numbers for rows in equal consecutive groups, each of which draws from its own generator.
+
+    The number of rows in a size must be a multiple of `groups`: size (groups, K) is one row for each generator.
+    """
 
     def __init__(self, rngs: Sequence[np.random.Generator]) -> None:
         self.rngs = list(rngs)
         self.groups = len(self.rngs)
 
     def random(self, size: tuple[int, ...]) -> Array:
-        """Draws from U(0, 1) of a given size, whose first axis counts rows."""
+        """Draws from U(0, 1) of a given size, whose first axis is rows: an equal group of them from each generator."""
         return np.concatenate([rng.random((size[0] // self.groups, *size[1:])) for rng in self.rngs])
 
     def standard_normal(self, size: tuple[int, ...]) -> Array:
-        """Draws from N(0, 1) of a given size, whose first axis counts rows."""
+        """Draws from N(0, 1) of a given size, whose first axis is rows: an equal group of them from each generator."""
         return np.concatenate([rng.standard_normal((size[0] // self.groups, *size[1:])) for rng in self.rngs])
 
     def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:

@@ -177,9 +177,10 @@ class Task(ABC):
         return np.stack([lat.drifted(theta[:, i], normal[:, i]) for i, lat in enumerate(self.latents)], -1)
 
     def theta_grid(self, k: int) -> Array:
-        """Equally likely thetas [K, L]: k values of a single latent, or all combinations of k^(2 / (L + 1)) of each.
+        """A grid of equally likely thetas [K, L]. Of a single latent it has k values, K = k.
 
-        With two latents, k = 21 makes 7 x 7. A categorical latent always has all of its values.
+        Of L latents it has all combinations of m values of each, K = m^L, with m = floor(k^(2 / (L + 1))), at least 2;
+        K may be more than k: of two latents, k = 21 makes 7 x 7. A categorical latent has all of its values, for any k.
         """
         axes = np.meshgrid(*(lat.grid(self._values_each(k)) for lat in self.latents), indexing="ij")
         return np.stack([axis.ravel() for axis in axes], -1)

@@ -29,7 +29,7 @@ from deconfounded.benchmarks.engine.benchmark import Recorder
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.presets import Preset, preset
-from deconfounded.benchmarks.output import index, score, statistics
+from deconfounded.benchmarks.output import index, scoring, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
@@ -217,7 +217,7 @@ def of_scores(name: str) -> Numbers:
             ]
             for method, mean in level.items()
         }
-        methods = score.summarise(records, 2)
+        methods = scoring.summarise(records, 2)
         last[task] = index.last_scores(methods)
         for key in ("score", "score_last", "score_beyond", "ci95", "band", "objective", "theta_r2", "cpu_s", "return"):
             numbers[f"{key} of the {task} task"] = sums(
@@ -246,7 +246,7 @@ def of_diagnosis(name: str) -> Numbers:
         amounts = diagnose.DiagnoseConfig().amounts
         parts = {part: getattr(amounts, part) for part in ("cloning", "naive", "offline", "exploring")}
         less = {part: replace(config, **few(asdict(config))) for part, config in parts.items()}
-        amounts = replace(amounts, **less, rivals=4, dreams=8)
+        amounts = replace(amounts, **less, candidates=4, rollouts=8)
         measured = {
             label: measures.measure(trials, exploration, amounts, np.random.default_rng(5))
             for label, exploration in (("with exploration", explored), ("of expert trials alone", None))
@@ -275,7 +275,7 @@ KINDS: dict[str, Kind] = {
         "`version` in its file in deconf/methods",
     ),
     "protocol": (of_protocol, lambda name: identity.PROTOCOL, ["all"], "PROTOCOL in benchmarks/engine/identity.py"),
-    "scores": (of_scores, lambda name: score.VERSION, ["all"], "VERSION in benchmarks/output/score.py"),
+    "scores": (of_scores, lambda name: scoring.VERSION, ["all"], "VERSION in benchmarks/output/scoring.py"),
     "diagnosis": (of_diagnosis, lambda name: diagnose.VERSION, ["all"], "VERSION in deconf/diagnosis/diagnose.py"),
 }
 EVERY = [f"{kind}:{name}" for kind, (_, _, names, _) in KINDS.items() for name in names]

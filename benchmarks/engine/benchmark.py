@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import label
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.engine.guest import Guest
+from deconfounded.benchmarks.engine.guest_host import Guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
-from deconfounded.experts import store
+from deconfounded.experts import saved_agents
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
@@ -148,7 +148,7 @@ class BenchmarkJob(Job):
                 if isinstance(agent, Guest):
                     note = agent.keep(folder, about)
                 elif isinstance(agent, LearnedAgent):
-                    store.save(agent.of_seed(i), folder, **about)
+                    saved_agents.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
                 note = f"its agent is not kept: {error_line(error)}"
         return note

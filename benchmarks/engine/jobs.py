@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import store
+from deconfounded.benchmarks.engine import job_files
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
@@ -90,12 +90,12 @@ class Job(ABC):
 
     def load(self, seed: int) -> dict[str, Any] | None:
         """What was written of a seed: arrays, and `meta` decoded. None if there is nothing that fits: see `unfit`."""
-        found = store.read(self.file(seed))
+        found = job_files.read(self.file(seed))
         return None if found is None or self.unfit(seed, found) else found
 
     def unfit(self, seed: int, found: dict[str, Any]) -> str:
         """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
-        if why := store.broken(found):
+        if why := job_files.broken(found):
             return why
         meta, expected = found["meta"], identity(self)
         told = meta["identity"]

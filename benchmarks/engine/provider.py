@@ -1,7 +1,7 @@
 """Provides a method with the data that it declares that it uses, counts it, and keeps all else out of its reach.
 
 The methods of this package are handed it in this process: what they hold refers to a provider by a number alone.
-A method from outside asks from a process of its own (`guest.py`).
+A method from outside asks from a process of its own (`guest_host.py`).
 """
 
 import itertools
@@ -138,7 +138,7 @@ def _forget(number: int) -> None:
 
 
 class NumberedMonitor(Monitor):
-    """Forwards updates and checkpoints to the monitor of the provider of that number."""
+    """Stands for the monitor of a run, which it finds by a number: so a method cannot reach the run's context by it."""
 
     def __init__(self, number: int) -> None:
         self._number = number
@@ -147,9 +147,11 @@ class NumberedMonitor(Monitor):
         _PROVIDERS[self._number].context.monitor.update(done, total, losses, agent)
 
     def save(self, state: Callable[[], Training]) -> None:
+        """Offer a checkpoint to the run's monitor."""
         _PROVIDERS[self._number].context.monitor.save(state)
 
     def load(self) -> Training | None:
+        """The checkpoint that the run's monitor has, of an interrupted training; it loads nothing into this object."""
         return _PROVIDERS[self._number].context.monitor.load()
 
 

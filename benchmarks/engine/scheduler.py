@@ -11,9 +11,9 @@ import numpy as np
 
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.job_files import Finished, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.engine.store import Finished, read
 from deconfounded.envs.support.errors import InputError, error_line
 
 

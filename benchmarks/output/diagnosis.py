@@ -23,7 +23,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "tier": diagnosis.tier,
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
-        "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
+        "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
     }
     write_json(folder / "diagnosis.json", {**made, **about})
     findings = _findings(diagnosis.figures)
@@ -54,15 +54,15 @@ agent.save("agent")
 
 def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
     """Title, two sentences, and a picture."""
-    memory, naive, latent = (figure[key] for key in ("memory", "naive", "latent"))
-    stakes, strayed = figure["stakes"], figure["strayed"]
+    memory, naive, latent = (figure[key] for key in ("memory_gain", "naive", "latent"))
+    stakes, paired = figure["stakes"], figure["paired_stakes"]
     predictors: Rows = {"memory": (memory, colour("naive_rnn"))}
     source = "Exploration would show how much of that is evidence of the dynamics, and how much of past actions alone."
-    if "explained" in figure:
-        explained = figure["explained"]
-        predictors["latent from dynamics"] = (explained, colour("interventional"))
+    if "latent_gain" in figure:
+        gain = figure["latent_gain"]
+        predictors["latent from dynamics"] = (gain, colour("interventional"))
         source = (
-            f"A latent that is inferred from the dynamics alone accounts for {explained} of it (below 0: it predicts"
+            f"A latent that is inferred from the dynamics alone accounts for {gain} of it (below 0: it predicts"
             " less well than the present observation). The rest is, for the most part, evidence of the expert's past"
             " actions, and a clone's own actions are no evidence."
         )
@@ -74,39 +74,41 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
             _bars(predictors, "nats a step over the present observation", NEGLIGIBLE),
         )
     ]
-    if "explored" in figure:
-        explored, shown, acted = (figure[key] for key in ("explored", "shown", "acted"))
+    if "exploration_evidence" in figure:
+        sources = ("exploration_evidence", "expert_evidence", "action_evidence")
+        in_exploration, in_trials, in_actions = (figure[key] for key in sources)
         evidence: Rows = {
-            "dynamics, in exploration": (explored, colour("interventional")),
-            "dynamics, in expert trials": (shown, colour("expert")),
-            "the expert's actions": (acted, colour("naive_rnn")),
+            "dynamics, in exploration": (in_exploration, colour("interventional")),
+            "dynamics, in expert trials": (in_trials, colour("expert")),
+            "the expert's actions": (in_actions, colour("naive_rnn")),
         }
         sections.append(
             (
                 "Are the dynamics evidence of it?",
-                f"A trial's own latent makes next observations {explored} nats a step more likely than another trial's"
-                f" in exploration, whose actions do not depend on it, and {shown} in expert trials. If the latter is"
-                f" below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do not"
-                f" identify it. The expert's actions are evidence of it by {acted} nats a step, {figure['ratio']} times"
-                " as much: this is the false confidence of a clone that takes its own actions for the expert's.",
+                f"A trial's own latent makes next observations {in_exploration} nats a step more likely than another"
+                f" trial's in exploration, whose actions do not depend on it, and {in_trials} in expert trials. If the"
+                f" latter is below {NEGLIGIBLE}, and the latent explains next to none of the actions, expert trials do"
+                f" not identify it. The expert's actions are evidence of it by {in_actions} nats a step,"
+                f" {figure['ratio']} times as much: this is the false confidence of a clone that takes its own actions"
+                " for the expert's.",
                 _bars(evidence, "nats a step", NEGLIGIBLE),
             )
         )
     hue = colour("expert")
-    deviations: Rows = {"from all with right latents": (stakes, hue), "paired by latent and start": (strayed, hue)}
+    deviations: Rows = {"from all with right latents": (stakes, hue), "paired by latent and start": (paired, hue)}
     sections.append(
         (
             "What is at stake?",
             f"In the learned dynamics, trajectories of an expert policy given a wrong latent deviate {stakes} times as"
-            f" much as by chance from those given right latents, and {strayed} times as much when paired by latent and"
+            f" much as by chance from those given right latents, and {paired} times as much when paired by latent and"
             f" start; below {STAKES} that may be chance. Trajectories in the learned dynamics deviate from the data's"
-            f" {figure['unlike']} times as much as by chance.",
+            f" {figure['model_deviation']} times as much as by chance.",
             _bars(deviations, "deviation under a wrong latent, times chance", STAKES),
         )
     )
     actors = [("naive clone", "naive", "naive_rnn"), ("infers the latent", "latent", "deconfounded")]
     scores: Rows = {actor: (figure[key], colour(hue)) for actor, key, hue in actors}
-    scores |= {f"{actor}, Eq. (1)": (figure[f"{key}_judged"], colour(hue)) for actor, key, hue in actors}
+    scores |= {f"{actor}, Eq. (1)": (figure[f"{key}_by_actions"], colour(hue)) for actor, key, hue in actors}
     sections.append(
         (
             "What will it cost?",

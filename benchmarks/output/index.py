@@ -11,14 +11,14 @@ from PIL import Image
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
-from deconfounded.benchmarks.output import score, statistics
+from deconfounded.benchmarks.output import scoring, statistics
 from deconfounded.benchmarks.output.pictures import colour
 from deconfounded.envs.streams import Array
 
 NOTE = (
-    "Scores in the last episode, of all tasks whose certificate is passed and where all three were run. Opponents were"
-    " tuned on two of these tasks, with other seeds, to score best. naive_rnn kept its preset, though what else was"
-    " tried scores higher, see opponents.md."
+    "Scores in the last episode, over all tasks whose certificate is passed and where all three were run. Baselines"
+    " were tuned for their scores on two of these tasks, with other seeds. naive_rnn kept its preset, though other"
+    " settings score higher, see baselines.md."
 )
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",
@@ -45,7 +45,7 @@ def template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None)
 def last_scores(methods: dict[str, Any]) -> dict[str, dict[int, float]]:
     """The `methods` of results.json -> score in the last episode, by method and seed."""
     zero, one = (float(np.mean(methods[name]["return"])) for name in REFERENCES)
-    last = {name: score.normalise(np.array(entry["return"])[:, -1], zero, one) for name, entry in methods.items()}
+    last = {name: scoring.normalise(np.array(entry["return"])[:, -1], zero, one) for name, entry in methods.items()}
     return {name: dict(zip(methods[name]["seeds"], scores.tolist(), strict=True)) for name, scores in last.items()}
 
 
@@ -78,7 +78,7 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "return": round(float(np.mean(entry["return"], 0)[-1]), 2),
         "objective": round(entry["objective"][-1]),
         "r2": entry["theta_r2"],
-        "data": score.budget(entry["budget"]),
+        "data": scoring.budget(entry["budget"]),
         "cpu": entry["cpu_s"],
         "curve": entry.get("curve", {}),
     }
@@ -133,7 +133,7 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
         "latents": [f"{units[lat.name]}, {lat.distribution}" for lat in task.latents],
         "episodes": task.episodes,
         "trials": results["eval_trials"],
-        "outcome": score.outcome(results["methods"]),
+        "outcome": scoring.outcome(results["methods"]),
         "clip": _sized(docs, f"{task.name}.webp"),
         "certificate": certificate(docs, task, certified),
         "records": f"records/{task.name}.jsonl",
@@ -184,7 +184,7 @@ def answers(scores: Scores) -> list[str]:
 
 
 def _answer(scores: Scores, method: str, question: str) -> str | None:
-    """By intervals of 95%: does the method's reach up to that of PEER, and does it keep clear of that of NAIVE?"""
+    """Whether a method's 95% interval overlaps or exceeds that of PEER, and whether it exceeds that of NAIVE."""
     names = (method, NAIVE, PEER)
     tasks = [task for task, of in scores.items() if all(len(of.get(name, ())) > 1 for name in names)]
     if not tasks:
@@ -194,11 +194,11 @@ def _answer(scores: Scores, method: str, question: str) -> str | None:
     (_, low, high), (_, _, naive), (_, peer, _) = means.values()
     helps, enough = low > naive, high >= peer
     if peer <= naive or (enough and not helps):
-        word = "It cannot be told yet"
+        word = "It cannot be decided yet"
     else:
         word = "Yes" if enough else "It helps, but it is not enough" if helps else "No"
-    ranges = ("{} {} ({} to {})".format(name, *map(score.two_decimals, mean)) for name, mean in means.items())
-    better = score.two_decimals(_figure(statistics.improvement, runs[PEER], runs[method])[0])
+    ranges = ("{} {} ({} to {})".format(name, *map(scoring.two_decimals, mean)) for name, mean in means.items())
+    better = scoring.two_decimals(_figure(statistics.improvement, runs[PEER], runs[method])[0])
     return (
         f"{question} {word}: {', '.join(ranges)}, interquartile means over {len(tasks)} task{'s' * (len(tasks) > 1)}"
         f" and their 95% intervals. A run of {PEER} is better than one of {method} with probability {better}."
@@ -220,5 +220,5 @@ def page(
     content = data(docs, found, certificates, command)
     counts = [entry["n"] for entry in content["rows"]]
     opened = next((task["name"] for task in content["tasks"] if task["episodes"] > 1), "")
-    head = {"records": sum(counts), "seeds": score.fewest_to_most(counts), "peer": PEER, "opened": opened}
+    head = {"records": sum(counts), "seeds": scoring.fewest_to_most(counts), "peer": PEER, "opened": opened}
     return template("index.html.jinja").render(data=content, tiers=tiers, **head) + "\n"

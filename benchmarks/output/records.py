@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
-from deconfounded.benchmarks.engine.store import Finished
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.engine.job_files import Finished
+from deconfounded.benchmarks.output import scoring
 from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
 
@@ -236,7 +236,7 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         "versions": first["versions"],
         "machine": "; ".join(sorted({record["machine"] for record in records})),
         "wall_s": round(covered([span for record in records for span in record["spans"]]), 1),
-        "methods": score.summarise({name: by_agent[name] for name in names}, first["episodes"]),
+        "methods": scoring.summarise({name: by_agent[name] for name in names}, first["episodes"]),
     }
 
 

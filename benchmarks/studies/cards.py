@@ -11,7 +11,7 @@ import numpy as np
 from deconfounded import envs
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-TIERS = {None: "none: nobody can win", 2: "2: exploration is enough", 3: "3: it takes queries of the expert"}
+TIERS = {None: "none: no imitator can succeed", 2: "2: exploration is enough", 3: "3: queries of the expert are needed"}
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output import scoring
 from deconfounded.benchmarks.studies import spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
-UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/opponents.md says why
-BUDGET = 4  # settings of each opponent
+UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/baselines.md says why
+BUDGET = 4  # settings of each baseline
 NEAR = 0.01  # scores that differ by less: the cheaper setting is chosen
 
 
@@ -20,9 +20,9 @@ def rates() -> str:
     for name, by_size in kept("speed/speed")["tasks"].items():
         few, middle, many = (by_size[n] for n in sizes)
         closed = (f"{by_size[n]['closed_loop']:,.0f}" for n in sizes)
-        shares = (score.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
+        shares = (scoring.two_decimals(by_size[n]["closed_loop"] / by_size[n]["open_loop"]) for n in sizes)
         peers = (f"{few[way]:,.0f}" for way in ("mj_step", "sync_vector_env"))
-        slowdown = score.two_decimals(middle["closed_loop"] / many["closed_loop"])
+        slowdown = scoring.two_decimals(middle["closed_loop"] / many["closed_loop"])
         rows.append((name, *closed, *shares, *peers, slowdown, f"{many['kib']:.0f}"))
     loops = [f"{what} loop, {n}" for what in ("closed", "of open") for n in sizes]
     others = ("mj_step x threads", "SyncVectorEnv, 64", "a step, 4096 / 256", "KiB each")
@@ -60,14 +60,14 @@ def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tuning() -> str:
-    """The table of docs/opponents.md: what `deconf tune` tried of each opponent, and what was best."""
+    """The table of docs/baselines.md: what `deconf tune` tried of each baseline, and what was best."""
     tried, rows = kept("tuning")["rows"], []
     tasks = list(tried[0]["scores"])
     for method in dict.fromkeys(row["method"] for row in tried):
         of = [row for row in tried if row["method"] == method]
         best = chosen(of) if len(of) == BUDGET else None
         for row in of:
-            scores = [score.two_decimals(np.mean(row["scores"][task])) for task in tasks]
+            scores = [scoring.two_decimals(np.mean(row["scores"][task])) for task in tasks]
             cpu = [f"{row['cpu_s'][task]:.0f}" for task in tasks]
             word = "" if row is not best else "kept" if method == UNTUNED else "chosen"
             rows.append((method, row["setting"], *scores, *cpu, word))

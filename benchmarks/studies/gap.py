@@ -8,7 +8,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 
 FORETOLD = "exact interventional less conditional"
@@ -38,14 +38,14 @@ def _correlation(gaps: Sequence[Gap]) -> str:
 
 def section(gaps: Sequence[Gap]) -> str:
     """Its part of docs/results.md."""
-    explored = [one for one in gaps if one.task.tier != 3]  # in expert trials of Tier 3 the world is silent about theta
+    explored = [one for one in gaps if one.task.tier != 3]  # of Tier 3, expert trials hold no evidence of theta
     if len(explored) < 3:
         return ""
     text = f"""## Predicted and measured
 
-What cloning loses, in the last episode: as the exact policies foretell it (interventional less conditional), and as it
-was measured (`deconfounded` less `naive_rnn`). Pearson's correlation is {_correlation(explored)} of Tier 2 and none.
-With those of Tier 3, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
+What naive cloning loses in score, in the last episode: predicted by the exact policies (interventional less
+conditional), and measured (`deconfounded` less `naive_rnn`). Without the tasks of Tier 3, Pearson's correlation
+is {_correlation(explored)}. With those, whose gap only queries of the expert can close, it is {_correlation(gaps)}."""
     rows = [(one.task.name, two_decimals(one.predicted), two_decimals(one.measured)) for one in gaps]
     table = markdown_table(("task", "predicted", "measured"), rows)
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])

@@ -16,10 +16,10 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.engine.job_files import Finished, by_method
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.benchmarks.engine.store import Finished, by_method
-from deconfounded.benchmarks.output import score
+from deconfounded.benchmarks.output import scoring
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.records import covered
 from deconfounded.deconf.core.data import Batch
@@ -167,7 +167,7 @@ def summarise(finished: Finished, references: dict[str, dict[str, Any]]) -> dict
             "loss": round(float(np.mean([entry["loss_curve"][-1] for entry in data])), 4),
             "online": curve.round(4).tolist(),
             "on_expert": np.mean([entry["on_expert"] for entry in data], 0).round(4).tolist(),
-            "budget": score.mean_budget([entry["meta"]["budget"] for entry in data]),
+            "budget": scoring.mean_budget([entry["meta"]["budget"] for entry in data]),
             "train_s": round(float(np.mean([entry["meta"]["train_s"] for entry in data])), 1),
         }
     return methods
@@ -180,8 +180,8 @@ def table(methods: dict[str, Any]) -> str:
         pulls = f"{entry['pulls_mean']:.2f}"
         pulls += "" if entry["pulls_se"] is None else f" +- {entry['pulls_se']:.2f}"
         exact, apart = f"{entry['target_pulls']:.2f}", f"{entry['max_gap_online']:.3f}"
-        rows.append((name, pulls, exact, apart, score.budget(entry["budget"])))
-    return score.plain_table(("method", "best-arm pulls", "exact", "max gap online", "budget (a seed)"), rows)
+        rows.append((name, pulls, exact, apart, scoring.budget(entry["budget"])))
+    return scoring.plain_table(("method", "best-arm pulls", "exact", "max gap online", "budget (a seed)"), rows)
 
 
 def write(

@@ -121,7 +121,7 @@ def texts(found: index.Found) -> dict[Path, str]:
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
     tables = {
         DOCS / "diagnose.md": {"validation": findings.validated()},
-        DOCS / "opponents.md": {"fared": results.fared(found, certified), "tuning": findings.tuning()},
+        DOCS / "baselines.md": {"fared": results.fared(found, certified), "tuning": findings.tuning()},
         DOCS / "spectrum.md": {"noises": findings.noises()},
         DOCS / "speed.md": {"costs": results.costs(found), "rates": findings.rates()},
         DOCS / "paper.md": {"controls": results.controls(found)},

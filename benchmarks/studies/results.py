@@ -1,4 +1,4 @@
-"""Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and opponents.md."""
+"""Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and baselines.md."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import index, records, score
+from deconfounded.benchmarks.output import index, records, scoring
 from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
@@ -48,19 +48,19 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
 
 def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
-    seeds = score.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
+    seeds = scoring.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
     commits = ", ".join(dict.fromkeys(commit[:7] for commit in results["commits"]))
     rows = []
-    for row in score.rows(results["methods"]):
+    for row in scoring.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
-        rows.append((*row, score.two_decimals(beyond[-1]) if beyond else ""))
+        rows.append((*row, scoring.two_decimals(beyond[-1]) if beyond else ""))
     parts = [
         f"## {task.name}",
         f"`{command(task, results)}`",
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
         f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
-        markdown_table((*score.COLUMNS, "after as many again"), rows),
+        markdown_table((*scoring.COLUMNS, "twice as long"), rows),
         f"![score by episode]({task.name}.png)",
     ]
     if older := outdated(task, results):
@@ -86,18 +86,18 @@ def results_page(found: index.Found, certified: dict[str, Any]) -> str:
     """docs/results.md."""
     head = """# Results
 
-Made by `deconf publish` from the [records](records) alone, one a seed. Scores: 0 = random actions, 1 = the
-expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that sees
-theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-Intervals are 95% bootstrap intervals over seeds, too narrow of few: if scores are normal, one of five seeds holds the
-mean five times in six, one of ten nine times in ten. *After as many again*: the last score in a trial twice as long as
-those of training."""
+Made by `deconf publish` from the [records](records) alone, of which each is of one seed. Scores: 0 = random actions,
+1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that
+sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
+Intervals are 95% bootstrap intervals over seeds; of few seeds they are too narrow: with normal scores an interval of
+five seeds contains the mean in five of six cases, one of ten seeds in nine of ten. *Twice as long*: the last score in a
+trial of twice as many episodes as in training."""
     parts = [head, in_short(found, certified), *(section(*of) for of in found), gap.section(gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def in_short(found: index.Found, certified: dict[str, Any]) -> str:
-    """The part of docs/results.md that answers what is asked first, over the tasks whose certificate is passed."""
+    """The part of docs/results.md that answers common questions, over the tasks whose certificate is passed."""
     lines = [f"- {answer}" for answer in answers(index.certified(found, certified))]
     return "\n".join(["## In short", "", *lines, "", NOTE]) if lines else ""
 
@@ -109,13 +109,13 @@ def gaps(found: index.Found) -> list[gap.Gap]:
 
 def summary(found: index.Found) -> str:
     """README's table: scores in the last episode."""
-    rows, column = [], score.COLUMNS.index("last")
+    rows, column = [], scoring.COLUMNS.index("last")
     for task, results in found:
-        last = {row[0]: row[column] for row in score.rows(results["methods"])}
+        last = {row[0]: row[column] for row in scoring.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
-    return markdown_table(("task", "tier", *methods, "seconds"), rows)
+    return markdown_table(("task", "tier needed", *methods, "seconds"), rows)
 
 
 def controls(found: index.Found) -> str:
@@ -128,7 +128,7 @@ def controls(found: index.Found) -> str:
         returns = {name: np.mean(entry["return"], 0)[-1] for name, entry in entries.items()}
         scores = {name: entry["score_last"] for name, entry in entries.items()}
         for what, last in (("the return here", returns), ("the score here", scores)):
-            rows.append(("", what, *(score.two_decimals(last[name]) if name in last else "" for name in methods)))
+            rows.append(("", what, *(scoring.two_decimals(last[name]) if name in last else "" for name in methods)))
     return markdown_table(("task", "in the last episode", *methods), rows)
 
 
@@ -143,13 +143,13 @@ def costs(found: index.Found) -> str:
 
 
 def fared(found: index.Found, certified: dict[str, Any]) -> str:
-    """The table of docs/opponents.md: each method over the tasks whose certificate is passed, best first."""
+    """The table of docs/baselines.md: each method over the tasks whose certificate is passed, best first."""
     scores, rows = index.certified(found, certified), list[tuple[str, ...]]()
     over = index.over_tasks(scores, list(scores))["methods"]
     for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
         ends = (end(means, key=means.__getitem__) for end in (min, max))
-        extremes = (f"{task}, {score.two_decimals(means[task])}" for task in ends)
+        extremes = (f"{task}, {scoring.two_decimals(means[task])}" for task in ends)
         figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
         rows.append((name, METHODS[name].tier, str(len(means)), *figures, *extremes))
     summary = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
@@ -158,5 +158,5 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
 
 def _with_interval(figure: dict[str, Any] | None) -> str:
     """Two decimals, and from where to where."""
-    value, *ends = map(score.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
+    value, *ends = map(scoring.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
     return f"{value} ({' to '.join(ends)})" if ends else value

@@ -33,8 +33,8 @@ def run(
 ) -> "list[Record]":
     """The records of the methods' seeds on a task; base: the settings the folder is for, if others follow there."""
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+    from deconfounded.benchmarks.engine.job_files import prepare
     from deconfounded.benchmarks.engine.scheduler import listed, run_all
-    from deconfounded.benchmarks.engine.store import prepare
     from deconfounded.benchmarks.output import records
 
     wanted, own = [name for name in METHODS if name in methods], tuple(seeds)

@@ -15,7 +15,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES, check_names
 from deconfounded.benchmarks.output.pictures import colour, panels
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import noise, runs
 from deconfounded.benchmarks.studies.cards import markdown_table, nats
 from deconfounded.envs.support.files import write_json
@@ -52,7 +52,7 @@ def foretold(points: list[Point]) -> str:
         ahead = [np.mean(scores["deconfounded"]) - np.mean(scores["naive_rnn"]) for scores in of]
         ends = " to ".join(two_decimals(end(ahead)) for end in (min, max)) if ahead else "(none)"
         parts.append(f"where it is {verdict}, on {len(ahead)}, by {ends}")
-    return f"The certificate said so beforehand: {'; '.join(parts)} is `deconfounded` ahead of `naive_rnn`."
+    return f"The certificate predicts this. `deconfounded` is ahead of `naive_rnn` {'; '.join(parts)}."
 
 
 def table(points: list[Point]) -> str:

@@ -1,6 +1,6 @@
-"""The opponents' tuning: `deconf tune`
+"""The baselines' tuning: `deconf tune`
 
-Each opponent gets four settings, the preset of before among them, on two development tasks: the cartpole on a tilted
+Each baseline gets four settings, the preset of before among them, on two development tasks: the cartpole on a tilted
 rail and the bandit. Their seeds are no others' (`SEEDS`). What came of each setting is kept in docs/tuning.json at
 once. Interrupted, it goes on where it was; what is there of today's versions and amounts stays.
 """
@@ -36,7 +36,7 @@ TRIED: dict[str, tuple[Change, ...]] = {
     "naive_transformer": ({"learning_rate": 0.3}, {"updates": 2}, {"layers": 2}),
     "gail": ({"policy_rate": 0.3}, {"discriminator_rate": 0.3}, {"rounds": 2}),
 }
-"""Of each opponent, what is tried beside the preset as it was before."""
+"""Of each baseline, what is tried beside the preset as it was before."""
 BEFORE: dict[str, Change] = {
     "naive_obs": {"learning_rate": 1 / 0.3},
     "naive_dropout": {"learning_rate": 1 / 0.3},

@@ -17,7 +17,7 @@ from scipy import stats
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import check_names
-from deconfounded.benchmarks.output.score import two_decimals
+from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
 from deconfounded.benchmarks.studies.cards import DOCS, kept, markdown_table
 from deconfounded.envs.support.files import write_json
@@ -40,7 +40,10 @@ CASES: dict[str, str | None] = {
 TRIALS, SEED = {"bandit": 2000}, 11  # trials: 256 of all others
 LEARNED = ("naive_rnn", "deconfounded")
 KEPT = "diagnose/validation"
-FIGURES = ("memory", "explained", "explored", "shown", "ratio", "stakes", "strayed", "unlike")  # of the table
+FIGURES = (  # of the table
+    *("memory_gain", "latent_gain", "exploration_evidence", "expert_evidence", "ratio"),
+    *("stakes", "paired_stakes", "model_deviation"),
+)
 
 
 def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
@@ -129,12 +132,12 @@ def _unseen(row: dict[str, Any]) -> bool:
 def summary(rows: list[dict[str, Any]]) -> str:
     """How many are right, and Spearman's correlation of the predicted and the measured gap."""
     sentences = []
-    for what, unseen in (("that thresholds were set by", False), ("not looked at then", True)):
+    for what, unseen in (("by which thresholds were set", False), ("added later", True)):
         of = [row for row in rows if _unseen(row) is unseen]
         if len(of) > 2:
             share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
             rank = stats.spearmanr([row["predicted"] for row in of], [row["measured"] for row in of]).statistic
-            alike = f"predicted and measured gaps rank alike by {two_decimals(rank)}"
+            alike = f"the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
             sentences.append(f"Of cases {what}, {share}; {alike}.")
     return " ".join(sentences)
 
@@ -144,7 +147,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         verdict = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
-        figures = (row["found"][key]["value"] if key in row["found"] else None for key in FIGURES)
+        figures = (row["figures"][key]["value"] if key in row["figures"] else None for key in FIGURES)
         cells = ("" if value is None else two_decimals(value) for value in (*figures, row["predicted"]))
         certified, judged = "passed" if row["certified"] else "failed", "" if row["right"] else "wrong"
         lines.append((row["task"], certified, verdict, judged, *cells, two_decimals(row["measured"])))
@@ -187,7 +190,7 @@ def main() -> None:
             "right": right(task, certified, diagnosis),
             "predicted": predicted(diagnosis),
             "measured": scores["deconfounded"] - scores["naive_rnn"],
-            "found": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
+            "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
         rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}

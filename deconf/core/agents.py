@@ -16,7 +16,7 @@ from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import ActionHead, Scaler
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts import store
+from deconfounded.experts import saved_agents
 from deconfounded.experts.rollout import Agent, State
 
 
@@ -152,4 +152,4 @@ class LearnedAgent(Agent):
 
     def save(self, folder: Path | str) -> None:
         """Save the agent in a folder, for `deconfounded.load`."""
-        store.save(self, Path(folder))
+        saved_agents.save(self, Path(folder))

@@ -50,8 +50,8 @@ class LatentModel(nn.Module, ABC):
         """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
 
     @abstractmethod
-    def last(self, batch: Batch) -> Tensor:
-        """The memory [S, B, M] of whole trials."""
+    def final_memory(self, batch: Batch) -> Tensor:
+        """The memory [S, B, M] after the last step of whole trials."""
 
     @abstractmethod
     def belief(self, memory: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ class VariationalModel(LatentModel):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return self.encoder.update(memory, step)
 
-    def last(self, batch: Batch) -> Tensor:
+    def final_memory(self, batch: Batch) -> Tensor:
         return self.encoder(batch)[:, :, -1]
 
     def belief(self, memory: Tensor) -> Tensor:
@@ -123,10 +123,10 @@ class VariationalModel(LatentModel):
         transitions = batch.steps(index)
         memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
         mean, std = self.encoder.posterior(take(memories, index))
-        return self.bound(transitions, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
+        return self.negative_elbo(transitions, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
 
-    def bound(self, steps: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
-        """The negative of Eq. (6) [S], of steps [S, K], beliefs N(mean, std^2) and latents drawn from these."""
+    def negative_elbo(self, steps: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
+        """The negative of the bound of Eq. (6) [S], of steps [S, K], beliefs N(mean, std^2) and latents from these."""
         log_next = self.dynamics.log_prob(steps.obs, steps.action, steps.next_obs, theta_hat)[..., 0]
         kl = gaussian_kl(mean, std, *self.encoder.prior(mean))
         return inference_loss(log_next, kl, beta, steps.mask)
@@ -162,7 +162,7 @@ class DiscreteModel(LatentModel):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return belief_update(memory, self._evidence(step))
 
-    def last(self, batch: Batch) -> Tensor:
+    def final_memory(self, batch: Batch) -> Tensor:
         return belief_update(self.start(len(batch)), self._evidence(batch).sum(2))
 
     def belief(self, memory: Tensor) -> Tensor:
@@ -213,4 +213,4 @@ def new_model(
 def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
     """Beliefs q_phi(theta_hat_H | tau) after whole trials, [S, B, P]; in parts of so many, to save memory."""
     indices = torch.arange(len(trials), device=trials.mask.device).split(part)
-    return model.belief(torch.cat([model.last(trials[:, i]) for i in indices], 1))
+    return model.belief(torch.cat([model.final_memory(trials[:, i]) for i in indices], 1))

@@ -21,7 +21,7 @@ NEGLIGIBLE, NO_EVIDENCE = 0.1, 0.01  # nats a step: of memory, of the dynamics
 MISFIT = 0.2  # nats a step by which a memory may make a clone worse
 GOOD, SMALL_GAP = 0.8, 0.15  # scores
 STAKES = 1.5  # times chance
-MAX_UNLIKE = 4.0  # deviation of rollouts from the data, up to which the absence of stakes is believed
+MAX_MODEL_DEVIATION = 4.0  # deviation of rollouts from the data, up to which the absence of stakes is believed
 
 
 class Next(NamedTuple):
@@ -83,7 +83,7 @@ class Diagnosis:
     """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.
 
     Figures are those of Findings, and three more. `gap`: the predicted loss by naive cloning, in scores by paired
-    deviation; `gap_judged`: by Eq. (1); `ratio`: the evidence of actions over that of dynamics, in expert trials.
+    deviation; `gap_by_actions`: by Eq. (1); `ratio`: the evidence of actions over that of dynamics, in expert trials.
     """
 
     verdict: Verdict
@@ -148,12 +148,14 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
                 )
             figures[key] = Figure.of(values)
     gap = figures["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
-    judged = figures["gap_judged"] = Figure.of([refit.latent_judged - refit.naive_judged for refit in refits])
-    memory, stakes, strayed, unlike = (figures[key] for key in ("memory", "stakes", "strayed", "unlike"))
+    gaps = [refit.latent_by_actions - refit.naive_by_actions for refit in refits]
+    by_actions = figures["gap_by_actions"] = Figure.of(gaps)
+    names = ("memory_gain", "stakes", "paired_stakes", "model_deviation")
+    memory, stakes, paired, model = (figures[name] for name in names)
     naive, latent = figures["naive"], figures["latent"]
-    explored = figures.get("explored")
-    if explored is not None:
-        ratios = [(refit.acted or 0.0) / max(refit.shown or 0.0, NO_EVIDENCE) for refit in refits]
+    in_exploration = figures.get("exploration_evidence")
+    if in_exploration is not None:
+        ratios = [(refit.action_evidence or 0.0) / max(refit.expert_evidence or 0.0, NO_EVIDENCE) for refit in refits]
         figures["ratio"] = Figure.of(ratios)
     reasons = [
         f"A memory improves the prediction of the expert's action by {memory} nats a step over the present observation."
@@ -169,7 +171,7 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
         if memory.high > NEGLIGIBLE:
             reason = "That may be zero or not; more trials would decide."
             return conclude("cannot tell", None, reason, MORE_TRIALS)
-        if explored is not None and figures["shown"].low > NO_EVIDENCE:
+        if in_exploration is not None and figures["expert_evidence"].low > NO_EVIDENCE:
             reason = (
                 "The dynamics differ between trials, but the expert acts on nothing that its clone does not observe."
             )
@@ -182,24 +184,25 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
     reasons.append(
         "The expert acts on something that the present observation does not show. In rollouts in the learned dynamics,"
         f" trajectories of an expert policy given a wrong latent deviate from those given right ones {stakes} times as"
-        f" much as by chance, and {strayed} times as much when paired by latent and start. From 0 for the wrong latent"
+        f" much as by chance, and {paired} times as much when paired by latent and start. From 0 for the wrong latent"
         f" to 1 for the right one, a naive clone scores {naive} by trajectories, and a policy that infers the latent"
-        f" from the dynamics {latent}; by actions, Eq. (1), {figures['naive_judged']} and {figures['latent_judged']}."
+        f" from the dynamics {latent}; by actions, Eq. (1), {figures['naive_by_actions']} and"
+        f" {figures['latent_by_actions']}."
     )
-    if explored is None:
+    if in_exploration is None:
         reason = (
             "But the dynamics were learned from expert trials alone, which hold nearly one action for each observation"
             " and latent: effects of actions and of the latent cannot be separated there."
         )
         return conclude("cannot tell", None, reason, EXPLORE_FIRST)
-    shown, explained = figures["shown"], figures["explained"]
+    in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(
-        f"The dynamics are evidence of the latent, by {explored} nats a step in exploration and {shown} in expert"
-        " trials; the latent inferred from them improves the prediction of the expert's actions by"
-        f" {explained} over the present observation. The actions are evidence of it by {figures['acted']} nats a step:"
-        f" {figures['ratio']} times as much, for a clone that takes its own actions for the expert's."
+        f"The dynamics are evidence of the latent, by {in_exploration} nats a step in exploration and {in_trials} in"
+        " expert trials; the latent inferred from them improves the prediction of the expert's actions by"
+        f" {gain} over the present observation. The actions are evidence of it by {figures['action_evidence']} nats a"
+        f" step: {figures['ratio']} times as much, for a clone that takes its own actions for the expert's."
     )
-    if max(-shown.low, shown.value, explained.high) < NEGLIGIBLE:
+    if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
         reason = (
             "In expert trials the evidence of the dynamics is next to zero, and so is what the latent explains: these"
             " trials do not identify it, and no exploration helps. Query the expert in states that the clone visits; if"
@@ -207,21 +210,21 @@ def judge(refits: Sequence[Findings]) -> Diagnosis:
             " lasts, looks the same; queries tell these apart.)"
         )
         return conclude("confounded", 3, reason, QUERY)
-    if shown.low <= NO_EVIDENCE:
+    if in_trials.low <= NO_EVIDENCE:
         reason = "The evidence in expert trials may be zero or not."
         return conclude("cannot tell", None, reason, EXPLORE_MORE)
-    if max(stakes.high, strayed.high) < STAKES and unlike.value < MAX_UNLIKE and explained.low > 0:
+    if max(stakes.high, paired.high) < STAKES and model.value < MAX_MODEL_DEVIATION and gain.low > 0:
         reason = "But trajectories under a wrong latent hardly deviate; nor will a clone's."
         return conclude("not confounded", 1, reason, CLONE)
-    if not any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, strayed)):
+    if not any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, paired)):
         reason = (
             "These deviations may be chance: the latent hardly matters, or the learned dynamics are poor where it does."
-            f" (Over all features, trajectories in them deviate {unlike} times as much from the data's as by chance.)"
+            f" (Over all features, trajectories in them deviate {model} times as much from the data's as by chance.)"
         )
         return conclude("cannot tell", None, reason, EXPLORE_MORE)
-    if naive.low > GOOD and max(gap.high, judged.high) < SMALL_GAP:
+    if naive.low > GOOD and max(gap.high, by_actions.high) < SMALL_GAP:
         return conclude("not confounded", 1, "The naive clone infers the latent by itself.", CLONE)
-    if max(gap.low, judged.low) <= 0 or max(gap.high, judged.high) < SMALL_GAP:
+    if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
         reason = "The scores hardly differ; more trials and more exploration would decide."
         return conclude("cannot tell", None, reason, MORE_TRIALS)
     reason = "A clone takes its own actions for evidence; inference from the dynamics does better."

@@ -120,12 +120,12 @@ def _train_dynamics(
         batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, config.shortest)
         half = draws.uniform(*batch.mask.shape[1:]) < 0.5
         context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
-        belief = model.belief(model.last(context))
+        belief = model.belief(model.final_memory(context))
         index = rest.draw_steps(config.inference_steps, draws)
         steps, trial = rest.steps(index), index // batch.mask.shape[2]
         theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
-        loss = model.bound(steps, mean, std, theta_hat, beta)
+        loss = model.negative_elbo(steps, mean, std, theta_hat, beta)
         optimizer.step(loss)
         monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model

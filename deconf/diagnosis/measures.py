@@ -42,12 +42,13 @@ Report = Callable[[float], None]
 class Amounts:
     """Hyperparameters of one split; offline: of Eq. (7); exploring: of Eq. (6).
 
-    rivals: candidate latents, drawn from those of the data. dreams: trials of each rollout in the learned dynamics.
+    candidates: number of latents in rollouts, drawn from the data's. rollouts: trials of each rollout in the learned
+    dynamics.
     """
 
     held_out: float = 0.25  # share of the trials
-    rivals: int = 32
-    dreams: int = 192
+    candidates: int = 32
+    rollouts: int = 192
     cloning: MemorylessConfig = field(default_factory=lambda: MemorylessConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
@@ -71,32 +72,33 @@ class Amounts:
 class Findings(NamedTuple):
     """The figures of one split. Nats are a step, on held-out trials.
 
-    memory: gain in log-likelihood of the expert's actions by a memory, over the present observation alone. explained:
-    the same by the latent inferred from the dynamics. Evidence is the log-likelihood given a trial's own latent less
-    that given another trial's. explored: evidence of the dynamics in exploration; shown: in expert trials; acted:
-    evidence of the expert's actions, which a naive clone takes its own for.
+    memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone.
+    latent_gain: the same by the latent inferred from the dynamics. Evidence is the log-likelihood given a trial's own
+    latent less that given another trial's. exploration_evidence, expert_evidence: evidence in the dynamics, of
+    exploration and of expert trials. action_evidence: evidence in the expert's actions, for which a naive clone takes
+    its own.
 
     The others are of the last episode of rollouts in the learned dynamics, and deviations are over chance, which is 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
-    under right latents, in the feature where it is largest. strayed: the same, paired by latent and start. unlike: mean
-    deviation of trajectories under right latents from the data's. naive, latent: scores of the naive clone and of
-    posterior sampling, from 0 for a wrong latent to 1 for the right one, by paired deviation; naive_judged,
-    latent_judged: by errors of actions, Eq. (1). Without exploration, explained to acted are None, and the latent
-    explains actions too, Eq. (7).
+    under right latents, in the feature where it is largest. paired_stakes: the same, paired by latent and start.
+    model_deviation: mean deviation of trajectories under right latents from the data's. naive, latent: scores of the
+    naive clone and of posterior sampling, from 0 for a wrong latent to 1 for the right one, by paired deviation;
+    naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
+    are None, and the latent explains actions too, Eq. (7).
     """
 
-    memory: float
-    explained: float | None
-    explored: float | None
-    shown: float | None
-    acted: float | None
+    memory_gain: float
+    latent_gain: float | None
+    exploration_evidence: float | None
+    expert_evidence: float | None
+    action_evidence: float | None
     stakes: float
-    strayed: float
-    unlike: float
+    paired_stakes: float
+    model_deviation: float
     naive: float
     latent: float
-    naive_judged: float
-    latent_judged: float
+    naive_by_actions: float
+    latent_by_actions: float
 
 
 class PartMonitor(Monitor):
@@ -158,12 +160,12 @@ def _rollouts(
 ) -> tuple[float, ...]:
     """Figures of rollouts: `stakes` and those after it in Findings. paths: trajectories of the data [N, T, O]."""
     draws, model, policy = Draws(rngs, "cpu"), explanation.model, explanation.policy
-    candidates = take(explanation.latents, draws.integers(explanation.latents.shape[1], amounts.rivals))
-    index = draws.integers(amounts.rivals, amounts.dreams)
+    candidates = take(explanation.latents, draws.integers(explanation.latents.shape[1], amounts.candidates))
+    index = draws.integers(amounts.candidates, amounts.rollouts)
     right = LatentPolicy(model, policy, take(candidates, index))
     wrong = LatentPolicy(model, policy, take(candidates, draw_distant(candidates, index, draws)))
     imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(model, policy, candidates)]
-    env, half = learned_env(right), amounts.dreams // 2
+    env, half = learned_env(right), amounts.rollouts // 2
     rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, *[right] * 3]]
     least, most, *errors = (error for error, _ in rollouts[:4])
     judged = (float(1 - (error - least) / (most - least).clamp(min=0.05)) for error in errors)

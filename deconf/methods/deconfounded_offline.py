@@ -69,7 +69,7 @@ def explain(
         steps = batch.mask.shape[2]
         index = draws.uniform(steps).argsort(-1)[:, : config.offline_steps]
         subset = Batch(*(take(x.transpose(1, 2), index).transpose(1, 2) for x in batch.tensors))
-        belief = offline.belief(offline.last(subset))
+        belief = offline.belief(offline.final_memory(subset))
         mean, std = belief.chunk(2, -1)
         theta_hat = offline.sample(belief, draws)[:, :, None].expand(-1, -1, index.shape[1], -1)
         log_next = offline.dynamics.log_prob(subset.obs, subset.action, subset.next_obs, theta_hat)[..., 0]

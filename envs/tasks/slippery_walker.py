@@ -54,7 +54,7 @@ class SlipperyWalker(MujocoTask):
     }
 
     def spec(self) -> mujoco.MjSpec:
-        """The walker of dm_control, on a floor whose friction has priority, without textures."""
+        """The walker of dm_control with steps of 1/120 s, damped joints, and a floor that decides friction."""
         if find_spec("dm_control") is None:
             remedy = "`pip install --no-deps dm_control` brings it"
             raise InputError(f"{self.name} needs an MJCF of dm_control, which is not installed; {remedy}")

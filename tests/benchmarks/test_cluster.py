@@ -13,7 +13,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.engine import catalogue, identity, jobs, progress, sources, store
+from deconfounded.benchmarks.engine import catalogue, identity, job_files, jobs, progress, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.local import Local
@@ -162,7 +162,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     assert [str(error) for error in failed] == ["method my_guest_broken: no luck (ValueError, my_guest.py:18)"]
     spans = []
     for seed, mine, theirs in zip((0, 1), local, dawdling, strict=True):
-        expected, found = store.read(mine.file(seed)), store.read(theirs.file(seed))
+        expected, found = job_files.read(mine.file(seed)), job_files.read(theirs.file(seed))
         assert expected is not None
         assert found is not None
         for key in expected.keys() - {"meta"}:

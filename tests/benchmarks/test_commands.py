@@ -23,7 +23,7 @@ from deconfounded.benchmarks import certify, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
 from deconfounded.benchmarks.engine.local import Local
-from deconfounded.benchmarks.output import records, score
+from deconfounded.benchmarks.output import records, scoring
 from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.studies import publish, results
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
@@ -58,7 +58,7 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--device", "cuda:99"), "cpu always can"),
     (("run", "--task", "bandit", "--out", "/proc/none"), "cannot be written"),
     (("run",), "--task is missing"),
-    (("run", "--list", "--task", "nonsense"), "it lists all, and goes by itself"),
+    (("run", "--list", "--task", "nonsense"), "it lists all; give it alone"),
     (("run", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
     (("run", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
     (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
@@ -417,7 +417,7 @@ class TestScore:
                 }
                 for seed, value in enumerate(by_seed)
             ]
-        methods = score.summarise(by_method, 2)
+        methods = scoring.summarise(by_method, 2)
         assert methods["other"]["objective"] == [-25, -25]
         assert methods["other"]["score"] == [0.75, 0.75]
         assert methods["other"]["return"] == [[24.0, 24.0], [26.0, 26.0]]
@@ -427,9 +427,9 @@ class TestScore:
     @pytest.mark.parametrize(("seeds", "share"), [(3, 0.75), (5, 0.84), (10, 0.89)])
     def test_few_seeds_cover_less(self, seeds: int, share: float) -> None:
         """As often as the pages say: 500 tries, four standard errors."""
-        low, high = score.bootstrap(np.random.default_rng(0).standard_normal((seeds, 500))).T
+        low, high = scoring.bootstrap(np.random.default_rng(0).standard_normal((seeds, 500))).T
         assert ((low <= 0) & (high >= 0)).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / 500))
-        assert score.bootstrap(np.array([1.0])) is None
+        assert scoring.bootstrap(np.array([1.0])) is None
 
 
 def test_certificate_fails_what_deserves_it() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import benchmark, jobs, progress, scheduler, store
+from deconfounded.benchmarks.engine import benchmark, job_files, jobs, progress, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
@@ -151,11 +151,11 @@ def test_an_edit_during_a_run_is_noticed(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(jobs, "commit", lambda: "abc")
     job = BenchmarkJob("bandit", settings("bandit", False), "random", (0,), tmp_path)
     job.run()
-    assert store.read(job.file(0))["meta"]["commit"] == "abc"  # type: ignore[index]
+    assert job_files.read(job.file(0))["meta"]["commit"] == "abc"  # type: ignore[index]
     stamps = iter((1, 2))
     monkeypatch.setattr(jobs, "last_edit", lambda: next(stamps))
     job.run()
-    assert store.read(job.file(0))["meta"]["commit"] == "abc+"  # type: ignore[index]
+    assert job_files.read(job.file(0))["meta"]["commit"] == "abc+"  # type: ignore[index]
     job.file(0).unlink()
     monkeypatch.undo()
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)

@@ -10,7 +10,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import identity, progress, store
+from deconfounded.benchmarks.engine import identity, job_files, progress
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.jobs import JobMonitor
@@ -65,10 +65,10 @@ def test_a_file_of_other_settings_expert_or_salt_is_made_again(tmp_path: Path, m
 @pytest.mark.parametrize("key", ["settings", "versions", "expert", "salt", "preset", "set", "task_version"])
 def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -> None:
     described = {**dict.fromkeys(("settings", "versions", "expert", "salt", "preset", "set", "task_version"), "a")}
-    store.prepare(tmp_path, described, resume=False)
-    store.prepare(tmp_path, described, resume=True)
+    job_files.prepare(tmp_path, described, resume=False)
+    job_files.prepare(tmp_path, described, resume=True)
     with pytest.raises(envs.InputError, match=f"holds a run that differs in its {key}"):
-        store.prepare(tmp_path, {**described, key: "b"}, resume=True)
+        job_files.prepare(tmp_path, {**described, key: "b"}, resume=True)
 
 
 def test_what_the_table_lacks_is_of_today_s_settings_and_expert(

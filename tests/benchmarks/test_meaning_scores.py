@@ -16,7 +16,7 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.benchmark import evaluate, objective
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.output import records, report, score, statistics
+from deconfounded.benchmarks.output import records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
 from deconfounded.deconf.methods import memoryless_bc
@@ -191,9 +191,9 @@ def entry(first: float, last: float) -> dict[str, Any]:
 
 def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     methods = {"bad": entry(0.9, 0.1), "best": entry(0.2, 0.8), "middle": entry(0.5, 0.5)}
-    rows = score.rows(methods)
+    rows = scoring.rows(methods)
     assert [row[0] for row in rows] == ["best", "middle", "bad"]
-    best = dict(zip(score.COLUMNS, rows[0], strict=True))
+    best = dict(zip(scoring.COLUMNS, rows[0], strict=True))
     assert (best["return"], best["last"], best["95% interval"], best["Eq. (1)"]) == (
         "8.0",
         "0.80",
@@ -202,7 +202,7 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     )
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
     about |= {"versions": dict.fromkeys(("python", "mujoco", "torch"), "1"), "eval_trials": 4, "episodes": 2}
-    text = report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
+    text = run_report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
     places = [re.search(rf"<td[^>]*>\s*(?:<[^>]*>\s*)*{name}\b", text).start() for name in ("best", "middle", "bad")]  # type: ignore[union-attr]
     assert places == sorted(places)
 
@@ -234,7 +234,7 @@ def test_episodes_beyond_training_move_no_score() -> None:
     seeds = {"random": [0.0, 0.0, 9.0, 9.0], "expert": [10.0, 10.0, 50.0, 50.0]}
     by_method = {name: [record(name, returns)] * 2 for name, returns in seeds.items()}
     by_method["other"] = [record("other", [2.0, 4.0, 30.0, 40.0]), record("other", [2.0, 6.0, 30.0, 40.0])]
-    summary = score.summarise(by_method, 2)["other"]
+    summary = scoring.summarise(by_method, 2)["other"]
     assert (summary["score"], summary["score_last"], summary["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
     assert summary["ci95"] == pytest.approx([0.4, 0.6])
 
@@ -245,7 +245,7 @@ def test_rows_csv_is_row_by_row_what_came_of_it() -> None:
     theta, objective_ = np.array([[[0.1], [0.2]], [[0.3], [0.4]]]), np.array([[-1.0, -2.0], [-3.0, -4.0]])
     data = {"meta": {"agents": {"x": ""}}, "x/returns": returns, "x/objective": objective_, "x/theta": theta}
     about = {"methods": {"random": {"return": [[0.0]]}, "expert": {"return": [[10.0]]}}}
-    lines = score.csv_rows(task, about, [("x", 7, data)]).splitlines()
+    lines = scoring.csv_rows(task, about, [("x", 7, data)]).splitlines()
     assert lines[0] == "method,seed,trial,force,episode,return,score,objective"
     assert lines[1:] == [
         *("x,7,0,0.1,1,5.0,0.5,-1.0", "x,7,0,0.2,2,10.0,1.0,-2.0"),

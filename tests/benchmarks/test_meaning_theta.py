@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import guest, progress, provider
+from deconfounded.benchmarks.engine import guest_host, progress, provider
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
@@ -198,11 +198,11 @@ def test_a_guest_does_not_act_on_theta(monkeypatch: pytest.MonkeyPatch) -> None:
         def send(self, message: Any) -> None: ...
         def close(self) -> None: ...
 
-    monkeypatch.setattr(guest.sys, "executable", "true")
-    monkeypatch.setattr(guest.Guest, "_connect", lambda self, reference: Silent())
-    monkeypatch.setattr(guest.Guest, "_fit", lambda self: None)
+    monkeypatch.setattr(guest_host.sys, "executable", "true")
+    monkeypatch.setattr(guest_host.Guest, "_connect", lambda self, reference: Silent())
+    monkeypatch.setattr(guest_host.Guest, "_fit", lambda self: None)
     context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
-    made = guest.Guest(context, "mine", "mine.py:fit", ["demonstrations", "theta"])
+    made = guest_host.Guest(context, "mine", "mine.py:fit", ["demonstrations", "theta"])
     made.close()
     assert len(made.provider("theta")) == 4
     with pytest.raises(envs.InputError, match="it asked for acting theta"):

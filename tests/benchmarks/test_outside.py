@@ -22,7 +22,7 @@ from deconfounded.benchmarks import certify, check, play
 from deconfounded.benchmarks.engine import catalogue, identity, presets, progress, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Context, stream
-from deconfounded.benchmarks.engine.guest import Guest
+from deconfounded.benchmarks.engine.guest_host import Guest
 from deconfounded.benchmarks.engine.provider import Provider, fit
 from deconfounded.deconf import methods, wire
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -32,7 +32,7 @@ from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
-from deconfounded.experts import policy, store
+from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 from tests.tools import tiny_preset
 
@@ -636,7 +636,7 @@ class TestSaved:
         agent = fit(Context(envs.get("bandit"), tiny_preset(), [0]), "blind_bc")
         assert isinstance(agent, LearnedAgent)
         agent.save(tmp_path)
-        assert store.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
+        assert saved_agents.describe(tmp_path)["versions"]["deconfounded-imitation"] == deconfounded.__version__
         assert isinstance(deconfounded.load(tmp_path), type(agent))
 
     @pytest.mark.parametrize(
@@ -656,7 +656,7 @@ class Odd(Still):
         (tmp_path / "odd.py").write_text(HEAD + text)
         agent = outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")()
         with pytest.raises(envs.InputError, match=says):
-            store.save(agent, tmp_path / "kept")
+            saved_agents.save(agent, tmp_path / "kept")
         assert not (tmp_path / "kept").exists()
 
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
@@ -677,7 +677,7 @@ def fit(given): return Constant(-0.25)
         expected = run_trials(context.env, agent, 1, 3).returns
         agent.close()
         (tmp_path / "mine.py").unlink()
-        assert store.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
+        assert saved_agents.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
         again = deconfounded.load(tmp_path / "kept")
         np.testing.assert_array_equal(run_trials(context.env, again, 1, 3).returns, expected)
 

@@ -14,7 +14,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import index, records, report, score, statistics
+from deconfounded.benchmarks.output import index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
 from deconfounded.benchmarks.studies import cards, findings, gap, publish, results, tune
@@ -77,11 +77,11 @@ def test_presets_are_what_tuning_chose() -> None:
     ("score", "naive", "spread", "word"),
     [
         *((0.95, 0.4, 1, "Yes"), (0.7, 0.4, 1, "It helps, but it is not enough"), (0.4, 0.4, 1, "No")),
-        *((0.7, 0.4, 20, "It cannot be told yet"), (0.95, 0.95, 1, "It cannot be told yet")),
+        *((0.7, 0.4, 20, "It cannot be decided yet"), (0.95, 0.95, 1, "It cannot be decided yet")),
     ],
 )
 def test_answers(score: float, naive: float, spread: float, word: str) -> None:
-    """By whether the opponent comes up to the one, or is no better than the other, on the tasks where all were run."""
+    """By whether the baseline comes up to the one, or is no better than the other, on the tasks where all were run."""
     seeds = {0: -0.06, 1: -0.02, 2: 0.0, 3: 0.02, 4: 0.06}
     runs = {"naive_rnn": (naive, 1), "deconfounded": (0.95, 1), "naive_transformer": (score, spread)}
     of = {name: {seed: mean + by * noise for seed, noise in seeds.items()} for name, (mean, by) in runs.items()}
@@ -176,8 +176,8 @@ class TestCurves:
         one = {"a": {"update": [10, 20, 30, 90, 100], "loss": [1.0, 2.0, 3.0, 4.0, 5.0]}}
         two = {"a": {"update": [10, 20, 30, 90, 100], "loss": [3.0, 2.0, 1.0, 4.0, 5.0]}}
         mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5]}
-        assert score.mean_curve([one, two]) == {"a": mean}
-        assert score.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
+        assert scoring.mean_curve([one, two]) == {"a": mean}
+        assert scoring.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
 
     def test_records(self) -> None:
         """A record has a curve of its training, and needs none."""
@@ -201,7 +201,7 @@ class TestOutcome:
     EXACT = {"interventional": entry(1, tier="reference"), "conditional": entry(0.6, tier="reference")}
 
     def test_sides(self) -> None:
-        found = score.outcome(
+        found = scoring.outcome(
             {
                 **self.EXACT,
                 **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5), "mute": entry(0.4, known=False)},
@@ -209,20 +209,22 @@ class TestOutcome:
             }
         )
         assert found == (
-            "good (0.90) learned what can be known, like the exact policy interventional (1.00); unsure (0.81) may be"
-            " on either side of the middle between the exact policies, 0.80; bad (0.50) fell in with the deluded exact"
-            " policy, conditional (0.60); mute (0.40) has no memory to learn with. Scores of the last episode, means of"
-            " 3 seeds."
+            "good (0.90) inferred theta, like the exact policy interventional (1.00); unsure (0.81) may be"
+            " on either side of the middle between the exact policies, 0.80; bad (0.50) scored like the deluded exact"
+            " policy, conditional (0.60); mute (0.40) has no memory to infer theta with. Scores of the last episode,"
+            " means of 3 seeds."
         )
 
     def test_what_cannot_be_told(self) -> None:
         near = {**self.EXACT, "conditional": entry(0.95, tier="reference"), "one": entry(0.9), "two": entry(0.8)}
-        assert score.outcome(near).startswith("Nothing can be told here: the exact policies, interventional (1.00) and")
-        assert "no pair of exact policies was run" in score.outcome({"one": entry(0.9, None)})
-        assert score.outcome({"one": entry(0.9, None)}).endswith("of one seed.")
-        assert score.outcome({"expert": entry(1, tier="reference")}).startswith("No method that learns without theta")
+        assert scoring.outcome(near).startswith(
+            "Nothing can be concluded: the exact policies, interventional (1.00) and"
+        )
+        assert "no pair of exact policies was run" in scoring.outcome({"one": entry(0.9, None)})
+        assert scoring.outcome({"one": entry(0.9, None)}).endswith("of one seed.")
+        assert scoring.outcome({"expert": entry(1, tier="reference")}).startswith("No method that learns without theta")
         lone = {name: entry(one["score_last"], None, one["tier"]) for name, one in self.EXACT.items()}
-        assert "one (0.90) learned" in score.outcome({**lone, "one": entry(0.9, None)})
+        assert "one (0.90) inferred" in scoring.outcome({**lone, "one": entry(0.9, None)})
 
 
 @pytest.fixture(scope="module")
@@ -400,14 +402,14 @@ class TestInABrowser:
 def test_report_in_a_browser(seen: "Page", errors: list[str], tmp_path: Path) -> None:
     """A run's report fits as well; its table scrolls, and each method has its curves."""
     results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
-    report.adaptation(results, tmp_path / "adaptation.png")
-    report.learning(results, tmp_path / "learning.png")
-    (tmp_path / "report.html").write_text(report.page(results, tmp_path))
+    run_report.adaptation(results, tmp_path / "adaptation.png")
+    run_report.learning(results, tmp_path / "learning.png")
+    (tmp_path / "report.html").write_text(run_report.page(results, tmp_path))
     seen.goto((tmp_path / "report.html").as_uri())
     assert errors == []
     assert seen.evaluate("document.documentElement.scrollWidth") <= seen.evaluate("innerWidth")
     assert seen.evaluate("document.querySelectorAll('td svg').length") >= len(results["methods"])
-    assert seen.evaluate("document.querySelector('.outcome').textContent") == score.outcome(results["methods"])
+    assert seen.evaluate("document.querySelector('.outcome').textContent") == scoring.outcome(results["methods"])
     wide = "box.scrollWidth > box.clientWidth && getComputedStyle(box).overflowX"
     assert seen.evaluate(f"(box => {wide})(document.querySelector('.scroll'))") == "auto"
     assert seen.evaluate("document.images.length") == 3  # adaptation, learning, certificate
@@ -416,21 +418,21 @@ def test_report_in_a_browser(seen: "Page", errors: list[str], tmp_path: Path) ->
 def test_certificate_of_a_report(tmp_path: Path) -> None:
     """Beside the run before that of docs/; of this version of the task, or none."""
     run, folder = tmp_path / "bandit-default", tmp_path / "certificates"
-    assert report.certificate("bandit", 0, run) == DOCS / "certificates" / "bandit.png"
-    assert report.certificate("bandit", 9, run) is None
+    assert run_report.certificate("bandit", 0, run) == DOCS / "certificates" / "bandit.png"
+    assert run_report.certificate("bandit", 9, run) is None
     folder.mkdir()
     (folder / "bandit.json").write_text('{"task": "bandit", "task_version": 0}')
     (folder / "bandit.png").write_bytes(b"")
-    assert report.certificate("bandit", 0, run) == folder / "bandit.png"
+    assert run_report.certificate("bandit", 0, run) == folder / "bandit.png"
 
 
 def test_beliefs_are_drawn(tmp_path: Path) -> None:
     """Of two latents; an agent without belief needs none, and no agents leave no picture."""
     task = envs.get("slippery_walker")
     theta, episode = task.theta_grid(2)[[0, 1, 2]], np.repeat([0, 1, 2], [4, 1, 3])
-    report.beliefs(task, {}, tmp_path / "none.png")
+    run_report.beliefs(task, {}, tmp_path / "none.png")
     assert not (tmp_path / "none.png").exists()
-    report.beliefs(
+    run_report.beliefs(
         task, {"naive_rnn": {"theta": theta, "episode": episode, "belief": theta[episode]}}, tmp_path / "some.png"
     )
     assert (tmp_path / "some.png").stat().st_size > 5000

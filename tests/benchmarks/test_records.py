@@ -15,7 +15,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import identity, progress, scheduler, sources, store
+from deconfounded.benchmarks.engine import identity, job_files, progress, scheduler, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import records
@@ -130,13 +130,13 @@ class TestKeptFiles:
 
     def spoilt(self, job: BenchmarkJob, **changes: Any) -> str:
         """Why the file of seed 0 is not believed, with these arrays or parts of meta in the place of its own."""
-        found = store.read(job.file(0))
+        found = job_files.read(job.file(0))
         assert found is not None
         meta = {**found["meta"], **{key: value for key, value in changes.items() if key in found["meta"]}}
         arrays = {key: changes.get(key, value) for key, value in found.items() if key != "meta"}
         np.savez(job.file(0), meta=np.array(json.dumps(meta)), **arrays)
         assert job.load(0) is None
-        spoilt = store.read(job.file(0))
+        spoilt = job_files.read(job.file(0))
         assert spoilt is not None
         return job.unfit(0, spoilt)
 
@@ -147,7 +147,7 @@ class TestKeptFiles:
 
     def test_another_seed(self, job: BenchmarkJob) -> None:
         shutil.copy(job.file(1), job.file(0))
-        found = store.read(job.file(0))
+        found = job_files.read(job.file(0))
         assert found is not None
         assert job.unfit(0, found) == "it is of seed 1"
 
@@ -155,7 +155,7 @@ class TestKeptFiles:
         other = replace(job, method="random", seeds=(0,))
         other.run()
         shutil.copy(other.file(0), job.file(0))
-        found = store.read(job.file(0))
+        found = job_files.read(job.file(0))
         assert found is not None
         assert job.unfit(0, found) == "it was made with another method"
 
@@ -194,19 +194,19 @@ class TestKeptFiles:
         assert job.context().has_demonstrations(0)
         assert not replace(job, preset=replace(job.preset, expert_trials=3)).context().has_demonstrations(0)
         shutil.copy(job.file(1), job.file(0))
-        assert [(method, seed) for method, seed, _ in store.left_in(job.folder)] == [("blind_bc", 1)]
+        assert [(method, seed) for method, seed, _ in job_files.left_in(job.folder)] == [("blind_bc", 1)]
         assert capsys.readouterr().out == "blind_bc-0.npz is left out: it is of blind_bc-1\n"
 
     @pytest.mark.parametrize("text", ["[]", "{", '{"kind": "BenchmarkJob"}', "\xff", "[" * 100_000])
     def test_settings_of_wrong_shape(self, text: str, tmp_path: Path) -> None:
         (tmp_path / "settings.json").write_text(text, encoding="latin-1")
         with pytest.raises(envs.InputError, match=r"settings\.json is damaged"):
-            store.prepare(tmp_path, {"kind": "BenchmarkJob"}, resume=True)
+            job_files.prepare(tmp_path, {"kind": "BenchmarkJob"}, resume=True)
 
     def test_what_a_kill_left_half_written_goes(self, tmp_path: Path) -> None:
         (tmp_path / "jobs").mkdir()
         (tmp_path / "jobs" / f".naive_rnn-0.npz.77{PARTIAL}").write_bytes(b"half")
-        store.prepare(tmp_path, {}, resume=False)
+        job_files.prepare(tmp_path, {}, resume=False)
         assert not list((tmp_path / "jobs").iterdir())
 
     def test_flipped_bits(self, job: BenchmarkJob) -> None:
@@ -418,7 +418,7 @@ def test_broken_pictures_leave_the_numbers(
     def broken(*_: Any) -> None:
         raise FatalError("an OpenGL platform library has not been loaded")
 
-    monkeypatch.setattr("deconfounded.benchmarks.output.report.pictures", broken)
+    monkeypatch.setattr("deconfounded.benchmarks.output.run_report.pictures", broken)
     for method in ("random", "expert"):
         replace(job, method=method).run()
     about = {"reference": "bandit", "kind": "BenchmarkJob", "preset": "smoke", "set": []}

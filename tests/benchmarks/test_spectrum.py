@@ -67,7 +67,7 @@ def test_what_the_certificate_foretold() -> None:
         for verdict, naive in (("passed", 0.1), ("passed", 0.4), ("failed", 0.9))
     ]
     told = spectrum.foretold(points)
-    assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10 is" in told
+    assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10." in told
     assert "failed, on 0, by (none)" in spectrum.foretold(points[:2])
 
 
@@ -117,14 +117,14 @@ def test_validation_has_what_the_spectrum_found() -> None:
 def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
     def row(case: str, right: bool, predicted: float, measured: float) -> dict[str, Any]:
         told = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
-        found = {"stakes": {"value": 2 * predicted}}
-        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "found": found}
+        figures = {"stakes": {"value": 2 * predicted}}
+        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "figures": figures}
 
     seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
-    ranked = "verdicts are right; predicted and measured gaps rank alike by"
-    assert validate.summary(seen) == f"Of cases that thresholds were set by, 2 of 3 {ranked} 1.00."
+    ranked = "verdicts are right; the rank correlation of predicted and measured gaps is"
+    assert validate.summary(seen) == f"Of cases by which thresholds were set, 2 of 3 {ranked} 1.00."
     other = [row(noise.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
-    assert validate.summary([*seen, *other]).endswith(f" Of cases not looked at then, 3 of 3 {ranked} -1.00.")
+    assert validate.summary([*seen, *other]).endswith(f" Of cases added later, 3 of 3 {ranked} -1.00.")
     table = validate.table([*seen, *other]).splitlines()
     assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
     assert table[-1].endswith("| 16.00 |  |  | 8.00 | -8.00 |")

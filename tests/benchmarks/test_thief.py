@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import catalogue, progress, store
+from deconfounded.benchmarks.engine import catalogue, job_files, progress
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Context, stream
 from deconfounded.benchmarks.output import records
@@ -50,7 +50,7 @@ def run(folder: Path, steal: str, monkeypatch: pytest.MonkeyPatch, seed: int = 0
     guest = catalogue.guest(name)
     job = BenchmarkJob(CONTROL, tiny_preset(), name, (seed,), folder / "jobs", None, SALT, guest)
     job.run()
-    data = store.read(job.file(seed))
+    data = job_files.read(job.file(seed))
     assert data is not None
     return data
 
@@ -123,7 +123,7 @@ def test_salts_of_a_record_give_it_again(tmp_path: Path, monkeypatch: pytest.Mon
         salts=tuple(record["salts"]),
     )
     job.run()
-    again = store.read(job.file(0))
+    again = job_files.read(job.file(0))
     assert again is not None
     np.testing.assert_array_equal(again["thief/returns"], data["thief/returns"])
 

@@ -203,7 +203,7 @@ def test_discrete_belief_one_step_at_a_time(name: str) -> None:
         memory = model.start(len(data))
         for t in range(data.mask.shape[2]):
             memory = model.update(memory, data[:, :, t])
-        torch.testing.assert_close(memory, model.last(data), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(memory, model.final_memory(data), rtol=1e-3, atol=1e-3)
         assert (memory - model.start(len(data))).abs().max() > 0.1
 
 
@@ -266,7 +266,7 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
     seen: list[Tensor] = []
     weights: list[Tensor] = []
 
-    def last(self: VariationalModel, batch: Batch) -> Tensor:
+    def final_memory(self: VariationalModel, batch: Batch) -> Tensor:
         seen.append(batch.obs[0, 0, :, 0])
         return self.encoder(batch)[:, :, -1]
 
@@ -274,7 +274,7 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
         weights.append(weight)
         return offline_loss(log_next, log_policy, kl, beta, weight)
 
-    monkeypatch.setattr(VariationalModel, "last", last)
+    monkeypatch.setattr(VariationalModel, "final_memory", final_memory)
     monkeypatch.setattr(deconfounded_offline, "offline_loss", loss)
     step = np.tile(np.arange(11, dtype="f4"), (3, 1, 1))[..., None]
     trials = Trials(step, np.zeros((3, 1, 10, 1), "f4"), np.ones((3, 1, 10), bool))

@@ -24,8 +24,8 @@ from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_t
 
 ROOT = Path(__file__).parents[2]
 TINY = Amounts(
-    rivals=2,
-    dreams=4,
+    candidates=2,
+    rollouts=4,
     cloning=MemorylessConfig(updates=5, batch=64),
     naive=RecurrentConfig(updates=6, batch=4),
     offline=OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4, offline_steps=16),
@@ -93,21 +93,21 @@ class TestBadInput:
 
 
 CLEAR = Findings(
-    memory=1.0,
-    explored=0.2,
-    shown=0.2,
-    acted=50.0,
-    explained=0.5,
+    memory_gain=1.0,
+    exploration_evidence=0.2,
+    expert_evidence=0.2,
+    action_evidence=50.0,
+    latent_gain=0.5,
     stakes=3.0,
-    strayed=9.0,
-    unlike=3.0,
+    paired_stakes=9.0,
+    model_deviation=3.0,
     naive=0.2,
     latent=0.9,
-    naive_judged=-0.1,
-    latent_judged=0.8,
+    naive_by_actions=-0.1,
+    latent_by_actions=0.8,
 )
 
-ALONE = dict.fromkeys(("explained", "explored", "shown", "acted"))
+ALONE = dict.fromkeys(("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence"))
 
 
 class TestJudge:
@@ -118,26 +118,31 @@ class TestJudge:
         [
             ({}, "confounded", 2, diagnose.EXPLORE),
             (ALONE, "cannot tell", None, diagnose.EXPLORE_FIRST),
-            ({**ALONE, "stakes": 1.0, "strayed": 1.0, "unlike": 1.0}, "cannot tell", None, diagnose.EXPLORE_FIRST),
-            ({"shown": 0.05, "explained": -0.1}, "confounded", 3, diagnose.QUERY),
-            ({"shown": 0.05, "explained": 0.05}, "confounded", 3, diagnose.QUERY),
-            ({"shown": 0.05}, "confounded", 2, diagnose.EXPLORE),
-            ({"explained": -0.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"shown": -0.5}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            (
+                {**ALONE, "stakes": 1.0, "paired_stakes": 1.0, "model_deviation": 1.0},
+                "cannot tell",
+                None,
+                diagnose.EXPLORE_FIRST,
+            ),
+            ({"expert_evidence": 0.05, "latent_gain": -0.1}, "confounded", 3, diagnose.QUERY),
+            ({"expert_evidence": 0.05, "latent_gain": 0.05}, "confounded", 3, diagnose.QUERY),
+            ({"expert_evidence": 0.05}, "confounded", 2, diagnose.EXPLORE),
+            ({"latent_gain": -0.1}, "confounded", 2, diagnose.EXPLORE),
+            ({"expert_evidence": -0.5}, "cannot tell", None, diagnose.EXPLORE_MORE),
             ({"stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"strayed": 1.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"stakes": 1.1, "strayed": 1.4}, "not confounded", 1, diagnose.CLONE),
-            ({"stakes": 1.1, "strayed": 1.4, "unlike": 5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"stakes": 1.1, "strayed": 1.4, "explained": -0.1}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"shown": -5.0, "explained": -5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"memory": -1.0}, "cannot tell", None, diagnose.MORE_TRIALS),
-            ({"naive": 0.7, "latent": 0.75, "naive_judged": 0.75}, "cannot tell", None, diagnose.MORE_TRIALS),
-            ({"naive": 0.95, "latent": 1.0, "naive_judged": 0.75}, "not confounded", 1, diagnose.CLONE),
+            ({"paired_stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
+            ({"stakes": 1.1, "paired_stakes": 1.4}, "not confounded", 1, diagnose.CLONE),
+            ({"stakes": 1.1, "paired_stakes": 1.4, "model_deviation": 5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"stakes": 1.1, "paired_stakes": 1.4, "latent_gain": -0.1}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"expert_evidence": -5.0, "latent_gain": -5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
+            ({"memory_gain": -1.0}, "cannot tell", None, diagnose.MORE_TRIALS),
+            ({"naive": 0.7, "latent": 0.75, "naive_by_actions": 0.75}, "cannot tell", None, diagnose.MORE_TRIALS),
+            ({"naive": 0.95, "latent": 1.0, "naive_by_actions": 0.75}, "not confounded", 1, diagnose.CLONE),
             ({"naive": 0.95, "latent": 1.0}, "confounded", 2, diagnose.EXPLORE),
-            ({"memory": 0.001}, "not confounded", 1, diagnose.CLONE),
-            ({"memory": 0.001, "shown": -0.002}, "cannot tell", None, diagnose.VARY_LATENT),
-            ({"memory": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY_LATENT),
-            ({"latent": 0.1, "latent_judged": -0.2}, "cannot tell", None, diagnose.MORE_TRIALS),
+            ({"memory_gain": 0.001}, "not confounded", 1, diagnose.CLONE),
+            ({"memory_gain": 0.001, "expert_evidence": -0.002}, "cannot tell", None, diagnose.VARY_LATENT),
+            ({"memory_gain": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY_LATENT),
+            ({"latent": 0.1, "latent_by_actions": -0.2}, "cannot tell", None, diagnose.MORE_TRIALS),
         ],
     )
     def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: diagnose.Next) -> None:
@@ -146,27 +151,27 @@ class TestJudge:
 
     def test_refits_that_disagree(self) -> None:
         """No confident verdict where refits lie on both sides of what decides."""
-        assert diagnose.judge([CLEAR, CLEAR._replace(memory=0.0)]).verdict == "cannot tell"
-        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_judged=-0.2)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(memory_gain=0.0)]).verdict == "cannot tell"
+        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_by_actions=-0.2)]).verdict == "cannot tell"
         assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
-        assert diagnose.judge([CLEAR, CLEAR._replace(shown=-0.002)]).verdict == "cannot tell"
-        mixed = CLEAR._replace(shown=0.05, explained=-0.1)
+        assert diagnose.judge([CLEAR, CLEAR._replace(expert_evidence=-0.002)]).verdict == "cannot tell"
+        mixed = CLEAR._replace(expert_evidence=0.05, latent_gain=-0.1)
         assert diagnose.judge([mixed, mixed]).tier == 3
-        assert diagnose.judge([mixed, mixed._replace(explained=0.2)]).tier == 2
-        alike = CLEAR._replace(strayed=1.4)
+        assert diagnose.judge([mixed, mixed._replace(latent_gain=0.2)]).tier == 2
+        alike = CLEAR._replace(paired_stakes=1.4)
         assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_nan(self) -> None:
-        with pytest.raises(InputError, match="learning failed: unlike is"):
-            diagnose.judge([CLEAR, CLEAR._replace(unlike=float("nan"))])
+        with pytest.raises(InputError, match="learning failed: model_deviation is"):
+            diagnose.judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
 
     def test_figures(self) -> None:
         """The mean over refits, the least, and the most of them."""
-        figures = diagnose.judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, shown=0.5)]).figures
+        figures = diagnose.judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, expert_evidence=0.5)]).figures
         assert figures["naive"] == pytest.approx((0.3, 0.2, 0.5))
         assert figures["ratio"] == pytest.approx((200, 100, 250))
-        assert "explored" not in diagnose.judge([CLEAR._replace(**ALONE)]).figures
+        assert "exploration_evidence" not in diagnose.judge([CLEAR._replace(**ALONE)]).figures
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
@@ -184,8 +189,8 @@ def test_measures(make) -> None:
     assert first == second
     assert np.isfinite(first).all()
     alone = measures.measure(expert, None, TINY, np.random.default_rng(0))
-    assert {alone.explained, alone.explored, alone.shown, alone.acted} == {None}
-    assert np.isfinite([alone.memory, alone.stakes, alone.naive, alone.latent]).all()
+    assert {alone.latent_gain, alone.exploration_evidence, alone.expert_evidence, alone.action_evidence} == {None}
+    assert np.isfinite([alone.memory_gain, alone.stakes, alone.naive, alone.latent]).all()
 
 
 def test_gain_by_memory() -> None:
@@ -201,9 +206,9 @@ def test_gain_by_memory() -> None:
     )
     hidden = Trials(obs, sign, np.ones(shape, bool), 2)
     findings = measures.measure(hidden, None, amounts, np.random.default_rng(0))
-    assert findings.memory == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
+    assert findings.memory_gain == pytest.approx(np.log(2) * 19 / 20, abs=0.06)
     chance = Trials(obs, rng.integers(2, size=(*shape, 1)), np.ones(shape, bool), 2)
-    assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory < 0.02
+    assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory_gain < 0.02
 
 
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
@@ -217,17 +222,17 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     first = capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert written["verdict"].upper() in first
-    assert set(written["found"]) == {*Findings._fields, "gap", "gap_judged", "ratio"}
+    assert set(written["figures"]) == {*Findings._fields, "gap", "gap_by_actions", "ratio"}
     page = (tmp_path / "out" / "index.html").read_text()
     assert written["reasons"][0] in html.unescape(page)
     assert not re.search(r"(src|href)=\"(?!data:)", page)
     assert first.count("measured in") == 2
     command.main()
     assert "measured in" not in capsys.readouterr().out
-    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["found"] == written["found"]
+    assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["figures"] == written["figures"]
     monkeypatch.setattr("sys.argv", ["diagnose", *options[:2], "--out", str(tmp_path / "alone")])
     command.main()
-    assert "explored" not in json.loads((tmp_path / "alone" / "diagnosis.json").read_text())["found"]
+    assert "exploration_evidence" not in json.loads((tmp_path / "alone" / "diagnosis.json").read_text())["figures"]
 
 
 FEWER = {

@@ -91,10 +91,10 @@ def losses(batch: Batch) -> dict[str, Loss]:
     for kind in ("evidence", "gru", "discrete"):
         model = new_model(kind, 3, 16, FLAT, obs, change, draws()).eval()
         agent = DeconfoundedAgent.new(kind, 3, 16, FLAT, obs, change, draws())
-        belief = agent.model.belief(agent.model.last(batch)).detach()
+        belief = agent.model.belief(agent.model.final_memory(batch)).detach()
         found[f"{kind} model"] = lambda given, model=model: model.loss(given, None, 0.1, draws())  # type: ignore[misc]
         found[f"{kind} policy"] = lambda given, agent=agent, belief=belief: agent.loss(given, belief, None, draws())  # type: ignore[misc]
-        found[f"{kind} memory"] = lambda given, model=model: model.last(given).flatten()  # type: ignore[misc]
+        found[f"{kind} memory"] = lambda given, model=model: model.final_memory(given).flatten()  # type: ignore[misc]
     return found
 
 

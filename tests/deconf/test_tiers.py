@@ -10,7 +10,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.provider import deployed, fit
-from deconfounded.benchmarks.output.score import normalise
+from deconfounded.benchmarks.output.scoring import normalise
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig

@@ -19,7 +19,7 @@ import numpy as np
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks.engine import jobs, progress, store
+from deconfounded.benchmarks.engine import job_files, jobs, progress
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.output import records
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -49,7 +49,7 @@ def equal(one: Any, other: Any) -> bool:
 def files(folder: Path) -> dict[str, tuple[Path, Read]]:
     """One file of each kind, as commands write it, and what reads it: None or InputError if it is not believed."""
     progress._ticks = queue.Queue()  # type: ignore[assignment]
-    store.prepare(folder, {"task": "bandit", "seeds": 3, "set": ["seeds=3"], "rate": 1e-3}, resume=False)
+    job_files.prepare(folder, {"task": "bandit", "seeds": 3, "set": ["seeds=3"], "rate": 1e-3}, resume=False)
     jobs.SAVE_EVERY_S = 0.0
     job = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", (0,), folder / "jobs")
     kept = folder / "kept.pt"

@@ -30,7 +30,7 @@ from deconfounded.benchmarks.engine.benchmark import spaces
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig, train
-from deconfounded.experts import policy, store
+from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.rollout import Trials, run_trials
 from tests.tools import tiny_preset
 
@@ -38,7 +38,7 @@ REACHED = (  # where a command's work begins
     *("benchmarks.engine.scheduler.run_all", "benchmarks.certify.certify", "experts.train.train"),
     *("benchmarks.studies.stepping.seconds", "benchmarks.studies.performance.update_seconds"),
     *("experts.datasets.collect", "benchmarks.score.rescore", "benchmarks.verify.rerun"),
-    *("benchmarks.output.report.write", "benchmarks.studies.publish.write"),
+    *("benchmarks.output.run_report.write", "benchmarks.studies.publish.write"),
     *("benchmarks.check.check_task",),
 )
 MOST = 4 << 30  # bytes of memory, so that what asks for more is seen here
@@ -175,7 +175,7 @@ def commands(folder: Path) -> Iterator[tuple[str, str]]:
     shown = Context(envs.get("bandit"), preset, [0]).demonstrations
     agent = train(shown, MemorylessConfig(updates=3, batch=64), [np.random.default_rng(0)])
     assert isinstance(agent, LearnedAgent)
-    store.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
+    saved_agents.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
     for command, (base, options) in ODD.items():
         for option, values in options.items():
             for value in values:

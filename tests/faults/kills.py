@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.benchmarks.engine import store
+from deconfounded.benchmarks.engine import job_files
 from deconfounded.envs.support.files import write_json
 
 HERE = Path(__file__).parent
@@ -41,7 +41,7 @@ def start(out: Path) -> subprocess.Popen[bytes]:
 
 def finished(out: Path) -> dict[str, str]:
     """SHA-256 of each job's file that is whole."""
-    files = [file for file in sorted((out / "jobs").glob("*-*.npz")) if store.read(file) is not None]
+    files = [file for file in sorted((out / "jobs").glob("*-*.npz")) if job_files.read(file) is not None]
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
@@ -58,7 +58,7 @@ def came_out(out: Path) -> dict[str, str]:
     for file in sorted(file for file in out.rglob("*") if file.is_file()):
         digest, name = hashlib.sha256(), str(file.relative_to(out))
         if file.suffix == ".npz":
-            job = store.read(file)
+            job = job_files.read(file)
             if job is None:  # demonstrations
                 digest.update(file.read_bytes())
             else:

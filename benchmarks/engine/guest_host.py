@@ -191,7 +191,7 @@ def fresh(rngs: Sequence[np.random.Generator]) -> list[int]:
     return [int(rng.integers(2**63)) for rng in rngs]
 
 
-class Stranger(Agent):
+class ReseededAgent(Agent):
     """An agent of somebody else's class in this process: it gets the random numbers that it would get as a guest."""
 
     def __init__(self, agent: Agent) -> None:

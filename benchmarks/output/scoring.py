@@ -101,11 +101,11 @@ def summarise(by_method: dict[str, list[dict[str, Any]]], episodes: int) -> dict
 
 
 def outcome(methods: dict[str, Any]) -> str:
-    """In a sentence, what came out in the last episode: who learned, and who is deluded.
+    """A sentence on scores of the last episode: which methods infer theta, and which are deluded.
 
-    A method that does not see theta learned if its interval lies above the middle between the exact conditional and
-    the exact interventional policy; it fell in with the deluded one if it lies below and there is a memory at all.
-    Where the two are not .1 apart, nothing can be told. Other ways to deploy the same agent are left out.
+    A method that does not see theta infers it if its interval lies above the middle between the exact conditional and
+    the exact interventional policy; it is deluded if its interval lies below and the agent has a memory. If the two
+    are not .1 apart, nothing can be concluded. Other ways to deploy the same agent are left out.
     """
 
     def listed(*names: str) -> str:
@@ -125,7 +125,7 @@ def outcome(methods: dict[str, Any]) -> str:
         return f"{text} pair of exact policies was run to compare with. {basis}"
     (low, deluded), (high, exact) = ((methods[name]["score_last"], listed(name)) for name in EXACT)
     if high - low < 0.1:
-        alike = f"Nothing can be told here: the exact policies, {exact} and {deluded}, are alike."
+        alike = f"Nothing can be concluded: the exact policies, {exact} and {deluded}, score alike."
         return f"{alike} The others: {listed(*judged)}. {basis}"
     middle, sides = (low + high) / 2, dict[str, list[str]]()
     for name in judged:
@@ -133,11 +133,11 @@ def outcome(methods: dict[str, Any]) -> str:
         least, most = entry["ci95"] or (entry["score_last"],) * 2
         if most < middle:
             memory = any(entry["theta_r2"])
-            fate = f"fell in with the deluded exact policy, {deluded}" if memory else "has no memory to learn with"
+            fate = f"scored like the deluded exact policy, {deluded}" if memory else "has no memory to infer theta with"
         elif least <= middle:
             fate = f"may be on either side of the middle between the exact policies, {two_decimals(middle)}"
         else:
-            fate = f"learned what can be known, like the exact policy {exact}"
+            fate = f"inferred theta, like the exact policy {exact}"
         sides.setdefault(fate, []).append(name)
     return f"{'; '.join(f'{listed(*names)} {fate}' for fate, names in sides.items())}. {basis}"
 

@@ -1,4 +1,4 @@
-"""Opponents: past actions are hidden or dropped, transformers are causal, GAIL's environments hide theta."""
+"""Baselines: past actions are hidden or dropped, transformers are causal, GAIL's environments hide theta."""
 
 import copy
 from collections.abc import Callable
@@ -459,7 +459,7 @@ def test_gail_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_stable_baselines_leaves_no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Neither in an opponent's rounds nor for an expert."""
+    """Neither in a baseline's rounds nor for an expert."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     made("gail")
     train(envs.get(CONTROL), 2048, 0, lambda *_: None, n=16)

@@ -11,8 +11,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
-from deconfounded.benchmarks.engine.store import Finished
-from deconfounded.benchmarks.output import film, records, score
+from deconfounded.benchmarks.engine.job_files import Finished
+from deconfounded.benchmarks.output import film, records, scoring
 from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, encoded, mark, panels
 from deconfounded.envs.support.errors import error_line
@@ -28,14 +28,14 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     records.write(folder / "records", made)
     results = {**records.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
     write_json(folder / "results.json", results)
-    write_atomically(folder / "rows.csv", score.csv_rows(task, results, finished))
+    write_atomically(folder / "rows.csv", scoring.csv_rows(task, results, finished))
     try:
         pictures(task, results, finished, folder)
     except Exception as error:  # a GL, a font or an encoder can fail in many ways
         print(f"no pictures: {error_line(error)}")
     write_atomically(folder / "report.html", page(results, folder))
     head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
-    table = score.plain_table(score.COLUMNS, score.rows(results["methods"]))
+    table = scoring.plain_table(scoring.COLUMNS, scoring.rows(results["methods"]))
     return f"\n{head}\n\n{table}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
 
 
@@ -152,12 +152,12 @@ def page(results: dict[str, Any], folder: Path) -> str:
         pictures.append(("Is it confounded?", f"The task's certificate, of {command}.", encoded(certified)))
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
     filters = {
-        "two_decimals": score.two_decimals,
+        "two_decimals": scoring.two_decimals,
         "height": lambda value: 23 - 20 * min(max(value, -0.1), 1.1),
         "last_mean": lambda returns: np.mean(returns, 0)[-1],
     }
     parts = {
-        "outcome": score.outcome(results["methods"]),
+        "outcome": scoring.outcome(results["methods"]),
         "methods": sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]),
         "how": json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2),
     }
