@@ -13,8 +13,8 @@ from deconfounded.envs.support.errors import InputError
 class Adam:
     """Adam over stacked parameters, each seed's gradient clipped to norm 1; with `updates`, cosine decay.
 
-    A seed's parameters become views of one flat row, so that an update is a few operations. Whoever made the newest
-    Adam of a module owns its parameters; an older one raises RuntimeError when it steps.
+    A seed's parameters become views of one flat row, so that an update is a few operations. The newest Adam of a module
+    owns its parameters: an older one raises RuntimeError when it steps. `gradient` [S, N]: the last update's, clipped.
     """
 
     def __init__(self, modules: Iterable[nn.Module], learning_rate: float, updates: int | None = None) -> None:
@@ -24,14 +24,14 @@ class Adam:
         sizes = [p[0].numel() for p in self.parameters]
         # Rows are a multiple of 64 bytes long: products round by where in memory their factors lie.
         rows = self.parameters[0].new_zeros(len(self.parameters[0]), -(-sum(sizes) // 16) * 16)
-        self._flat, self._grad = rows[:, : sum(sizes)], torch.zeros_like(rows)[:, : sum(sizes)]
+        self._flat, self.gradient = rows[:, : sum(sizes)], torch.zeros_like(rows)[:, : sum(sizes)]
         with torch.no_grad():
             for p, own in zip(self.parameters, self._flat.split(sizes, 1), strict=True):
                 own.copy_(p.flatten(1))
                 p.data = own.unflatten(1, p.shape[1:])
         # Seed by seed: the fused kernel rounds the end of a tensor otherwise than its middle.
         by_seed = list(self._flat)
-        for row, grad in zip(by_seed, self._grad, strict=True):
+        for row, grad in zip(by_seed, self.gradient, strict=True):
             row.grad = grad
         self._adam = torch.optim.Adam(by_seed, learning_rate, fused=True)
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
@@ -52,12 +52,12 @@ class Adam:
         if self.parameters[0].data_ptr() != self._flat.data_ptr():
             raise RuntimeError(f"another Adam trains {self._trained}: this one is out of date")
         grads = torch.autograd.grad(loss.sum(), self.parameters, allow_unused=True, materialize_grads=True)
-        torch.cat([grad.flatten(1) for grad in grads], 1, out=self._grad)
+        torch.cat([grad.flatten(1) for grad in grads], 1, out=self.gradient)
         # Seed by seed: a sum over a stack has another order for one seed than for several.
-        squares = torch.stack([row.square().sum() for row in self._grad])
+        squares = torch.stack([row.square().sum() for row in self.gradient])
         if not math.isfinite(sum(loss.flatten().tolist())) or math.isnan(sum(squares.tolist())):
             self._fail(loss)
-        self._grad *= (1 / (squares.sqrt() + 1e-6)).clamp(max=1)[:, None]
+        self.gradient *= (1 / (squares.sqrt() + 1e-6)).clamp(max=1)[:, None]
         self._adam.step()
         if self._schedule is not None:
             self._schedule.step()

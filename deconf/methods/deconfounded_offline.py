@@ -93,7 +93,6 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     online.encoder.set_prior(latents)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
     horizon = trials.mask.shape[2]
-    online.eval()
     agent = DeconfoundedAgent(online, policy)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)

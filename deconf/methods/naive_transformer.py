@@ -34,7 +34,7 @@ class TransformerConfig(Configuration):
 
     width: int = 64
     layers: int = 2
-    heads: int = 4
+    heads: int = 2
     updates: int = 600
     batch: int = 16
     shortest: float = 1 / 8
@@ -47,16 +47,19 @@ def normed(x: Tensor) -> Tensor:
     return F.layer_norm(x, x.shape[-1:])
 
 
-def rotated(x: Tensor, position: Tensor) -> Tensor:
-    """Rotary positions: pairs of the D of x [..., H, T, D] are rotated by angles that grow with position [..., 1, T].
+def rotation(position: Tensor, width: int) -> Tensor:
+    """Rotary positions: exp(i angle), complex [..., D / 2], of angles that grow with position [...].
 
-    Dot products then depend on relative positions; wavelengths are 6 to some thousand steps.
+    Dot products of rotated vectors depend on relative positions; wavelengths are 6 to some thousand steps.
     """
-    half = x.shape[-1] // 2
-    speed = 1000.0 ** -(torch.arange(half, device=x.device) / half)
-    angle = position[..., None].float() * speed
-    (first, second), cos, sin = x.chunk(2, -1), angle.cos(), angle.sin()
-    return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
+    speed = 1000.0 ** -(torch.arange(width // 2, device=position.device) / (width // 2))
+    angle = position[..., None] * speed
+    return torch.polar(torch.ones_like(angle), angle)
+
+
+def rotated(x: Tensor, by: Tensor) -> Tensor:
+    """x [..., D], as D / 2 complex numbers, times `by`."""
+    return torch.view_as_real(torch.view_as_complex(x.unflatten(-1, (-1, 2))) * by).flatten(-2)
 
 
 class Cache:
@@ -72,13 +75,13 @@ class Cache:
 
     def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         """Write each trial's next token and attend to it and those before; all [N, H, 1, D]."""
-        position = self.count[:, None, None]
+        turn = rotation(self.count, key.shape[-1])[:, None, None]
         filled = min(int(self.count.max()) + 1, self.window)
-        for kept, new in zip(self.kept[layer], (rotated(key, position), value), strict=True):
+        for kept, new in zip(self.kept[layer], (rotated(key, turn), value), strict=True):
             kept[self.rows, :, self.count % self.window] = new[:, :, 0]
         keys, values = (kept[:, :, :filled] for kept in self.kept[layer])
         real = torch.arange(filled, device=key.device) <= self.count[:, None]
-        return F.scaled_dot_product_attention(rotated(query, position), keys, values, real[:, None, None])
+        return F.scaled_dot_product_attention(rotated(query, turn), keys, values, real[:, None, None])
 
 
 class Transformer(nn.Module):
@@ -105,10 +108,9 @@ class Transformer(nn.Module):
         """[S, B, T, 3 W] -> [S, B, T, W]."""
         qkv = projected.unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5)  # [3, S, B, H, T, D]
         if caches is None:
-            position = torch.arange(projected.shape[2], device=projected.device)[None]
-            query, key, value = (x.flatten(0, 1) for x in qkv)
-            query, key = rotated(query, position), rotated(key, position)
-            mixed = F.scaled_dot_product_attention(query, key, value, is_causal=True)
+            turn = rotation(torch.arange(projected.shape[2], device=projected.device), qkv.shape[-1])
+            query, key = rotated(qkv[:2].flatten(1, 2), turn)
+            mixed = F.scaled_dot_product_attention(query, key, qkv[2].flatten(0, 1), is_causal=True)
             mixed = mixed.unflatten(0, projected.shape[:2])
         else:
             mixed = torch.stack([cache.attend(layer, *qkv[:, s].unbind()) for s, cache in enumerate(caches)])
