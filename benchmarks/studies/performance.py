@@ -3,8 +3,9 @@
 speed: how fast environments step (minutes). growth: CPU seconds by the steps of a trial (an update of the belief, a
 pass of the RNN) and by the values of the exact policies' grid, each with the power of n that fits best. seeds: seconds
 an update of S seeds in one program over those of one seed: S means that stacking gains nothing, 1 that the other seeds
-come for free. cost: score in the last episode against CPU seconds, for each learned method, with shares of the default
-preset's updates; where the curve is flat, a smaller share does. Each part writes a .json, and most a .png.
+come for free. latency: milliseconds of an agent's step in one environment, by method (minutes). cost: score in the
+last episode against CPU seconds, for each learned method, with shares of the default preset's updates; where the curve
+is flat, a smaller share does. Each part writes a .json, and most a .png.
 """
 
 import argparse
@@ -203,7 +204,16 @@ def cost(args: argparse.Namespace) -> None:
             grid[0, 0].legend(frameon=False, fontsize=8)
 
 
-PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "cost": cost}
+def latency(args: argparse.Namespace) -> None:
+    """Of each learned method on a task."""
+    from deconfounded.benchmarks.studies.latency import by_method
+
+    task = envs.get(GRID)
+    measured = by_method(task, [name for name in LEARNED if name != "oracle_bc"])  # which is given theta
+    write_json(args.out / "latency.json", {"task": task.name, "versions": identity.versions(), "methods": measured})
+
+
+PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "latency": latency, "cost": cost}
 
 
 def main() -> None:

@@ -63,25 +63,36 @@ def rotated(x: Tensor, by: Tensor) -> Tensor:
 
 
 class Cache:
-    """A ring buffer of keys and values [N, H, window, D] of each layer's latest tokens, for N trials of one seed.
+    """A ring buffer of keys and values [2, N, H, window, D] of each layer's latest tokens, for N trials of one seed.
 
     Each seed has its own, since the order of sums depends on how far it is filled.
     """
 
     def __init__(self, layers: int, n: int, heads: int, window: int, width: int, device: torch.device) -> None:
-        self.kept = [[torch.zeros(n, heads, window, width, device=device) for _ in range(2)] for _ in range(layers)]
-        self.count = torch.zeros(n, dtype=torch.int64, device=device)  # of tokens that stay
+        self.kept = [torch.zeros(2, n, heads, window, width, device=device) for _ in range(layers)]
         self.window, self.rows = window, torch.arange(n, device=device)
+        self.count = torch.zeros(n, dtype=torch.int64, device=device)  # of tokens that stay
 
-    def attend(self, layer: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-        """Write each trial's next token and attend to it and those before; all [N, H, 1, D]."""
-        turn = rotation(self.count, key.shape[-1])[:, None, None]
-        filled = min(int(self.count.max()) + 1, self.window)
-        for kept, new in zip(self.kept[layer], (rotated(key, turn), value), strict=True):
-            kept[self.rows, :, self.count % self.window] = new[:, :, 0]
-        keys, values = (kept[:, :, :filled] for kept in self.kept[layer])
-        real = torch.arange(filled, device=key.device) <= self.count[:, None]
-        return F.scaled_dot_product_attention(rotated(query, turn), keys, values, real[:, None, None])
+    def begin(self) -> None:
+        """Begin with the next token of each trial: where it is written, and to what it attends."""
+        low, high = self.count.min().item(), self.count.max().item()
+        self.turn = rotation(self.count, self.kept[0].shape[-1])[:, None, None]
+        self.filled, self.mask = min(int(high) + 1, self.window), None
+        self.slot: int | Tensor = int(high) % self.window  # of all, where trials have as many steps
+        if low < high:
+            self.slot = self.count % self.window
+            self.mask = (torch.arange(self.filled, device=self.count.device) <= self.count[:, None])[:, None, None]
+
+    def attend(self, layer: int, qkv: Tensor) -> Tensor:
+        """Write each trial's next token and attend to it and those before; [3, N, H, 1, D] -> [N, H, 1, D]."""
+        (query, key), value, kept = rotated(qkv[:2], self.turn), qkv[2], self.kept[layer]
+        for buffer, new in zip(kept, (key, value), strict=True):
+            if isinstance(self.slot, int):
+                buffer[:, :, self.slot] = new[:, :, 0]
+            else:
+                buffer[self.rows, :, self.slot] = new[:, :, 0]
+        keys, values = kept[..., : self.filled, :]
+        return F.scaled_dot_product_attention(query, keys, values, self.mask)
 
 
 class Transformer(nn.Module):
@@ -96,25 +107,37 @@ class Transformer(nn.Module):
         self.widen = nn.ModuleList(Linear(width, 4 * width, draws) for _ in range(layers))
         self.narrow = nn.ModuleList(Linear(4 * width, width, draws) for _ in range(layers))
 
-    def forward(self, tokens: Tensor, caches: list[Cache] | None = None) -> Tensor:
-        """With caches, one for each seed, tokens [S, N, 1, I] are each trial's next, and are written to them."""
+    def forward(self, tokens: Tensor) -> Tensor:
         x = self.embed(tokens)
         for i in range(self.depth):
-            x = x + self.mix[i](self._attention(i, self.attend[i](normed(x)), caches))
+            x = x + self.mix[i](self._attention(self.attend[i](normed(x))))
             x = x + self.narrow[i](F.gelu(self.widen[i](normed(x))))
         return normed(x)
 
-    def _attention(self, layer: int, projected: Tensor, caches: list[Cache] | None) -> Tensor:
+    def _attention(self, projected: Tensor) -> Tensor:
         """[S, B, T, 3 W] -> [S, B, T, W]."""
         qkv = projected.unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5)  # [3, S, B, H, T, D]
-        if caches is None:
-            turn = rotation(torch.arange(projected.shape[2], device=projected.device), qkv.shape[-1])
-            query, key = rotated(qkv[:2].flatten(1, 2), turn)
-            mixed = F.scaled_dot_product_attention(query, key, qkv[2].flatten(0, 1), is_causal=True)
-            mixed = mixed.unflatten(0, projected.shape[:2])
-        else:
-            mixed = torch.stack([cache.attend(layer, *qkv[:, s].unbind()) for s, cache in enumerate(caches)])
-        return mixed.transpose(2, 3).flatten(3)
+        turn = rotation(torch.arange(projected.shape[2], device=projected.device), qkv.shape[-1])
+        query, key = rotated(qkv[:2].flatten(1, 2), turn)
+        mixed = F.scaled_dot_product_attention(query, key, qkv[2].flatten(0, 1), is_causal=True)
+        return mixed.unflatten(0, projected.shape[:2]).transpose(2, 3).flatten(3)
+
+    def layers(self, seed: int) -> list[tuple[Tensor, Tensor]]:
+        """Bias and weight of a seed's linear maps, in the order of `step`."""
+        blocks = zip(self.attend, self.mix, self.widen, self.narrow, strict=True)
+        maps: list[Any] = [self.embed, *(linear for block in blocks for linear in block)]
+        return [(linear.bias[seed], linear.weight[seed]) for linear in maps]
+
+    def step(self, token: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> Tensor:
+        """Features [N, W] of each trial's next token [N, I], with one seed's layers; it is written to the cache."""
+        cache.begin()
+        x = torch.addmm(layers[0][0], token, layers[0][1])
+        for i in range(self.depth):
+            attend, mix, widen, narrow = layers[1 + 4 * i : 5 + 4 * i]
+            qkv = torch.addmm(attend[0], normed(x), attend[1]).view(len(x), 3, self.heads, 1, -1).transpose(0, 1)
+            x = torch.addmm(x, cache.attend(i, qkv).reshape(x.shape), mix[1]).add_(mix[0])
+            x = torch.addmm(x, F.gelu(torch.addmm(widen[0], normed(x), widen[1])), narrow[1]).add_(narrow[0])
+        return normed(x)
 
 
 class TransformerAgent(LearnedAgent):
@@ -157,6 +180,7 @@ class TransformerAgent(LearnedAgent):
         net = self.net
         sizes = (net.depth, self._n, net.heads, net.window, net.width // net.heads, self.device)
         self._caches = [Cache(*sizes) for _ in range(self.seeds)]
+        self._layers = [net.layers(seed) for seed in range(self.seeds)]
         signature = self.policy.signature
         width = signature.action_features + signature.obs + 1
         self._before = torch.zeros(self.seeds, self._n, width, device=self.device)
@@ -165,7 +189,9 @@ class TransformerAgent(LearnedAgent):
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the next token. It stays in the cache if the step takes place, and is overwritten otherwise."""
         scaled = self.obs(obs)
-        self._features = self.net(torch.cat([scaled, self._before], -1)[:, :, None], self._caches)[:, :, 0]
+        tokens = torch.cat([scaled, self._before], -1)
+        steps = zip(tokens, self._layers, self._caches, strict=True)
+        self._features = torch.stack([self.net.step(*of_seed) for of_seed in steps])
         return self.policy.sample(torch.cat([self._features, scaled], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
