@@ -63,6 +63,11 @@ def thinned(curve: dict[str, list[tuple[int, float]]]) -> dict[str, dict[str, li
     return thin
 
 
+def short_commit(commit: str | None) -> str:
+    """A commit's first seven digits, with a + if the tree had uncommitted changes."""
+    return "unknown" if commit is None else commit[:7] + "+" * commit.endswith("+")
+
+
 def of_run(finished: Finished, preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
     """The records of all that jobs wrote."""
     return [record for *_, data in finished for record in of_job(data, preset, changes, episodes)]

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from deconfounded.benchmarks.output import scoring
+from deconfounded.benchmarks.output import records, scoring
 from deconfounded.benchmarks.studies import spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 
@@ -31,7 +31,7 @@ def rates() -> str:
 
 def _origins(made: list[dict[str, Any]]) -> str:
     """Where what is kept was made, and of which code, each once."""
-    origins = {(row["machine"], row["versions"]["torch"], (row["commit"] or "unknown")[:7]): None for row in made}
+    origins = {(row["machine"], row["versions"]["torch"], records.short_commit(row["commit"])): None for row in made}
     return "; ".join(f"{machine}, torch {torch}, of {commit}" for machine, torch, commit in origins)
 
 

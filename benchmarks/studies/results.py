@@ -50,7 +50,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     """A task's part of docs/results.md."""
     seeds = scoring.fewest_to_most([len(entry["seeds"]) for entry in results["methods"].values()])
     versions = ", ".join(f"{name} {results['versions'][name]}" for name in ("python", "mujoco", "torch"))
-    commits = ", ".join(dict.fromkeys(commit[:7] for commit in results["commits"]))
+    commits = ", ".join(dict.fromkeys(map(records.short_commit, results["commits"])))
     rows = []
     for row in scoring.rows(results["methods"]):
         beyond = results["methods"][row[0]].get("score_beyond")
@@ -86,7 +86,8 @@ def results_page(found: index.Found, certified: dict[str, Any]) -> str:
     """docs/results.md."""
     head = """# Results
 
-Made by `deconf publish` from the [records](records) alone, of which each is of one seed. Scores: 0 = random actions,
+Made by `deconf publish` from the [records](records) alone, of which each is of one seed; where a commit ends in +, its
+tree had uncommitted changes. Scores: 0 = random actions,
 1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that
 sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
 Intervals are 95% bootstrap intervals over seeds; of few seeds they are too narrow: with normal scores an interval of
