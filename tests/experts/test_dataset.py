@@ -34,7 +34,7 @@ def test_the_same_in_another_process(
     code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.stdout.strip() == shown.sha256, done.stderr
-    trials, theta = datasets.read(tmp_path)
+    trials, theta = datasets.read(tmp_path), datasets.read_theta(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
     config = RecurrentConfig(updates=2, batch=4)
     one, other = (naive_rnn.train(given, config, context.rngs) for given in (shown, trials))
