@@ -171,13 +171,16 @@ def _lag(log: Log, steps: Steps) -> Iterator[Remark]:
             yield Remark("lag", "Actions match the observation of their own row best: they are not logged late.")
         return
     motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
-    rows = f"{lag} row{'s' * (lag > 1)}"
-    match = f"Actions match the observation {rows} before best ({1 - left[lag + 1]:.0%} of their variance; their own row's {1 - left[1]:.0%})"
+    rows, plural = f"{lag} row{'s' * (lag > 1)}", "s" * (lag > 1)
+    text = (
+        f"Actions match the observation {rows} before theirs best ({1 - left[lag + 1]:.0%} of their variance, and"
+        f" {1 - left[1]:.0%} by that of their own row)"
+    )
     if motion[1] > motion[0] + 0.02:
-        text = f", and so does the motion that follows: they are logged {lag} step{'s' * (lag > 1)} late. Move the action up by {rows}."
+        text += f", and the motion that follows it: they are logged {lag} step{plural} late. Move actions up by {rows}."
     else:
-        text = ": a reaction time, or logged late. An expert that answers late is one with a memory."
-    yield Remark("late", match + text, True)
+        text += ": a reaction time, or logged late. An expert that answers late is one with a memory."
+    yield Remark("late", text, True)
 
 
 def _states(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -217,11 +220,11 @@ def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
         repeat = 1 - float(((now - last) ** 2).mean(0).sum()) / total
         own = np.stack([fits.by_trial(x, trial, len(log))[trial] for x in now.T], 1)
         mean = 1 - float(((now - own) ** 2).mean(0).sum()) / total
-        linear = 1 - fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), np.zeros(len(now), int))
+        linear = 1 - (1 - mean) * fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial)
         text = (
-            f"Of the variance of actions, which is the error of always the mean action ({np.sqrt(total):.2g} in Trials'"
-            f" units), repeating the last action predicts {repeat:.0%}, the mean action of the trial {mean:.0%}, a linear"
-            f" function of the observation {linear:.0%}."
+            f"Always the mean action errs by {np.sqrt(total):.2g} (rms, ranges being -1 to 1). Of that variance, repeating"
+            f" the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear function of"
+            f" the observation in each trial {linear:.0%}."
         )
     high = repeat > REPEATED
     text += " A clone can score well by repeating itself; errors of its actions say little." * high
@@ -238,8 +241,8 @@ def _lasting(log: Log, steps: Steps) -> Iterator[Remark]:
         half = np.log(0.5) / np.log(min(correlation, 0.999))
         text = (
             f"What the observation leaves open of the action in a trial ({share:.0%} of the variance) lasts: its"
-            f" correlation from step to step is {correlation:.2f}, so that it halves in {half:.0f} steps. Noise that lasts,"
-            " AR(1), or the expert's own memory looks like something hidden, and is not in the world."
+            f" correlation from step to step is {correlation:.2f}, so that it halves in {half:.0f} steps. Noise that"
+            " lasts, AR(1), or the expert's own memory looks like something hidden, and is not in the world."
         )
         yield Remark("lasting", text, True)
 
@@ -259,11 +262,12 @@ def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
         if x.min() > 0:
             ways[f"log({name})"] = np.log(x)
         ways[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
-        how = next(
-            (how for how, mended in ways.items() if fits.kurtosis(mended) < MENDED),
-            min(ways, key=lambda k: fits.kurtosis(ways[k])),
+        left = {how: fits.kurtosis(mended) for how, mended in ways.items()}
+        how = next((how for how, tails in left.items() if tails < MENDED), min(left, key=left.__getitem__))
+        text = (
+            f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all of it within {x.min():.4g} and"
+            f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left[how]:.1f})."
         )
-        text = f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all of it within {x.min():.4g} and {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({fits.kurtosis(ways[how]):.1f})."
         yield Remark("tails", text, True)
 
 
@@ -278,10 +282,13 @@ def _dynamics(log: Log, steps: Steps) -> Iterator[Remark]:
     gain, column = measured
     if gain is None:
         text = (
-            "Trials do not differ in their dynamics, as far as a quadratic fit can see: nothing in them that an imitator"
-            " could infer from what its actions do."
+            "Trials do not differ in their dynamics, as far as a quadratic fit can see: an imitator could infer nothing"
+            " from what its actions do."
         )
         yield Remark("dynamics", text, True)
         return
-    text = f"Trials differ in their dynamics: one half of a trial explains {gain:.0%} of what is unexplained of {log.units.obs[column]} in the other."
+    text = (
+        f"Trials differ in their dynamics: of what a fit of all trials leaves of changes of {log.units.obs[column]}, one"
+        f" half of a trial explains {gain:.0%} in the other."
+    )
     yield Remark("dynamics", text)

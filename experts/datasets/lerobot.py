@@ -33,11 +33,13 @@ def read_lerobot(folder: Path) -> Table:
     columns: dict[str, Column] = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     order = np.lexsort((columns["frame_index"], columns["episode_index"]))
     columns = {name: column[order] for name, column in columns.items()}
-    numbers, first, lengths = np.unique(columns["episode_index"], return_index=True, return_counts=True)
-    told = {"frames": info.get("total_frames"), "episodes": info.get("total_episodes")}
+    numbers, lengths = np.unique(columns["episode_index"], return_counts=True)
+    promised = {"frames": info.get("total_frames"), "episodes": info.get("total_episodes")}
     for what, held in (("frames", len(order)), ("episodes", len(numbers))):
-        if told[what] not in (None, held):
-            raise InputError(f"{folder} holds {held} {what}; its meta/info.json says {told[what]}: are files missing?")
+        if promised[what] not in (None, held):
+            raise InputError(
+                f"{folder} holds {held} {what}; its meta/info.json says {promised[what]}: are files missing?"
+            )
     by_number = {entry.get("episode_index"): entry for entry in _episodes(folder)}
     if set(numbers) <= set(by_number):
         columns |= _new(of_episodes([by_number[number] for number in numbers], lengths.tolist()), columns)

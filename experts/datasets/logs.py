@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ Source = str | Path | Sequence[str | Path]
 class Log(Trials):
     """Trials of a log: what columns are called, in which units, names of trials, and notes on what was read."""
 
-    units: Units = Units((), (), (), ())
+    units: Units = field(default_factory=lambda: Units((), (), (), ()))
     names: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -78,7 +79,7 @@ def read_together(
             raise InputError(f"{what} was {given!r}; it must be a list of columns, [{given!r}]")
     roles = Roles(trial, episode, tuple(obs), tuple(action))
     files = [_files(source) for source in sources]
-    if all(file.suffix.lower() == ".npz" for file in sum(files, [])) and max(map(len, files)) == 1:
+    if all(file.suffix.lower() == ".npz" for group in files for file in group) and max(map(len, files)) == 1:
         if roles != Roles(None, None, (), ()):
             raise InputError(
                 f"{files[0][0]} has no columns to choose; --trial, --episode, --obs, --action are of tables"
@@ -110,7 +111,7 @@ def _table(path: Path) -> Table:
 def trials_of(sources: list[list[Table]], roles: Roles) -> list[Log]:
     """Trials of each source, whose tables are parts of one log. Raises InputError if columns differ."""
     read = [[episodes_of(table, roles) for table in tables] for tables in sources]
-    tables, parts = sum(sources, []), sum(read, [])
+    tables, parts = [*chain(*sources)], [*chain(*read)]
     for table, part in zip(tables, parts, strict=True):
         if (part.obs, part.action) != (parts[0].obs, parts[0].action):
             differ = sorted({*part.obs, *part.action} ^ {*parts[0].obs, *parts[0].action}) or ["their order"]

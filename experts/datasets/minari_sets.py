@@ -15,7 +15,7 @@ from gymnasium import spaces
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.spaces import action_sizes
-from deconfounded.experts.datasets.table import EXTRA, Column, Table, of_episodes
+from deconfounded.experts.datasets.table import EXTRA, Column, Table, of_episodes, spread
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before
@@ -199,18 +199,17 @@ def _order(source: Path | str, named: list[tuple[Any, Any]]) -> list[int]:
     return sorted(range(len(places)), key=places.__getitem__)
 
 
-def _observed(of: str, values: Any, space: spaces.Space[Any], n: int) -> dict[str, Column]:
-    """Columns of n observations."""
-    if isinstance(space, spaces.Dict):
-        columns: dict[str, Column] = {}
-        for key, part in space.items():
-            if isinstance(part, spaces.Dict | spaces.Discrete) or len(part.shape or ()) < 2:
-                columns |= {f"{key}.{name}": x for name, x in _observed(of, values[key], part, n).items()}
-        if not columns:
-            raise InputError(f"observations {of} are of {space}; a part of it must be Box of one axis or none")
-        return columns
-    rows = _rows(f"observations {of}", values, space, n, True)
-    return {f"observation.{i}": rows[:, i] for i in range(rows.shape[1])}
+def _observed(of: str, values: Any, space: spaces.Space[Any], n: int, name: str = "observation") -> dict[str, Column]:
+    """Columns of n observations; of a dictionary, parts that are rows of numbers."""
+    if not isinstance(space, spaces.Dict):
+        return spread(name, _rows(f"observations {of}", values, space, n, True))
+    columns: dict[str, Column] = {}
+    for key, part in space.items():
+        if len(part.shape or ()) < 2:
+            columns |= _observed(of, values[key], part, n, f"{name}.{key}")
+    if not columns:
+        raise InputError(f"observations {of} are of {space}; one must be of Box of one axis or none")
+    return columns
 
 
 def _rows(what: str, values: Any, space: spaces.Space[Any], n: int, observed: bool) -> Array:

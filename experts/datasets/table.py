@@ -23,9 +23,9 @@ Column = NDArray[Any]
 class Table:
     """Rows of logs in the order of time. A row holds an observation, and the action that was chosen on it.
 
-    where: the file or folder. columns: each [N], by name. boundaries [N]: the episode's number of each row, or None where
-    columns are to say it. obs, action, trial: names of columns that the format itself says are these. limits: the range
-    of an action by its name, where the format declares it. discrete: the declared number of actions. horizon: declared T.
+    where: the file or folder. columns: each [N], by name. boundaries [N]: the number of each row's episode, or None
+    where columns are to say it. obs, action, trial: names of columns that the format itself says are these. limits: the
+    range of an action by its name, where the format declares it. discrete, horizon: the declared number of actions, T.
     """
 
     where: str
