@@ -1,5 +1,6 @@
 """Fits for the first look at logs: of actions by observations, and of the dynamics, in all trials and in each."""
 
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -13,9 +14,10 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 FEW = 6  # columns, up to which their products are features too
 ENOUGH = 8  # steps of a trial for each feature of a fit of its own
-SHRINKAGE = (0.1, 1.0, 10.0)  # of a trial's own fit, in steps of each half
-CERTAIN = 4.0  # standard errors
-LEAST = 0.01  # share of variance that counts
+CHANCE = 0.001  # probability that trials that are alike are said to differ
+HIDDEN = 128  # random features
+CLIP = 4.0  # usual deviations
+ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,11 @@ def residual(y: Array, x: Array, trial: Numbers) -> tuple[Array, bool]:
     own = float(np.median(np.bincount(trial, minlength=count))) >= ENOUGH * (x.shape[1] + 1)
     centred = [np.stack([c - by_trial(c, trial, count)[trial] for c in part.T], 1) for part in (y, x)]
     if not own:
-        return centred[0] - centred[1] @ np.linalg.lstsq(centred[1], centred[0], rcond=None)[0], False
+        return centred[0] - centred[1] @ _solved(centred[1], centred[0]), False
     left = centred[0].copy()
-    order = np.argsort(trial, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(trial[order])) + 1):
+    for rows in _by_trial(trial):
         if len(rows) > x.shape[1] + 1:
-            fit = np.linalg.lstsq(centred[1][rows], centred[0][rows], rcond=None)[0]
-            left[rows] -= centred[1][rows] @ fit
+            left[rows] -= centred[1][rows] @ _solved(centred[1][rows], centred[0][rows])
             left[rows] *= np.sqrt(len(rows) / (len(rows) - x.shape[1] - 1))
     return left, True
 
@@ -113,14 +113,17 @@ class Window:
         return unexplained(self.action, np.concatenate([features(self.obs[lag]) for lag in lags], 1), self.trial)
 
 
-def lasting(trials: Trials, steps: Steps) -> tuple[float, float] | None:
+def lasting(trials: Trials, steps: Steps) -> tuple[float, float, float] | None:
     """What a trial's own fit by observations leaves of its actions: correlation from step to step, share of variance.
 
-    None where trials are too short for fits of their own, by which a latent is taken out.
+    The third is the correlation with what is left at the most alike observation of another time: of a poor fit it is
+    high, of noise low. None where trials are too short for fits of their own, which take a latent out.
     """
     action = _one_hot(steps.action, trials.actions)
-    for x in (features(steps.obs), _standard(steps.obs)):
-        left, own = residual(action, x, steps.trial)
+    inputs = _standard(steps.obs)
+    rest = action - smooth(inputs.clip(-CLIP, CLIP), action)
+    for x in (features(steps.obs), inputs):
+        left, own = residual(rest, x, steps.trial)
         if own:
             break
     else:
@@ -128,62 +131,71 @@ def lasting(trials: Trials, steps: Steps) -> tuple[float, float] | None:
     grid = np.zeros((*trials.mask.shape, left.shape[1]))
     grid[trials.mask] = left
     both = trials.mask[:, :, 1:] & trials.mask[:, :, :-1]
-    first, second = grid[:, :, :-1][both], grid[:, :, 1:][both]
-    power = float((first**2).sum() * (second**2).sum()) ** 0.5
-    return float((first * second).sum()) / max(power, 1e-12), float(
-        (left**2).sum() / max(action.var(0).sum(), 1e-12) / len(left)
-    )
+    pairs: tuple[list[Array], list[Array]] = [], []
+    for rows in _by_trial(steps.trial)[:ALIKE]:
+        distance = np.square(inputs[rows][:, None] - inputs[rows]).sum(-1)
+        near = np.abs(np.subtract.outer(np.arange(len(rows)), np.arange(len(rows)))) < APART
+        nearest = np.where(near, np.inf, distance).argmin(1)
+        pairs[0].append(left[rows])
+        pairs[1].append(left[rows[nearest]])
+    share = float((left**2).sum() / max(action.var(0).sum(), 1e-12) / len(left))
+    alike = _correlation(np.concatenate(pairs[0]), np.concatenate(pairs[1]))
+    return _correlation(grid[:, :, :-1][both], grid[:, :, 1:][both]), share, alike
 
 
-def own_dynamics(trials: Trials, steps: Steps) -> tuple[float | None, int] | None:
-    """The share of the motion that one half of a trial explains in the other, and the column where it is largest.
+def _correlation(x: Array, y: Array) -> float:
+    return float((x * y).sum()) / max(float((x**2).sum() * (y**2).sum()) ** 0.5, 1e-12)
 
-    Of what a fit of all trials leaves, and less what half of another trial explains. The share is None where it is not
-    beyond chance; the whole is None for too little data. Columns that observation and action decide are left out.
+
+def own_dynamics(trials: Trials, steps: Steps) -> tuple[float, int] | None:
+    """How alike two halves of a trial are in what a fit of all trials leaves of the motion, and the column of it.
+
+    Half the episodes each, or of one episode half the steps. What is left, and its products with observations and
+    actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest, or 0
+    if that is chance. None for too little data. Columns that observation and action decide are left out.
     """
     count = len(trials)
-    lengths = np.bincount(steps.trial, minlength=count)
-    if count < 8 or np.median(lengths) < 8:
+    if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
         return None
     action = _one_hot(steps.action, trials.actions)
-    change = steps.then - steps.obs
-    x = features(np.concatenate([steps.obs, action], 1))
-    x = x if x.shape[1] > steps.obs.shape[1] + action.shape[1] else _with_products(steps.obs, action)
-    x = np.concatenate([np.ones((len(x), 1)), x], 1)
-    left = change - x @ np.linalg.lstsq(x, change, rcond=None)[0]
-    scale = left.std(0)
-    kept = np.flatnonzero((change.std(0) > 1e-9) & (scale > 1e-4 * change.std(0)))
-    if not len(kept):
+    change, inputs = steps.then - steps.obs, _standard(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
+    left = change - smooth(inputs, change)
+    unit = 1.48 * np.median(np.abs(left), 0)
+    kept = np.flatnonzero(unit > 1e-4 * np.maximum(change.std(0), 1e-9))
+    _, episode, step = np.nonzero(trials.mask)
+    second = episode % 2 if trials.mask.shape[1] > 1 else step >= trials.mask.sum((1, 2))[steps.trial] / 2
+    group = 2 * steps.trial + second
+    both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
+    if not len(kept) or both.sum() < 16:
         return None
-    left = left[:, kept] / scale[kept]
-    inputs = np.concatenate([np.ones((len(x), 1)), _standard(np.concatenate([steps.obs, action], 1))], 1)
-    order = np.argsort(steps.trial, kind="stable")
-    trialwise = [rows for rows in np.split(order, np.flatnonzero(np.diff(steps.trial[order])) + 1) if len(rows) >= 4]
-    best: tuple[float | None, int] = None, 0
-    for shrinkage in SHRINKAGE:
-        pairs = [(rows[: len(rows) // 2], rows[len(rows) // 2 :]) for rows in trialwise]
-        fits = [[_ridge(inputs[part], left[part], shrinkage) for part in pair] for pair in pairs]
-        gains = np.zeros((len(pairs), len(kept)))
-        for i, pair in enumerate(pairs):
-            for half in (0, 1):
-                part = pair[1 - half]
-                own, other = (left[part] - inputs[part] @ fits[j][half] for j in (i, (i + 1) % len(pairs)))
-                gains[i] += ((left[part] ** 2 - own**2).sum(0) - (left[part] ** 2 - other**2).sum(0).clip(min=0)) / len(
-                    trialwise[i]
-                )
-        mean, error = gains.mean(0), gains.std(0) / len(gains) ** 0.5
-        for j in np.flatnonzero((mean > LEAST) & (mean > CERTAIN * error)):
-            if best[0] is None or mean[j] > best[0]:
-                best = float(mean[j]), int(kept[j])
+    best, tests = (0.0, 0), len(kept) * (1 + inputs.shape[1])
+    for k in kept:
+        rest = (left[:, k] / unit[k]).clip(-CLIP, CLIP)
+        for x in (np.ones(len(rest)), *inputs.T):
+            power = np.maximum(by_trial(x**2, group, 2 * count), 1e-9)
+            halves = (by_trial(x * rest, group, 2 * count) / power).reshape(count, 2)[both]
+            alike = float(np.corrcoef(*halves.argsort(0).argsort(0).T).min())
+            certain = statistics.NormalDist().inv_cdf(1 - CHANCE / tests)
+            if alike > max(best[0], certain / len(halves) ** 0.5):
+                best = alike, int(k)
     return best
 
 
-def _with_products(obs: Array, action: Array) -> Array:
-    """Observations, actions, squares, and products of each observation with each action."""
-    obs, action = _standard(obs), _standard(action)
-    products = (obs[:, :, None] * action[:, None, :]).reshape(len(obs), -1) if action.shape[1] <= FEW else obs[:, :0]
-    return np.concatenate([obs, action, obs**2, products], 1)
+def smooth(x: Array, y: Array) -> Array:
+    """A smooth function of standardised x [N, F], fitted to y [N, K] in all trials: ridge on random features."""
+    rng = np.random.default_rng(0)
+    weight = rng.standard_normal((x.shape[1], HIDDEN)) * rng.choice([0.3, 1.0], HIDDEN) / x.shape[1] ** 0.25
+    hidden = np.tanh(x @ weight + rng.uniform(-2, 2, HIDDEN))
+    basis = np.concatenate([np.ones((len(x), 1)), x, x**2, hidden], 1)
+    return basis @ _solved(basis, y, 1e-4)
 
 
-def _ridge(x: Array, y: Array, shrinkage: float) -> Array:
-    return np.linalg.solve(x.T @ x + shrinkage * len(x) * np.eye(x.shape[1]), x.T @ y)
+def _solved(x: Array, y: Array, ridge: float = 1e-9) -> Array:
+    """Coefficients [F, K] of a linear fit of y [N, K] by x [N, F]."""
+    return np.asarray(np.linalg.solve(x.T @ x + ridge * len(x) * np.eye(x.shape[1]), x.T @ y), float)
+
+
+def _by_trial(trial: Numbers) -> list[Numbers]:
+    """Rows of each trial, in their order."""
+    order = np.argsort(trial, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(trial[order])) + 1)

@@ -14,12 +14,15 @@ from deconfounded.experts.rollout import Trials
 
 Array = NDArray[np.float64]
 LISTED = 8  # columns, trials, that are named
-OUTLYING = 8.0  # times the usual spread of trials
+OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials
+MOST = 50_000  # steps that are fitted
+FEW = 8  # values of a column that does not move, but jumps
 STILL, PAUSE = 0.02, 5  # of the motion's 90th percentile; steps
 LATEST = 3  # steps by which an action may be logged late
 BETTER = 0.7  # of the variance that is left
-REPEATED, LASTING = 0.9, 0.5  # shares of variance; correlation from step to step
-HEAVY, MENDED = 10.0, 4.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
+REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
+ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
+HEAVY, MENDED = 30.0, 4.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
 
 
 class Remark(NamedTuple):
@@ -33,13 +36,23 @@ class Remark(NamedTuple):
         return f"{'!' if self.odd else '-'} {self.text}"
 
 
-def look(trials: Trials) -> list[Remark]:
-    """Remarks on trials, those of a log by the names of its columns; what is odd comes last."""
-    log = trials if isinstance(trials, Log) else Log.of(trials, "Trials")
-    steps = Steps.of(log)
+def look(given: Trials, blind: bool = False) -> list[Remark]:
+    """Remarks on trials, those of a log by the names of its columns; what is odd comes last.
+
+    blind: they are of exploration, of which it does not matter how its actions are chosen.
+    """
+    log = given if isinstance(given, Log) else Log.of(given, "Trials")
+    steps, part = Steps.of(log), given
+    if (total := len(steps.trial)) > MOST:  # evenly spaced trials, for what is fitted
+        index = np.linspace(0, len(log) - 1, max(8, int(len(log) * MOST / total))).astype(int)
+        part = Trials(log.obs[index], log.action[index], log.mask[index], log.actions)
+    fitted = Steps.of(part)
     remarks = [Remark("size", note) for note in log.notes]
-    for part in (_ranges, _outliers, _duplicates, _pauses, _lag, _states, _repeats, _lasting, _tails, _dynamics):
-        remarks += part(log, steps)
+    for describe in (_ranges, _outliers, _duplicates, _pauses, _states, _tails, *[_repeats] * (not blind)):
+        remarks += describe(log, steps)
+    if not blind:
+        remarks += [*_lag(part), *_lasting(part, fitted)]
+    remarks += _dynamics(part, fitted, log.units.obs, blind)
     return sorted(remarks, key=lambda remark: remark.odd)
 
 
@@ -87,8 +100,11 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     table = np.stack(features, 1)
     centre = np.median(table, 0)
     unit = 1.48 * np.median(np.abs(table - centre), 0)
-    unit = np.maximum(unit, 0.01 * np.ptp(np.where(np.abs(table - centre) < 20 * unit + 1e-12, table, centre), 0))
+    low, high = np.quantile(table, [0.05, 0.95], 0)
+    unit = np.maximum(unit, 0.1 * (high - low))
+    unit[0] = max(unit[0], 0.1 * centre[0])
     far = np.abs(table - centre) / np.maximum(unit, 1e-3 * np.abs(centre) + 1e-9)
+    far *= (far > OUTLYING).sum(0) <= max(2, SEVERAL * count)  # more of them are of another kind
     worst = far.max(1)
     for i in [i for i in np.argsort(-worst) if worst[i] > OUTLYING][:LISTED]:
         j = int(far[i].argmax())
@@ -131,7 +147,10 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     """Stretches in which nothing moves, at the start of episodes and later."""
-    change = np.abs(np.diff(log.obs.astype(float), axis=2))
+    moving = [i for i, x in enumerate(steps.obs.T) if len(np.unique(x[: 1 << 16])) > FEW]
+    if not moving:
+        return
+    change = np.abs(np.diff(log.obs[..., moving].astype(float), axis=2))
     spread = np.sqrt((change[log.mask] ** 2).mean(0))
     motion = (change / np.where(spread > 0, spread, np.inf)).max(-1)
     usual = np.quantile(motion[log.mask], 0.9)
@@ -159,9 +178,9 @@ def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
         yield Remark("pause", text, at_start + later > 0.02 * count)
 
 
-def _lag(log: Log, steps: Steps) -> Iterator[Remark]:
+def _lag(trials: Trials) -> Iterator[Remark]:
     """The lag at which actions match observations, and the motion that follows, best."""
-    window = fits.Window.of(log, LATEST + 2)
+    window = fits.Window.of(trials, LATEST + 2)
     if len(window) < 200 or not window.action.std():
         return
     left = [window.unexplained([lag]) for lag in range(-1, LATEST + 1)]
@@ -222,7 +241,7 @@ def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
         mean = 1 - float(((now - own) ** 2).mean(0).sum()) / total
         linear = 1 - (1 - mean) * fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial)
         text = (
-            f"Always the mean action errs by {np.sqrt(total):.2g} (rms, ranges being -1 to 1). Of that variance, repeating"
+            f"Always the mean action errs by {np.sqrt(total):.2g} (rms, of ranges -1 to 1). Of that variance, repeating"
             f" the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear function of"
             f" the observation in each trial {linear:.0%}."
         )
@@ -231,13 +250,13 @@ def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
     yield Remark("repeat", text, high)
 
 
-def _lasting(log: Log, steps: Steps) -> Iterator[Remark]:
+def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
     """Whether what observations leave open of the action lasts from step to step, within a trial."""
-    measured = fits.lasting(log, steps)
+    measured = fits.lasting(trials, steps)
     if measured is None:
         return
-    correlation, share = measured
-    if correlation > LASTING and share > 0.02:
+    correlation, share, alike = measured
+    if correlation > LASTING and share > 0.02 and alike < ALIKE * correlation:
         half = np.log(0.5) / np.log(min(correlation, 0.999))
         text = (
             f"What the observation leaves open of the action in a trial ({share:.0%} of the variance) lasts: its"
@@ -265,30 +284,30 @@ def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
         left = {how: fits.kurtosis(mended) for how, mended in ways.items()}
         how = next((how for how, tails in left.items() if tails < MENDED), min(left, key=left.__getitem__))
         text = (
-            f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all of it within {x.min():.4g} and"
+            f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all within {x.min():.4g} and"
             f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left[how]:.1f})."
         )
         yield Remark("tails", text, True)
 
 
-def _dynamics(log: Log, steps: Steps) -> Iterator[Remark]:
+def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
     """Whether trials differ in their dynamics."""
-    measured = fits.own_dynamics(log, steps)
+    measured = fits.own_dynamics(trials, steps)
     if measured is None:
-        yield Remark(
-            "dynamics", "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
-        )
-        return
-    gain, column = measured
-    if gain is None:
+        text = "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
+    elif measured[0]:
         text = (
-            "Trials do not differ in their dynamics, as far as a quadratic fit can see: an imitator could infer nothing"
-            " from what its actions do."
+            f"Trials differ in their dynamics: what one half of a trial does to {names[measured[1]]}, beyond a"
+            f" fit of all trials, the other does too (rank correlation {measured[0]:.2f})."
         )
-        yield Remark("dynamics", text, True)
-        return
-    text = (
-        f"Trials differ in their dynamics: of what a fit of all trials leaves of changes of {log.units.obs[column]}, one"
-        f" half of a trial explains {gain:.0%} in the other."
-    )
-    yield Remark("dynamics", text)
+    elif blind:
+        text = (
+            "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
+            " what its actions do."
+        )
+    else:
+        text = (
+            "No difference in dynamics is seen between trials. An expert's actions, which make up for it, can hide it;"
+            " exploration would show it."
+        )
+    yield Remark("dynamics", text, blind and measured is not None and not measured[0])

@@ -33,7 +33,7 @@ def read_hdf5(file: Path) -> Table:
 
 def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
     """Arrays of a group and of groups in it, by their path."""
-    arrays = {}
+    arrays: dict[str, Any] = {}
     for name, item in group.items():
         arrays |= _arrays(item, f"{prefix}{name}/") if isinstance(item, Mapping) else {f"{prefix}{name}": item}
     return arrays
@@ -72,7 +72,7 @@ def _robomimic(file: Path, data: Any) -> Table:
         if later:
             columns = {key: np.append(x, later[key][-1] if key in later else np.nan) for key, x in columns.items()}
         demos.append(columns)
-        attributes.append({"demo": name, **{key: value for key, value in demo.attrs.items()}})
+        attributes.append({"demo": name, **data[name].attrs})
     if strange := next((i for i, demo in enumerate(demos) if set(demo) != set(demos[0])), None):
         differ = min(set(demos[strange]) ^ set(demos[0]))
         raise InputError(f"{names[strange]} and {names[0]} of {file} hold different arrays; {differ} is in one alone")

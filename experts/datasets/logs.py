@@ -92,13 +92,14 @@ def _files(source: Source) -> list[Path]:
     given = [source] if isinstance(source, str | Path) else list(source)
     if not given or not all(isinstance(file, str | Path) for file in given):
         raise InputError(f"a log was {source!r}; it must be {KINDS}")
+    for file in map(Path, given):
+        if not file.exists():
+            raise InputError(f"there is no {file}; give {KINDS}")
     return [Path(file) for file in given]
 
 
 def _table(path: Path) -> Table:
     """What a file or folder holds, by its kind."""
-    if not path.exists():
-        raise InputError(f"there is no {path}; give {KINDS}")
     if path.is_dir():
         return read_lerobot(path) if (path / "meta" / "info.json").is_file() else read_minari(path)
     if path.suffix.lower() == ".npz":
@@ -182,7 +183,7 @@ def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, ho
             action[i, j, :n] = units.scaled(episode.action)
             mask[i, j, :n] = True
     try:
-        trials = Trials(obs, action, mask, len(units.values))
+        trials = Trials(obs, action, mask, len(units.values))  # type: ignore[arg-type]
     except InputError as error:
         listed = "; ".join(
             f"observation {i} is {name}" for i, name in enumerate(units.obs) if f"observation {i} " in str(error)

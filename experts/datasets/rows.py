@@ -112,7 +112,8 @@ def _starts(table: Table, names: list[str | None], columns: list[Column], roles:
     for name, column in zip(used, columns, strict=True):
         _check(table, [name], (column == "" if column.dtype == object else np.isnan(column))[:, None], 0, "is empty")
     own = table.boundaries is not None and roles.episode is None
-    keys = [np.unique(column, return_inverse=True)[1] for column in ([table.boundaries] if own else columns)]
+    grouping = [table.boundaries] if own else columns
+    keys = [np.unique(column, return_inverse=True)[1] for column in grouping if column is not None]
     changes = np.any([np.diff(key) != 0 for key in keys], 0)
     first = [0, *(1 + np.flatnonzero(changes)).tolist()]
     if own:

@@ -31,8 +31,8 @@ class Units:
     @staticmethod
     def plain(obs: int, action: int, n_actions: int) -> "Units":
         """Those of Trials that are no log."""
-        names = (tuple(f"{what} {i}" for i in range(n)) for what, n in (("observation", obs), ("action", action)))
-        return Units(*names, (-1.0,) * action, (1.0,) * action, tuple(range(n_actions)))
+        names = [tuple(f"{what} {i}" for i in range(n)) for what, n in (("observation", obs), ("action", action))]
+        return Units(names[0], names[1], (-1.0,) * action, (1.0,) * action, tuple(range(n_actions)))
 
     @property
     def raw(self) -> bool:

@@ -143,7 +143,7 @@ class TestDataSets:
         values = np.zeros((4, 2), "f4"), np.zeros((3, 1), "f4")
         made = data_set(tmp_path, BOX, ACTIONS, lambda _: values, about)
         with pytest.raises(envs.InputError, match=says):
-            datasets.read_theta(made)
+            (Trials.from_minari if "theta" not in about[0] else datasets.read_theta)(made)
 
     def test_no_folder(self) -> None:
         with pytest.raises(envs.InputError, match="a data set was None; it must be the path"):
