@@ -50,6 +50,11 @@ def _rows(where: str, arrays: dict[str, Any], n: int) -> dict[str, Column]:
     return columns
 
 
+def _ending(name: str, x: Column, later: dict[str, Column]) -> Column:
+    """What a column would hold in a row of the next observation: no action, and what is neither stays."""
+    return np.full_like(x, np.nan) if name.split(".")[0] == "actions" else later.get(name, x)
+
+
 def _robomimic(file: Path, data: Any) -> Table:
     """`data/demo_i` with `actions`, `obs/...` and perhaps `next_obs/...`; attributes of a demonstration are columns.
 
@@ -70,7 +75,7 @@ def _robomimic(file: Path, data: Any) -> Table:
         columns = _rows(where, arrays, n)
         later = {key[5:]: columns.pop(key) for key in list(columns) if key.startswith("next_obs/")}
         if later:
-            columns = {key: np.append(x, later[key][-1] if key in later else np.nan) for key, x in columns.items()}
+            columns = {key: np.append(x, _ending(key, x, later)[-1]) for key, x in columns.items()}
         demos.append(columns)
         attributes.append({"demo": name, **data[name].attrs})
     if strange := next((i for i, demo in enumerate(demos) if set(demo) != set(demos[0])), None):
@@ -102,7 +107,7 @@ def _d4rl(file: Path, opened: Any) -> Table:
     if later:
         last = np.flatnonzero(np.append(np.diff(episode) != 0, True))
         at = last + 1  # after each episode's last row, a row of its last observation
-        columns = {key: np.insert(x, at, later[key][last] if key in later else np.nan) for key, x in columns.items()}
+        columns = {key: np.insert(x, at, _ending(key, x, later)[last]) for key, x in columns.items()}
         episode = np.insert(episode, at, episode[last])
     obs = tuple(key for key in columns if key.split(".")[0] == "observations")
     if not obs:
