@@ -18,8 +18,8 @@ OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of tria
 MOST = 50_000  # steps that are fitted
 FEW = 8  # values of a column that does not move, but jumps
 STILL, PAUSE = 0.02, 5  # of the motion's 90th percentile; steps
-LATEST = 3  # steps by which an action may be logged late
-BETTER = 0.7  # of the variance that is left
+LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing follows
+BETTER = 0.95  # of the variance that another row leaves
 REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
 ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
 HEAVY, MENDED = 30.0, 4.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
@@ -85,25 +85,25 @@ def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
 
 
 def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
-    """Trials whose means, spreads or lengths are far from those of the others."""
+    """Trials whose medians, spreads or lengths are far from those of the others."""
     count = len(log)
     if count < 8:
         return
     per_episode = log.mask.sum(2).sum(1) / np.maximum(log.mask.any(2).sum(1), 1)
     names, features = ["length of episodes"], [per_episode.astype(float)]
-    columns = zip((*log.units.obs, *log.units.action), np.concatenate([steps.obs, steps.action], 1).T, strict=True)
+    least = [0.1 * float(per_episode.mean())]
+    rows = [np.flatnonzero(steps.trial == i) for i in range(count)]
+    columns = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
     for name, column in columns:
-        mean = fits.by_trial(column, steps.trial, count)
-        square = fits.by_trial((column - mean[steps.trial]) ** 2, steps.trial, count)
-        names += [f"mean of {name}", f"spread of {name}"]
-        features += [mean, np.sqrt(square)]
+        quartiles = np.array([np.quantile(column[index], [0.25, 0.5, 0.75]) for index in rows])
+        names += [f"median of {name}", f"interquartile range of {name}"]
+        features += [quartiles[:, 1], quartiles[:, 2] - quartiles[:, 0]]
+        least += [0.05 * float(column.std())] * 2
     table = np.stack(features, 1)
     centre = np.median(table, 0)
     unit = 1.48 * np.median(np.abs(table - centre), 0)
     low, high = np.quantile(table, [0.05, 0.95], 0)
-    unit = np.maximum(unit, 0.1 * (high - low))
-    unit[0] = max(unit[0], 0.1 * centre[0])
-    far = np.abs(table - centre) / np.maximum(unit, 1e-3 * np.abs(centre) + 1e-9)
+    far = np.abs(table - centre) / np.maximum(np.maximum(unit, 0.1 * (high - low)), np.maximum(least, 1e-9))
     far *= (far > OUTLYING).sum(0) <= max(2, SEVERAL * count)  # more of them are of another kind
     worst = far.max(1)
     for i in [i for i in np.argsort(-worst) if worst[i] > OUTLYING][:LISTED]:
@@ -185,20 +185,22 @@ def _lag(trials: Trials) -> Iterator[Remark]:
         return
     left = [window.unexplained([lag]) for lag in range(-1, LATEST + 1)]
     lag = int(np.argmin(left)) - 1
-    if lag <= 0 or left[lag + 1] > BETTER * left[1]:
-        if lag >= 0 and left[1] < BETTER:
+    if not 0 < lag < LATEST or left[lag + 1] > BETTER * left[1]:
+        if lag <= 0 and left[1] < BETTER:
             yield Remark("lag", "Actions match the observation of their own row best: they are not logged late.")
         return
     motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
-    rows, plural = f"{lag} row{'s' * (lag > 1)}", "s" * (lag > 1)
+    rows = f"{lag} row{'s' * (lag > 1)}"
     text = (
         f"Actions match the observation {rows} before theirs best ({1 - left[lag + 1]:.0%} of their variance, and"
         f" {1 - left[1]:.0%} by that of their own row)"
     )
     if motion[1] > motion[0] + 0.02:
-        text += f", and the motion that follows it: they are logged {lag} step{plural} late. Move actions up by {rows}."
+        text += f", and the motion that follows it: they are probably logged late. Move actions up by {rows}."
+    elif motion[0] > motion[1] + 0.02:
+        text += ", and move what follows their own: a reaction time. An expert that answers late is one with a memory."
     else:
-        text += ": a reaction time, or logged late. An expert that answers late is one with a memory."
+        text += ": a reaction time, or logged late."
     yield Remark("late", text, True)
 
 
