@@ -1,5 +1,6 @@
-"""Fits for the first look at logs: of actions by observations, and of the dynamics, in all trials and in each."""
+"""Measures of the first look at logs: fits of actions and of the dynamics, in all trials and in each; tails; copies."""
 
+import hashlib
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ Numbers = NDArray[np.int64]
 FEW = 6  # columns, up to which their products are features too
 ENOUGH = 8  # steps of a trial for each feature of a fit of its own
 CHANCE = 0.001  # probability that trials that are alike are said to differ
+MENDED = 4.0  # excess kurtosis
 HIDDEN = 128  # random features
 CLIP = 4.0  # usual deviations
 ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
@@ -47,6 +49,38 @@ def kurtosis(x: Array) -> float:
     centred = x - x.mean()
     variance = float((centred**2).mean())
     return float((centred**4).mean()) / variance**2 - 3 if variance > 1e-12 * (1 + x.mean() ** 2) else 0.0
+
+
+def mended(name: str, x: Array) -> tuple[str, float]:
+    """The first of some ways to write a column that has no heavy tails, or else the best, and its excess kurtosis."""
+    centre = float(np.median(x))
+    distance = np.abs(x - centre)
+    scale = 1.48 * float(np.median(distance)) or float(np.quantile(distance, 0.9)) or 1.0
+    low, high = np.quantile(x, [0.005, 0.995])
+    ways = {f"arcsinh(({name} - {centre:.3g}) / {scale:.3g})": np.arcsinh((x - centre) / scale)}
+    if x.min() > 0:
+        ways[f"log({name})"] = np.log(x)
+    ways[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
+    tails = {how: kurtosis(written) for how, written in ways.items()}
+    how = next((how for how, left in tails.items() if left < MENDED), min(tails, key=tails.__getitem__))
+    return how, tails[how]
+
+
+def copies(trials: Trials) -> tuple[list[list[int]], ...]:
+    """Groups of trials that are the same; whose actions are; and the trials of episodes that are the same.
+
+    Actions count where they are continuous, of ten steps or more, and not constant.
+    """
+    groups: tuple[dict[bytes, list[int]], ...] = {}, {}, {}
+    for b, mask in enumerate(trials.mask):
+        whole, acted = trials.obs[b].tobytes(), trials.action[b].tobytes()
+        groups[0].setdefault(hashlib.sha256(whole + acted).digest(), []).append(b)
+        if not trials.actions and mask.sum() >= 10 and np.ptp(trials.action[b][mask], 0).any():
+            groups[1].setdefault(hashlib.sha256(acted).digest(), []).append(b)
+        for e in np.flatnonzero(mask.any(1)):
+            bits = trials.obs[b, e].tobytes() + trials.action[b, e].tobytes()
+            groups[2].setdefault(hashlib.sha256(bits).digest(), []).append(b)
+    return tuple([numbers for numbers in found.values() if len(numbers) > 1] for found in groups)
 
 
 def _standard(x: Array) -> Array:

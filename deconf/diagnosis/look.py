@@ -1,6 +1,5 @@
 """A first look at logs, before any diagnosis: what is in them, and what would mislead it, in plain words."""
 
-import hashlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing fo
 BETTER = 0.95  # of the variance that another row leaves
 REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
 ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
-HEAVY, MENDED = 30.0, 4.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
+HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
 
 
 class Remark(NamedTuple):
@@ -59,11 +58,6 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
 def _list(names: list[str]) -> str:
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return ", ".join(names[:LISTED]) + more
-
-
-def _trials(log: Log, numbers: list[int]) -> str:
-    """Trials by name."""
-    return f"trial{'s' * (len(numbers) > 1)} {_list([log.names[i] for i in numbers])}"
 
 
 def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -117,32 +111,17 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
     """Trials and episodes that repeat others."""
-    varied = not log.actions and log.mask.sum((1, 2)).min() >= 10
-    kinds: dict[str, dict[bytes, list[int]]] = {"": {}, " in its actions": {}}
-    episodes = dict[bytes, list[int]]()
-    for b in range(len(log)):
-        own = {"": [log.obs[b], log.action[b]], " in its actions": [log.action[b]]}
-        for kind, arrays in own.items():
-            if not kind or (varied and np.ptp(log.action[b][log.mask[b]], 0).max() > 0):
-                digest = hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).digest()
-                kinds[kind].setdefault(digest, []).append(b)
-        for e in np.flatnonzero(log.mask[b].any(1)):
-            bits = log.obs[b, e].tobytes() + log.action[b, e].tobytes()
-            episodes.setdefault(hashlib.sha256(bits).digest(), []).append(b)
-    seen = set[tuple[int, ...]]()
-    for kind, digests in kinds.items():
-        groups = [tuple(group) for group in digests.values() if len(group) > 1 and tuple(group) not in seen]
-        seen |= set(groups)
+    whole, acted, episodes = fits.copies(log)
+    for kind, groups in (("", whole), (" in its actions", [group for group in acted if group not in whole])):
         if groups:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
             text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {_list(named)}."
-            yield Remark("duplicate", text + " Where one is held out, its copy betrays it; keep one of each.", True)
-    repeated = [group for group in episodes.values() if len(group) > 1 and tuple(group) not in seen]
-    if repeated:
-        again, trials = sum(len(group) - 1 for group in repeated), sorted({i for group in repeated for i in group})
-        text = f"{again} episodes repeat others, in {_trials(log, trials)}."
-        yield Remark("duplicate", text, True)
+            yield Remark("duplicate", f"{text} Where one is held out, its copy betrays it; keep one of each.", True)
+    if repeated := [group for group in episodes if group not in whole]:
+        names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
+        again = sum(len(group) - 1 for group in repeated)
+        yield Remark("duplicate", f"{again} episodes repeat others, in trials {_list(names)}.", True)
 
 
 def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -187,7 +166,10 @@ def _lag(trials: Trials) -> Iterator[Remark]:
     lag = int(np.argmin(left)) - 1
     if not 0 < lag < LATEST or left[lag + 1] > BETTER * left[1]:
         if lag <= 0 and left[1] < BETTER:
-            yield Remark("lag", "Actions match the observation of their own row best: they are not logged late.")
+            yield Remark(
+                "lag",
+                "No earlier observation matches actions better than that of their own row: they are not logged late.",
+            )
         return
     motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
     rows = f"{lag} row{'s' * (lag > 1)}"
@@ -276,18 +258,11 @@ def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
     for name, x in columns:
         if (heavy := fits.kurtosis(x)) < HEAVY:
             continue
-        centre = float(np.median(x))
-        scale = 1.48 * float(np.median(np.abs(x - centre))) or float(np.quantile(np.abs(x - centre), 0.9)) or 1.0
+        how, left = fits.mended(name, x)
         low, high = np.quantile(x, [0.005, 0.995])
-        ways = {f"arcsinh(({name} - {centre:.3g}) / {scale:.3g})": np.arcsinh((x - centre) / scale)}
-        if x.min() > 0:
-            ways[f"log({name})"] = np.log(x)
-        ways[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
-        left = {how: fits.kurtosis(mended) for how, mended in ways.items()}
-        how = next((how for how, tails in left.items() if tails < MENDED), min(left, key=left.__getitem__))
         text = (
             f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all within {x.min():.4g} and"
-            f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left[how]:.1f})."
+            f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left:.1f})."
         )
         yield Remark("tails", text, True)
 

@@ -1,6 +1,5 @@
 """Logs as Trials: files and folders of several formats, read to the same arrays."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -137,8 +136,9 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
     elif taken.dtype == object:
         values = tuple(sorted({str(value) for value in taken.ravel()}))
         if len(values) > MOST_DISCRETE:
-            strange = next((value for value in values if not _is_number(value)), values[0])
-            raise InputError(f"{action[0]!r} holds {len(values)} texts, as {strange!r}; an action must be a number")
+            raise InputError(
+                f"{action[0]!r} holds {len(values)} texts, as {values[0]!r}; an action must be a number, or one of {MOST_DISCRETE} texts"
+            )
     elif whole and 2 <= len(held := np.unique(taken)) <= MOST_DISCRETE and held[-1] - held[0] == len(held) - 1:
         values = tuple(int(value) for value in held)
     if values:
@@ -155,13 +155,6 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
     return Units(
         obs, action, tuple(low.tolist()), tuple(high.tolist())
     ), f"Actions, each range taken as -1 to 1: {said}"
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return not math.isnan(float(text))
-    except ValueError:
-        return False
 
 
 def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, horizon: int, single: bool) -> Log:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import Column, Table
+from deconfounded.experts.datasets.table import EMPTY, Column, Table
 
 CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
 GAP = 1.5  # times the usual time between rows
@@ -60,13 +60,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
     trial, labels = (None if name is None else table.columns[name] for name in groups)
     first = _starts(table, groups, [column for column in (trial, labels) if column is not None], roles)
     obs = np.stack([_numbers(table, name) for name in obs_names], 1)
-    text = len(action_names) == 1 and table.columns[action_names[0]].dtype == object
-    action = (
-        table.columns[action_names[0]][:, None]
-        if text
-        else np.stack([_numbers(table, name) for name in action_names], 1)
-    )
-    empty = action == "" if text else np.isnan(action)
+    action, empty = _actions(table, action_names)
     bounds = list(zip(first, [*first[1:], len(table)], strict=True))
     late = sum(bool(empty[a].any() and not empty[b - 1].any()) for a, b in bounds if b - a > 1)
     if 2 * late > len(bounds):
@@ -95,6 +89,27 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
         hint = f" ({', '.join(shared[:5])} might say: --trial)" if shared else ""
         notes.append(f"No column says what a trial is: every episode counts as a trial of its own{hint}.")
     return Episodes(episodes, obs_names, action_names, notes)
+
+
+def _actions(table: Table, names: tuple[str, ...]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Actions [N, A], numbers or, of one column alone, texts; and which of them are empty."""
+    column = table.columns[names[0]]
+    if len(names) > 1 or column.dtype != object:
+        action = np.stack([_numbers(table, name) for name in names], 1)
+        return action, np.isnan(action)
+    cells = [str(cell).strip() for cell in column]
+    empty = np.array([cell.lower() in EMPTY for cell in cells])
+    if any(_is_number(cell) for cell, missing in zip(cells, empty, strict=True) if not missing):
+        _numbers(table, names[0])  # which names the text among them
+    return np.array(cells, object)[:, None], empty[:, None]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def _groups(table: Table, roles: Roles) -> list[tuple[str, str | None]]:
@@ -143,7 +158,7 @@ def _numbers(table: Table, name: str) -> NDArray[np.float64]:
     numbers = np.full(len(column), np.nan)
     for i, cell in enumerate(column):
         try:
-            numbers[i] = float(cell) if str(cell).strip() else np.nan
+            numbers[i] = np.nan if str(cell).strip().lower() in EMPTY else float(cell)
         except ValueError:
             raise InputError(f"{name!r} of {table.where} is {cell!r} in row {i + 1}; it must be a number") from None
     return numbers

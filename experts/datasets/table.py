@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from deconfounded.envs.support.errors import InputError
 
 EXTRA = "`pip install deconfounded-imitation[data]` brings it"
+EMPTY = {"", "na", "n/a", "nan", "null", "none"}  # cells, in lower case
 MAX_TEXT = 100  # characters of an attribute that may be a label
 
 Column = NDArray[Any]

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import EXTRA, Column, Table, spread
+from deconfounded.experts.datasets.table import EMPTY, EXTRA, Column, Table, spread
 
-EMPTY = {"", "na", "n/a", "nan", "null", "none"}  # in lower case
 BLOCK = 1 << 16  # rows that are converted at once
 
 

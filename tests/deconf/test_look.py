@@ -116,7 +116,7 @@ def with_the_present_state(trials: Trials) -> Trials:
 
 
 PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a kind, and words of it
-    "nothing": (driven, set(), "lag", "Actions match the observation of their own row best"),
+    "nothing": (driven, set(), "lag", "No earlier observation matches actions better"),
     "late": (lambda: late(driven()), {"late"}, "late", "they are probably logged late. Move actions up by 1 row."),
     "two late": (lambda: late(late(driven())), {"late"}, "late", "they are probably logged late. Move actions up by 2"),
     "reaction": (lambda: driven(reaction=2), {"late"}, "late", "move what follows their own: a reaction time."),

@@ -334,6 +334,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     ),
     "case": ({"trial": "VEHICLE"}, {}, "trial 'VEHICLE' is no column of .*; did you mean 'vehicle'?"),
     "text": ({}, {"speed x": "fast"}, "'speed x' of .*x.csv is 'fast' in row 3; it must be a number"),
+    "text among actions": ({}, {"throttle": "off"}, "'throttle' of .*x.csv is 'off' in row 3; it must be a number"),
     "NaN": ({}, {"speed x": "nan"}, "'speed x' of .*x.csv holds no number in row 3"),
     "no action": ({}, {"throttle": ""}, "'throttle' of .*x.csv is empty in row 3"),
     "infinite": ({}, {"throttle": "inf"}, "'throttle' is infinite"),
