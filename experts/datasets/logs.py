@@ -136,9 +136,8 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
     elif taken.dtype == object:
         values = tuple(sorted({str(value) for value in taken.ravel()}))
         if len(values) > MOST_DISCRETE:
-            raise InputError(
-                f"{action[0]!r} holds {len(values)} texts, as {values[0]!r}; an action must be a number, or one of {MOST_DISCRETE} texts"
-            )
+            right = f"an action must be a number, or one of {MOST_DISCRETE} texts"
+            raise InputError(f"{action[0]!r} holds {len(values)} texts, as {values[0]!r}; {right}")
     elif whole and 2 <= len(held := np.unique(taken)) <= MOST_DISCRETE and held[-1] - held[0] == len(held) - 1:
         values = tuple(int(value) for value in held)
     if values:
