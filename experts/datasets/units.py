@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from deconfounded.envs.streams import Array, Mask, Obs
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts import store
+from deconfounded.experts import saved_agents
 from deconfounded.experts.rollout import Agent, State
 
 
@@ -106,4 +106,4 @@ class RawAgent(Agent):
 
     def save(self, folder: Path | str) -> None:
         """Save the agent in a folder, for `deconfounded.load`."""
-        store.save(self, Path(folder))
+        saved_agents.save(self, Path(folder))
