@@ -28,12 +28,13 @@ from tests.deconf.test_diagnose import _tiny_init
 B, E, T = 48, 2, 60
 
 
-def driven(lasting: float = 0.0, noise: float = 0.1, reaction: int = 0, same: bool = False, seed: int = 0) -> Trials:
+def driven(lasting: float = 0.0, noise: float = 0.1, reaction: int = 0, same: bool = False, goals: float = 0) -> Trials:
     """A cart in a hidden wind, which its driver feels.
 
     lasting: correlation of the driver's noise from step to step. reaction: steps by which the driver answers late.
+    same: one wind for all trials. goals: how far apart the drivers' goals are.
     """
-    rng = np.random.default_rng(seed)
+    rng, goal = np.random.default_rng(0), goals * np.linspace(-1, 1, B)
     wind = 0 * rng.uniform(-1, 1, B) + 0.5 if same else rng.uniform(-1, 1, B)
     obs, action = np.zeros((B, E, T + 1, 2)), np.zeros((B, E, T, 1))
     for e in range(E):
@@ -42,7 +43,7 @@ def driven(lasting: float = 0.0, noise: float = 0.1, reaction: int = 0, same: bo
         for t in range(T):
             shaken = lasting * shaken + np.sqrt(1 - lasting**2) * noise * rng.standard_normal(B)
             seen = obs[:, e, max(0, t - reaction)]
-            action[:, e, t, 0] = (-0.5 * seen[:, 0] - 0.5 * seen[:, 1] - 0.3 * wind + shaken).clip(-1, 1)
+            action[:, e, t, 0] = (0.5 * (goal - seen[:, 0]) - 0.5 * seen[:, 1] - 0.3 * wind + shaken).clip(-1, 1)
             v = v + 0.2 * action[:, e, t, 0] + 0.06 * wind + 0.05 * rng.standard_normal(B)
             x = x + 0.2 * v + 0.02 * rng.standard_normal(B)
             obs[:, e, t + 1] = np.stack([x, v], 1)
@@ -189,6 +190,7 @@ def test_dynamics_of_exploration(name: str, differ: bool) -> None:
 def test_dynamics_of_an_expert() -> None:
     assert "Trials differ in their dynamics" in said(look(driven()), "dynamics")
     assert "No difference in dynamics is seen" in said(look(driven(same=True)), "dynamics")
+    assert "No difference in dynamics is seen" in said(look(driven(same=True, goals=1)), "dynamics")
     few = driven()
     few = Trials(few.obs[:9], few.action[:9], few.mask[:9])
     assert "cannot be seen" in said(look(few), "dynamics")

@@ -60,6 +60,8 @@ def test_what_it_says(tmp_path: Path) -> None:
     about = list(found.storage.get_episode_metadata(range(15)))
     assert [(int(one["trial"]), int(one["episode"])) for one in about] == [(b, e) for b in range(3) for e in range(5)]
     assert not {"theta", "seed"} & set(vars(Trials.from_minari(place)))
+    with pytest.raises(envs.InputError, match="obs 'theta' is no column"):
+        datasets.read(place, obs=["theta"])
 
 
 def test_bad_input_is_one_line(tmp_path: Path) -> None:
