@@ -223,7 +223,7 @@ def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
         repeat = 1 - float(((now - last) ** 2).mean(0).sum()) / total
         own = np.stack([fits.by_trial(x, trial, len(log))[trial] for x in now.T], 1)
         mean = 1 - float(((now - own) ** 2).mean(0).sum()) / total
-        linear = 1 - (1 - mean) * fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial)
+        linear = 1 - (1 - mean) * min(1.0, fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial))
         text = (
             f"Always the mean action errs by {np.sqrt(total):.2g} (rms, of ranges -1 to 1). Of that variance, repeating"
             f" the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear function of"
