@@ -1,35 +1,25 @@
-"""Is your data confounded? `deconf diagnose --trials expert.npz`
+"""Is your data confounded? `deconf diagnose --data logs.csv --trial vehicle --obs 'speed*' --action throttle`
 
-It reads trials of an expert, and of exploration if you have some; it needs no theta and no simulator. Each file is an
-.npz as `Trials.save` writes it, or a Minari data set's folder; each trial is under a hidden theta of its own. It writes
-index.html and diagnosis.json. If it was interrupted, the same command goes on.
+It reads an expert's logs, and logs of exploration if you have some; it needs no theta and no simulator. Each trial is
+under a hidden theta of its own. `deconf look --help` says which data can be read; a look at them comes first. It writes
+index.html, diagnosis.json and the trials as .npz. If it was interrupted, the same command goes on.
 """
 
 import json
+import shlex
 import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from deconfounded import envs
-from deconfounded.benchmarks import commands
+from deconfounded.benchmarks import commands, look
 from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
     from deconfounded.deconf.diagnosis.diagnose import Diagnosis
     from deconfounded.deconf.diagnosis.measures import Amounts, Findings
-    from deconfounded.experts.rollout import Trials
-
-
-def trials_of(source: Path) -> "Trials":
-    """What a file or a data set's folder holds. Raises InputError if that is no trials."""
-    from deconfounded.experts.rollout import Trials
-
-    if not source.exists():
-        raise envs.InputError(f"there is no {source}; give a Minari data set's folder, or an .npz of Trials.save")
-    return Trials.from_minari(source) if source.is_dir() else Trials.load(source)
 
 
 @dataclass(frozen=True)
@@ -72,6 +62,7 @@ class Refit:
 
         from deconfounded.benchmarks.engine import progress
         from deconfounded.deconf.diagnosis.measures import measure
+        from deconfounded.experts.rollout import Trials
 
         start, ticked = time.time(), 0
 
@@ -81,19 +72,20 @@ class Refit:
             ticked = int(share * self.ticks)
 
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
-        explore = None if self.explore is None else trials_of(self.explore)
-        findings = measure(trials_of(self.trials), explore, self.amounts, rng, tell)
+        explore = None if self.explore is None else Trials.load(self.explore)
+        findings = measure(Trials.load(self.trials), explore, self.amounts, rng, tell)
         write_json(self.file, {"made_of": self.made_of, "figures": findings._asdict()})
         return f"measured in {time.time() - start:.0f} s"
 
 
-def run(source: Path, exploration: Path | None, seed: int, folder: Path, command: str) -> "tuple[Diagnosis, str]":
+def run(
+    data: list[Path], exploration: list[Path] | None, columns: dict[str, Any], seed: int, folder: Path, command: str
+) -> "tuple[Diagnosis, str]":
     """Diagnose, and write the page and the json; returns what to print too. What the folder has of the same, stays.
 
-    Raises InputError for data that cannot be judged.
+    columns: arguments of `datasets.read`. Raises InputError for data that cannot be judged.
     """
-    trials = trials_of(source)
-    explore = None if exploration is None else trials_of(exploration)
+    trials, explore = look.read(data, exploration, columns)
     from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.scheduler import run_jobs
@@ -101,35 +93,42 @@ def run(source: Path, exploration: Path | None, seed: int, folder: Path, command
     from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check, judge
 
     config, start = DiagnoseConfig(), time.time()
+    remarks = look.look(trials, explore)
+    print(*remarks, sep="\n", flush=True)
     check(trials, explore, config)
     about: dict[str, Any] = {
-        "trials": {"from": str(source), "sha256": trials.sha256, "shape": trials.mask.shape},
-        "explore": explore and {"from": str(exploration), "sha256": explore.sha256, "shape": explore.mask.shape},
+        "trials": {"from": paths(data), "sha256": trials.sha256, "shape": trials.mask.shape},
+        "explore": explore and {"from": paths(exploration), "sha256": explore.sha256, "shape": explore.mask.shape},
         "config": asdict(config),
         "seed": seed,
         "versions": identity.versions(),
         "version": VERSION,
     }
-    shared = (seed, config.refits, json.dumps(about), folder)
-    refits = [Refit(source, exploration, config.amounts, i, *shared) for i in range(config.refits)]
+    shared: dict[str, Any] = {"seed": seed, "refits": config.refits, "made_of": json.dumps(about), "folder": folder}
+    files = folder / "trials.npz", None if explore is None else folder / "explored.npz"
+    refits = [Refit(*files, config.amounts, i, **shared) for i in range(config.refits)]
     with commands.locked(folder), Local() as engine:
+        for log, file in zip((trials, explore), files, strict=True):
+            if log is not None and file is not None:
+                log.save(file)
         run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run)
     diagnosis = judge([findings for refit in refits if (findings := refit.findings()) is not None])
+    about |= {"columns": columns, "units": asdict(trials.units), "look": [remark._asdict() for remark in remarks]}
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
     return diagnosis, page.write(diagnosis, about, folder)
 
 
+def paths(given: list[Path] | None) -> str | list[str]:
+    """Names of files; of one alone, its name."""
+    names = [str(path) for path in given or ()]
+    return names[0] if len(names) == 1 else names
+
+
 def main() -> None:
     parser = Parser(__doc__)
-    parser.add_argument("--trials", type=place, required=True, metavar="FILE", help="trials of the expert")
-    parser.add_argument(
-        "--explore",
-        type=place,
-        metavar="FILE",
-        help="trials of theta-blind exploration",
-    )
+    look.add_data(parser)
     parser.add_argument("--seed", type=whole(0), default=0, help="of the splits and of training")
     parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
     args = parser.parse_args()
-    asked = " ".join(["deconf diagnose", *sys.argv[1:]])
-    print(run(args.trials, args.explore, args.seed, args.out, asked)[1])
+    asked = shlex.join(["deconf", "diagnose", *sys.argv[1:]])
+    print(run(args.data, args.explore, look.columns(args), args.seed, args.out, asked)[1])

@@ -18,6 +18,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "check": ("benchmarks.check", "does a task meet the contract? its tests", NOTHING),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?", NOTHING),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from trials, without theta", REPEATED),
+    "look": ("benchmarks.look", "what is in your data, and what would mislead a diagnosis", NOTHING),
     "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?", REPEATED),
     "play": ("benchmarks.play", "run a saved agent in one environment", NOTHING),
     "score": ("benchmarks.score", "score a saved agent on fresh thetas, or on another range", NOTHING),
@@ -54,7 +55,7 @@ def main(*first: str) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise
-        extra = "train" if name == "train" else "data" if error.name == "minari" else "bench"
+        extra = "train" if name == "train" else "data" if error.name in ("minari", "h5py", "pyarrow") else "bench"
         end(f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it")
 
 

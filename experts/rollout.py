@@ -91,10 +91,12 @@ class Trials:
 
     @staticmethod
     def from_minari(source: Path | str) -> Trials:
-        """The trials of a Minari data set's folder, without their thetas; see `experts.datasets.read`."""
-        from deconfounded.experts import datasets
+        """The trials of a Minari data set's folder, without their thetas; other formats: `experts.datasets.read`."""
+        from deconfounded.experts.datasets.logs import trials_of
+        from deconfounded.experts.datasets.minari_sets import read_minari
+        from deconfounded.experts.datasets.rows import Roles
 
-        return datasets.read(source)[0]
+        return trials_of([[read_minari(source)]], Roles())[0]
 
     def save(self, file: Path, made_of: str = "") -> None:
         """Write an .npz file atomically. made_of: identity of the data, which `load` compares."""

@@ -8,6 +8,7 @@ from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, encoded, panels
 from deconfounded.deconf.diagnosis.diagnose import GOOD, NEGLIGIBLE, STAKES, Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
+from deconfounded.experts.datasets.units import Units
 
 Rows = dict[str, tuple[Figure, str]]
 """Bars by what stands beside them, each with its colour."""
@@ -34,21 +35,44 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     return f"{text}\n-> {folder / 'index.html'}"
 
 
+WRITTEN = {  # functions of the user's own, until they are written
+    "explore": """
+def explore(agent):  # blind to theta; better than the log are trials in which the agent acts (None at first)
+    return {log}
+
+
+""",
+    "query": """
+def query(agent):  # trials in which the agent acts (None: the expert), and the expert's action at each step of them
+    raise NotImplementedError("ask the expert: return trials, actions")
+
+
+""",
+}
+
+
 def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     """Lines of Python that do what is to be done next, if a method does it."""
     if not diagnosis.next.fit:
         return ""
-    source = about["trials"]["from"]
-    read = f"Trials.{'from_minari' if Path(source).is_dir() else 'load'}(Path({source!r}))"
     method = diagnosis.next.fit.partition(".")[0]
-    return f"""from pathlib import Path
-import numpy as np
+    columns = "".join(f", {name}={value!r}" for name, value in about["columns"].items())
+    source = repr(about["trials"]["from"])
+    read = f"trials = datasets.read({source}{columns})\n"
+    if about["explore"]:
+        sources = f"[{source}, {about['explore']['from']!r}]"
+        read = f"trials, explored = datasets.read_together({sources}{columns})  # with one range of actions\n"
+    asked = next(
+        (name for name in WRITTEN if f", {name}," in diagnosis.next.fit or f"({name}," in diagnosis.next.fit), ""
+    )
+    own = WRITTEN[asked].format(log="explored" if about["explore"] else "trials") if asked else ""
+    raw = "agent = trials.units.agent(agent)  # acts in the units of the log\n" if Units(**about["units"]).raw else ""
+    return f"""import numpy as np
 from deconfounded.deconf.methods import {method}
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts import datasets
 
-trials = {read}
-agent = {diagnosis.next.fit}
-agent.save("agent")
+{read}{own}agent = {diagnosis.next.fit}
+{raw}agent.save("agent")
 """
 
 

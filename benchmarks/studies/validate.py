@@ -179,7 +179,8 @@ def main() -> None:
         task, source = envs.get(cases[name]), CASES[cases[name]]
         folder = args.out / task.name
         folder.mkdir(parents=True, exist_ok=True)
-        diagnosis, _ = run(*data(task, source, folder), 0, folder / "diagnosis", f"deconf validate --tasks {name}")
+        expert, explored = data(task, source, folder)
+        diagnosis, _ = run([expert], [explored], {}, 0, folder / "diagnosis", f"deconf validate --tasks {name}")
         certified, scores = certificate(task, source, folder), measured(task, source, folder)
         row = {
             "case": name,

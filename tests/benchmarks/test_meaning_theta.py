@@ -68,7 +68,7 @@ def test_episodes_of_a_data_set_hold_no_theta(tmp_path: Path) -> None:
         n = len(episode.rewards)
         np.testing.assert_array_equal(episode.observations, trials.obs[b, e, : n + 1])
         np.testing.assert_array_equal(episode.actions, trials.action[b, e, :n])
-    np.testing.assert_array_equal(datasets.read(place)[1], theta)
+    np.testing.assert_array_equal(datasets.read_theta(place), theta)
 
 
 def test_who_explores_gets_nothing_else() -> None:

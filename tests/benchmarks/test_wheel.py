@@ -131,7 +131,8 @@ report results/bandit-smoke
 score --agent results/bandit-smoke/agents/blind_bc-0 --task bandit --trials 4 --out scores/bandit.json
 verify bandit blind_bc 0 --records results/bandit-smoke/records
 data --task bandit --trials 24 --out sets
-diagnose --trials sets/deconf/bandit/expert24s0-v0
+look --data sets/deconf/bandit/expert24s0-v0
+diagnose --data sets/deconf/bandit/expert24s0-v0
 check --task bandit
 certify --task bandit
 train --task slippery_cartpole --steps 64

@@ -83,7 +83,7 @@ class TestBadInput:
         trials(5).save(tmp_path / "few.npz")
         (tmp_path / "junk.npz").write_bytes(b"junk")
         for name, line in (("none.npz", "there is no"), ("junk.npz", "no trials could"), ("few.npz", "5 trials given")):
-            monkeypatch.setattr("sys.argv", ["diagnose", "--trials", str(tmp_path / name), "--out", str(tmp_path)])
+            monkeypatch.setattr("sys.argv", ["diagnose", "--data", str(tmp_path / name), "--out", str(tmp_path)])
             with pytest.raises(SystemExit) as stopped:
                 run_command(command.main)
             assert stopped.value.code == 2
@@ -216,7 +216,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
     for name, data in zip(("expert", "explored"), _bandit(), strict=True):
         data.save(tmp_path / f"{name}.npz")
-    options = ["--trials", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
+    options = ["--data", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
     monkeypatch.setattr("sys.argv", ["diagnose", *options, "--out", str(tmp_path / "out")])
     command.main()
     first = capsys.readouterr().out

@@ -34,7 +34,7 @@ def test_the_same_in_another_process(
     code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.stdout.strip() == shown.sha256, done.stderr
-    trials, theta = datasets.read(tmp_path)
+    trials, theta = datasets.read(tmp_path), datasets.read_theta(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
     config = RecurrentConfig(updates=2, batch=4)
     one, other = (naive_rnn.train(given, config, context.rngs) for given in (shown, trials))
@@ -60,6 +60,8 @@ def test_what_it_says(tmp_path: Path) -> None:
     about = list(found.storage.get_episode_metadata(range(15)))
     assert [(int(one["trial"]), int(one["episode"])) for one in about] == [(b, e) for b in range(3) for e in range(5)]
     assert not {"theta", "seed"} & set(vars(Trials.from_minari(place)))
+    with pytest.raises(envs.InputError, match="obs 'theta' is no column"):
+        datasets.read(place, obs=["theta"])
 
 
 def test_bad_input_is_one_line(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
-from deconfounded.experts import policy
+from deconfounded.experts import datasets, policy
 from deconfounded.experts.rollout import RandomAgent, Trials, run_trials
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
@@ -89,10 +89,10 @@ class TestDataSets:
         ("observation", "action", "values", "says"),
         [
             (
-                spaces.Dict(x=BOX),
+                spaces.Dict(x=spaces.Box(0, 255, (4, 4, 3), np.uint8)),
                 ACTIONS,
-                ({"x": np.zeros((4, 2), "f4")}, np.zeros((3, 1), "f4")),
-                "Box of one axis or none",
+                ({"x": np.zeros((4, 4, 4, 3), np.uint8)}, np.zeros((3, 1), "f4")),
+                "one must be of Box of one axis or none",
             ),
             (
                 spaces.Tuple([BOX, BOX]),
@@ -143,7 +143,7 @@ class TestDataSets:
         values = np.zeros((4, 2), "f4"), np.zeros((3, 1), "f4")
         made = data_set(tmp_path, BOX, ACTIONS, lambda _: values, about)
         with pytest.raises(envs.InputError, match=says):
-            Trials.from_minari(made)
+            (Trials.from_minari if "theta" not in about[0] else datasets.read_theta)(made)
 
     def test_no_folder(self) -> None:
         with pytest.raises(envs.InputError, match="a data set was None; it must be the path"):

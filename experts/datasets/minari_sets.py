@@ -1,4 +1,4 @@
-"""Trials as Minari data sets: episodes with the number of their trial in their metadata and, for scoring, theta."""
+"""Minari data sets. Ours have the number of each episode's trial in its metadata and, for scoring, theta."""
 
 import os
 import warnings
@@ -15,6 +15,7 @@ from gymnasium import spaces
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.spaces import action_sizes
+from deconfounded.experts.datasets.table import EXTRA, Column, Table, of_episodes, spread
 from deconfounded.experts.rollout import Agent, Trials, run_trials
 
 HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before
@@ -102,19 +103,76 @@ def write(
     return place
 
 
-def read(source: Path | str) -> tuple[Trials, Array | None]:
-    """Trials of a data set's folder, and its thetas [B, E, L], for scoring alone, or None if it has none.
+def read_minari(source: Path | str) -> Table:
+    """A data set's folder: observations of numbers, actions, metadata of episodes; without theta.
 
-    Observations of one number are one column, discrete ones are one-hot. Raises InputError if there is no data set, if
-    its episodes' metadata do not name their trial, and for what cannot be [B, E, T + 1, O] and [B, E, T, A].
+    Observations of one number are one column, discrete ones are one-hot, those of a dictionary `key.0` on. Where every
+    episode's metadata name its `trial` and `episode`, episodes are in that order, and `trial` says what a trial is.
+    Raises InputError for anything else, and for spaces that are not a row of numbers a step.
     """
+    dataset, metadata, episodes = _opened(source)
+    places = [(entry["trial"], entry["episode"]) for entry in metadata if {"trial", "episode"} <= set(entry)]
+    named, horizon = len(places) == len(metadata), 0
+    if named:
+        horizon = int(dataset.storage.metadata.get(HORIZON, 0))
+        order = _order(source, places)
+        episodes, metadata = [episodes[i] for i in order], [metadata[i] for i in order]
+        if horizon and (longest := max(len(episode.rewards) for episode in episodes)) > horizon:
+            raise InputError(
+                f"an episode of {source} has {longest} steps; its {HORIZON}, {horizon}, must be at least that"
+            )
+    width, n_actions = action_sizes(dataset.action_space)
+    action = ["action"] if width == 1 else [f"action.{i}" for i in range(width)]
+    parts = list[dict[str, Column]]()
+    for i, episode in enumerate(episodes):
+        of = (
+            f"of episode {i} in {source}"
+            if not named
+            else "of episode {1} of trial {0} in {2}".format(
+                *(metadata[i][key] for key in ("trial", "episode")), source
+            )
+        )
+        n = len(episode.rewards)
+        seen = _observed(of, episode.observations, dataset.observation_space, n + 1)
+        done = _rows(f"actions {of}", episode.actions, dataset.action_space, n, False)
+        rows = np.append(np.asarray(done, float), np.full((1, done.shape[1]), np.nan), 0)
+        parts.append(seen | dict(zip(action, rows.T, strict=True)))
+    lengths = [len(next(iter(part.values()))) for part in parts]
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    obs = tuple(name for name in columns if name not in action)
+    attributes = [{key: value for key, value in entry.items() if key != "theta"} for entry in metadata]
+    columns |= {name: x for name, x in of_episodes(attributes, lengths).items() if name not in columns}
+    limits = {}
+    if isinstance(dataset.action_space, spaces.Box):
+        bounds = zip(dataset.action_space.low, dataset.action_space.high, strict=True)
+        limits = {
+            name: (float(a), float(b)) for name, (a, b) in zip(action, bounds, strict=True) if np.isfinite([a, b]).all()
+        }
+    boundaries = np.repeat(np.arange(len(parts)), lengths)
+    trial = "trial" if named else None
+    return Table(str(source), columns, boundaries, obs, tuple(action), trial, limits, n_actions, horizon)
+
+
+def read_theta(source: Path | str) -> Array | None:
+    """Thetas [B, E, L] of a data set that `write` wrote, for scoring alone; None if it has none."""
+    _, metadata, _ = _opened(source)
+    if not all({"trial", "episode", "theta"} <= set(entry) for entry in metadata):
+        return None
+    order = _order(source, [(entry["trial"], entry["episode"]) for entry in metadata])
+    theta = [np.asarray(metadata[i]["theta"], float) for i in order]
+    if len({value.shape for value in theta}) > 1:
+        raise InputError(f"thetas of {source} are of several shapes; each must have a number for each latent")
+    return np.stack(theta).reshape(1 + int(max(entry["trial"] for entry in metadata)), -1, *theta[0].shape)
+
+
+def _opened(source: Path | str) -> tuple[Any, list[dict[str, Any]], list[Any]]:
+    """The data set, and the metadata and data of its episodes."""
     if not isinstance(source, str | Path):
         raise InputError(f"a data set was {source!r}; it must be the path of its folder")
     try:
         import minari
     except ModuleNotFoundError:
-        raise InputError(f"{source} needs Minari; `pip install deconfounded-imitation[data]` brings it") from None
-
+        raise InputError(f"{source} needs Minari; {EXTRA}") from None
     folders = [file.parent for file in sorted(Path(source).rglob("metadata.json")) if file.parent.name == "data"]
     if len(folders) != 1:
         raise InputError(f"{source} holds {len(folders)} Minari data sets; give the folder of one")
@@ -122,36 +180,36 @@ def read(source: Path | str) -> tuple[Trials, Array | None]:
         dataset = minari.MinariDataset(folders[0])
         metadata = list(dataset.storage.get_episode_metadata(dataset.episode_indices))
         episodes = list(dataset.iterate_episodes())
-        named = [entry for entry in metadata if {"trial", "episode"} <= set(entry)]
-        places = [(index(entry["trial"]), index(entry["episode"])) for entry in named]
-        t = int(dataset.storage.metadata.get(HORIZON, max((len(episode.rewards) for episode in episodes), default=0)))
-        theta = [np.asarray(entry["theta"], float) for entry in metadata if entry.get("theta") is not None]
     except Exception as error:
         raise InputError(f"the data set in {source} cannot be read: {' '.join(str(error).split())}") from None
-    if not places or len(places) < len(metadata):
-        raise InputError(f"episodes of {source} do not say which `trial` and `episode` they are, in their metadata")
+    if not episodes:
+        raise InputError(f"the data set in {source} holds no episodes")
+    return dataset, metadata, episodes
+
+
+def _order(source: Path | str, named: list[tuple[Any, Any]]) -> list[int]:
+    """Indices of episodes by trial and episode. Raises InputError unless every trial has each episode once."""
+    try:
+        places = [(index(trial), index(episode)) for trial, episode in named]
+    except TypeError as error:
+        raise InputError(f"the data set in {source} cannot be read: {error}") from None
     b, e = (1 + max(numbers) for numbers in zip(*places, strict=True))
     if sorted(places) != [(i, j) for i in range(b) for j in range(e)]:
-        raise InputError(f"{source} holds {len(metadata)} episodes; every trial of {b} must have each of {e} once")
-    if (longest := max(len(episode.rewards) for episode in episodes)) > t:
-        raise InputError(f"an episode of {source} has {longest} steps; its {HORIZON}, {t}, must be at least that")
-    if len({value.shape for value in theta}) > 1:
-        raise InputError(f"thetas of {source} are of several shapes; each must have a number for each latent")
-    obs, action = [np.zeros(0)] * len(metadata), [np.zeros(0)] * len(metadata)
-    mask = np.zeros((b, e, t), bool)
-    for episode, (i, j) in zip(episodes, places, strict=True):
-        n = len(episode.rewards)
-        mask[i, j, :n] = True
-        of = f"of episode {j} of trial {i} in {source}"
-        seen = _rows(f"observations {of}", episode.observations, dataset.observation_space, n + 1, True)
-        obs[i * e + j] = np.pad(seen, ((0, t - n), (0, 0)))
-        done = _rows(f"actions {of}", episode.actions, dataset.action_space, n, False)
-        action[i * e + j] = np.pad(done, ((0, t - n), (0, 0)))
-    _, n_actions = action_sizes(dataset.action_space)
-    trials = Trials(np.reshape(obs, (b, e, t + 1, -1)), np.reshape(action, (b, e, t, -1)), mask, n_actions)
-    if len(theta) < len(metadata):
-        return trials, None
-    return trials, np.stack([theta[places.index((i, j))] for i in range(b) for j in range(e)]).reshape(b, e, -1)
+        raise InputError(f"{source} holds {len(places)} episodes; every trial of {b} must have each of {e} once")
+    return sorted(range(len(places)), key=places.__getitem__)
+
+
+def _observed(of: str, values: Any, space: spaces.Space[Any], n: int, name: str = "observation") -> dict[str, Column]:
+    """Columns of n observations; of a dictionary, parts that are rows of numbers."""
+    if not isinstance(space, spaces.Dict):
+        return spread(name, _rows(f"observations {of}", values, space, n, True))
+    columns: dict[str, Column] = {}
+    for key, part in space.items():
+        if len(part.shape or ()) < 2:
+            columns |= _observed(of, values[key], part, n, f"{name}.{key}")
+    if not columns:
+        raise InputError(f"observations {of} are of {space}; one must be of Box of one axis or none")
+    return columns
 
 
 def _rows(what: str, values: Any, space: spaces.Space[Any], n: int, observed: bool) -> Array:

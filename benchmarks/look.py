@@ -1,0 +1,56 @@
+"""A look at logs, before any diagnosis: `deconf look --data logs.csv --trial vehicle --obs 'speed*' --action throttle`
+
+What is in them, in plain words, and, marked with !, what would mislead a diagnosis. Data are csv, parquet, HDF5 (of
+robomimic or D4RL) and npz (of Trials.save) files, and folders of LeRobot and Minari data sets; several files of the
+same columns are read as one. It takes seconds.
+"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from deconfounded.benchmarks.console import Parser, place
+
+if TYPE_CHECKING:
+    from deconfounded.deconf.diagnosis.look import Remark
+    from deconfounded.experts.datasets import Log
+
+COLUMNS = ("trial", "episode", "obs", "action")
+
+
+def add_data(parser: argparse.ArgumentParser) -> None:
+    """Arguments that say what to read."""
+    parser.add_argument("--data", type=place, nargs="+", required=True, metavar="PATH", help="logs of the expert")
+    parser.add_argument("--explore", type=place, nargs="+", metavar="PATH", help="theta-blind exploration, alike")
+    parser.add_argument("--trial", metavar="COLUMN", help="says which trial a row is of; else each episode is a trial")
+    parser.add_argument("--episode", metavar="COLUMN", help="says which episode of the trial a row is of")
+    parser.add_argument("--obs", nargs="+", metavar="COLUMN", default=[], help="observations; 'speed*' is a pattern")
+    parser.add_argument("--action", nargs="+", metavar="COLUMN", default=[], help="actions")
+
+
+def columns(args: argparse.Namespace) -> dict[str, Any]:
+    """Columns that were given, as arguments of `datasets.read`."""
+    return {name: getattr(args, name) for name in COLUMNS if getattr(args, name)}
+
+
+def read(data: list[Path], explore: list[Path] | None, chosen: dict[str, Any]) -> "tuple[Log, Log | None]":
+    """Logs of the expert, and of exploration if there are any. Raises InputError for what cannot be read."""
+    from deconfounded.experts import datasets
+
+    logs = datasets.read_together([data] if explore is None else [data, explore], **chosen)
+    return logs[0], logs[1] if len(logs) > 1 else None
+
+
+def look(trials: "Log", explore: "Log | None") -> "list[Remark]":
+    """Remarks on both."""
+    from deconfounded.deconf.diagnosis.look import look as look_at
+
+    blind = [] if explore is None else look_at(explore, blind=True)
+    return look_at(trials) + [remark._replace(text=f"Exploration: {remark.text}") for remark in blind]
+
+
+def main() -> None:
+    parser = Parser(__doc__)
+    add_data(parser)
+    args = parser.parse_args()
+    print(*look(*read(args.data, args.explore, columns(args))), sep="\n")

@@ -1,0 +1,235 @@
+"""Measures of the first look at logs: fits of actions and of the dynamics, in all trials and in each; tails; copies."""
+
+import hashlib
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded.experts.rollout import Trials
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+FEW = 6  # columns, up to which their products are features too
+ENOUGH = 8  # steps of a trial for each feature of a fit of its own
+CHANCE = 0.001  # probability that trials that are alike are said to differ
+MENDED = 4.0  # excess kurtosis
+HIDDEN = 128  # random features
+CLIP = 4.0  # usual deviations
+ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Steps in a row: observations before and after [N, O], actions [N, A], and the trial [N] of each."""
+
+    obs: Array
+    then: Array
+    action: Array
+    trial: Numbers
+
+    @staticmethod
+    def of(trials: Trials) -> "Steps":
+        """The steps that took place."""
+        now, then = trials.obs[:, :, :-1][trials.mask], trials.obs[:, :, 1:][trials.mask]
+        action = trials.action[trials.mask].astype(float)
+        return Steps(now.astype(float), then.astype(float), action, np.nonzero(trials.mask)[0])
+
+
+def by_trial(x: Array, trial: Numbers, count: int) -> Array:
+    """The mean [B] of x [N] in each trial."""
+    return np.bincount(trial, x, count) / np.maximum(np.bincount(trial, minlength=count), 1)
+
+
+def kurtosis(x: Array) -> float:
+    """Excess kurtosis; 0 of what does not vary."""
+    centred = x - x.mean()
+    variance = float((centred**2).mean())
+    return float((centred**4).mean()) / variance**2 - 3 if variance > 1e-12 * (1 + x.mean() ** 2) else 0.0
+
+
+def mended(name: str, x: Array) -> tuple[str, float]:
+    """The first of some ways to write a column that has no heavy tails, or else the best, and its excess kurtosis."""
+    centre = float(np.median(x))
+    distance = np.abs(x - centre)
+    scale = 1.48 * float(np.median(distance)) or float(np.quantile(distance, 0.9)) or 1.0
+    low, high = np.quantile(x, [0.005, 0.995])
+    ways = {f"arcsinh(({name} - {centre:.3g}) / {scale:.3g})": np.arcsinh((x - centre) / scale)}
+    if x.min() > 0:
+        ways[f"log({name})"] = np.log(x)
+    ways[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
+    tails = {how: kurtosis(written) for how, written in ways.items()}
+    how = next((how for how, left in tails.items() if left < MENDED), min(tails, key=tails.__getitem__))
+    return how, tails[how]
+
+
+def copies(trials: Trials) -> tuple[list[list[int]], ...]:
+    """Groups of trials that are the same; whose actions are; and the trials of episodes that are the same.
+
+    Actions count where they are continuous, of ten steps or more, and not constant.
+    """
+    groups: tuple[dict[bytes, list[int]], ...] = {}, {}, {}
+    for b, mask in enumerate(trials.mask):
+        whole, acted = trials.obs[b].tobytes(), trials.action[b].tobytes()
+        groups[0].setdefault(hashlib.sha256(whole + acted).digest(), []).append(b)
+        if not trials.actions and mask.sum() >= 10 and np.ptp(trials.action[b][mask], 0).any():
+            groups[1].setdefault(hashlib.sha256(acted).digest(), []).append(b)
+        for e in np.flatnonzero(mask.any(1)):
+            bits = trials.obs[b, e].tobytes() + trials.action[b, e].tobytes()
+            groups[2].setdefault(hashlib.sha256(bits).digest(), []).append(b)
+    return tuple([numbers for numbers in found.values() if len(numbers) > 1] for found in groups)
+
+
+def _standard(x: Array) -> Array:
+    std = x.std(0)
+    return (x - x.mean(0)) / np.where(std > 1e-9, std, np.inf)
+
+
+def features(x: Array) -> Array:
+    """Standardised columns [N, F], and their products where columns are few."""
+    x = _standard(x)
+    pairs = combinations_with_replacement(range(x.shape[1]), 2) if x.shape[1] <= FEW else ()
+    return np.stack([*x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
+
+
+def _one_hot(action: Array, n_actions: int) -> Array:
+    return np.eye(n_actions)[action[..., 0].astype(int)][..., 1:] if n_actions else action
+
+
+def residual(y: Array, x: Array, trial: Numbers) -> tuple[Array, bool]:
+    """What linear fits of y [N, A] by x [N, F] leave, and whether they are of each trial alone, as of long ones."""
+    count = int(trial.max()) + 1
+    own = float(np.median(np.bincount(trial, minlength=count))) >= ENOUGH * (x.shape[1] + 1)
+    centred = [np.stack([c - by_trial(c, trial, count)[trial] for c in part.T], 1) for part in (y, x)]
+    if not own:
+        return centred[0] - centred[1] @ _solved(centred[1], centred[0]), False
+    left = centred[0].copy()
+    for rows in _by_trial(trial):
+        if len(rows) > x.shape[1] + 1:
+            left[rows] -= centred[1][rows] @ _solved(centred[1][rows], centred[0][rows])
+            left[rows] *= np.sqrt(len(rows) / (len(rows) - x.shape[1] - 1))
+    return left, True
+
+
+def unexplained(y: Array, x: Array, trial: Numbers) -> float:
+    """The share of the variance of y, within trials, that is left."""
+    count = int(trial.max()) + 1
+    total = sum(float(((c - by_trial(c, trial, count)[trial]) ** 2).sum()) for c in y.T)
+    return float((residual(y, _standard(x), trial)[0] ** 2).sum()) / max(total, 1e-12)
+
+
+@dataclass(frozen=True)
+class Window:
+    """Steps with observations at several lags: obs[k] [N, O] is that of k rows before the action [N, A]."""
+
+    obs: dict[int, Array]
+    action: Array
+    trial: Numbers
+
+    @staticmethod
+    def of(trials: Trials, most: int) -> "Window":
+        """Steps with `most` rows before them, and the one after."""
+        length = trials.mask.shape[2]
+        valid = np.zeros_like(trials.mask)
+        valid[:, :, most:] = trials.mask[:, :, most:]
+        b, e, t = np.nonzero(valid)
+        obs = {lag: trials.obs[b, e, t - lag].astype(float) for lag in range(-1, most + 1)} if length > most else {}
+        return Window(obs, _one_hot(trials.action[b, e, t].astype(float), trials.actions), b)
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    def unexplained(self, lags: Sequence[int]) -> float:
+        """The share of the variance of actions that observations at these lags leave."""
+        return unexplained(self.action, np.concatenate([features(self.obs[lag]) for lag in lags], 1), self.trial)
+
+
+def lasting(trials: Trials, steps: Steps) -> tuple[float, float, float] | None:
+    """What a trial's own fit by observations leaves of its actions: correlation from step to step, share of variance.
+
+    The third is the correlation with what is left at the most alike observation of another time: of a poor fit it is
+    high, of noise low. None where trials are too short for fits of their own, which take a latent out.
+    """
+    action = _one_hot(steps.action, trials.actions)
+    inputs = _standard(steps.obs)
+    rest = action - smooth(inputs.clip(-CLIP, CLIP), action)
+    for x in (features(steps.obs), inputs):
+        left, own = residual(rest, x, steps.trial)
+        if own:
+            break
+    else:
+        return None
+    grid = np.zeros((*trials.mask.shape, left.shape[1]))
+    grid[trials.mask] = left
+    both = trials.mask[:, :, 1:] & trials.mask[:, :, :-1]
+    pairs: tuple[list[Array], list[Array]] = [], []
+    for rows in _by_trial(steps.trial)[:ALIKE]:
+        distance = np.square(inputs[rows][:, None] - inputs[rows]).sum(-1)
+        near = np.abs(np.subtract.outer(np.arange(len(rows)), np.arange(len(rows)))) < APART
+        nearest = np.where(near, np.inf, distance).argmin(1)
+        pairs[0].append(left[rows])
+        pairs[1].append(left[rows[nearest]])
+    share = float((left**2).sum() / max(action.var(0).sum(), 1e-12) / len(left))
+    alike = _correlation(np.concatenate(pairs[0]), np.concatenate(pairs[1]))
+    return _correlation(grid[:, :, :-1][both], grid[:, :, 1:][both]), share, alike
+
+
+def _correlation(x: Array, y: Array) -> float:
+    return float((x * y).sum()) / max(float((x**2).sum() * (y**2).sum()) ** 0.5, 1e-12)
+
+
+def own_dynamics(trials: Trials, steps: Steps) -> tuple[float, int] | None:
+    """How alike two halves of a trial are in what a fit of all trials leaves of the motion, and the column of it.
+
+    Half the episodes each, or of one episode half the steps. What is left, and its products with observations and
+    actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest, or 0
+    if that is chance. None for too little data. Columns that observation and action decide are left out.
+    """
+    count = len(trials)
+    if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
+        return None
+    action = _one_hot(steps.action, trials.actions)
+    change, inputs = steps.then - steps.obs, _standard(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
+    left = change - smooth(inputs, change)
+    unit = 1.48 * np.median(np.abs(left), 0)
+    kept = np.flatnonzero(unit > 1e-4 * np.maximum(change.std(0), 1e-9))
+    _, episode, step = np.nonzero(trials.mask)
+    second = episode % 2 if trials.mask.shape[1] > 1 else step >= trials.mask.sum((1, 2))[steps.trial] / 2
+    group = 2 * steps.trial + second
+    both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
+    if not len(kept) or both.sum() < 16:
+        return None
+    best, tests = (0.0, 0), len(kept) * (1 + inputs.shape[1])
+    for k in kept:
+        rest = (left[:, k] / unit[k]).clip(-CLIP, CLIP)
+        for x in (np.ones(len(rest)), *inputs.T):
+            power = np.maximum(by_trial(x**2, group, 2 * count), 1e-9)
+            halves = (by_trial(x * rest, group, 2 * count) / power).reshape(count, 2)[both]
+            alike = float(np.corrcoef(*halves.argsort(0).argsort(0).T).min())
+            certain = statistics.NormalDist().inv_cdf(1 - CHANCE / tests)
+            if alike > max(best[0], certain / len(halves) ** 0.5):
+                best = alike, int(k)
+    return best
+
+
+def smooth(x: Array, y: Array) -> Array:
+    """A smooth function of standardised x [N, F], fitted to y [N, K] in all trials: ridge on random features."""
+    rng = np.random.default_rng(0)
+    weight = rng.standard_normal((x.shape[1], HIDDEN)) * rng.choice([0.3, 1.0], HIDDEN) / x.shape[1] ** 0.25
+    hidden = np.tanh(x @ weight + rng.uniform(-2, 2, HIDDEN))
+    basis = np.concatenate([np.ones((len(x), 1)), x, x**2, hidden], 1)
+    return basis @ _solved(basis, y, 1e-4)
+
+
+def _solved(x: Array, y: Array, ridge: float = 1e-9) -> Array:
+    """Coefficients [F, K] of a linear fit of y [N, K] by x [N, F]."""
+    return np.asarray(np.linalg.solve(x.T @ x + ridge * len(x) * np.eye(x.shape[1]), x.T @ y), float)
+
+
+def _by_trial(trial: Numbers) -> list[Numbers]:
+    """Rows of each trial, in their order."""
+    order = np.argsort(trial, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(trial[order])) + 1)

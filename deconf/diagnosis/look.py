@@ -1,0 +1,290 @@
+"""A first look at logs, before any diagnosis: what is in them, and what would mislead it, in plain words."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded.deconf.diagnosis import fits
+from deconfounded.deconf.diagnosis.fits import Steps
+from deconfounded.experts.datasets.logs import Log
+from deconfounded.experts.rollout import Trials
+
+Array = NDArray[np.float64]
+LISTED = 8  # columns, trials, that are named
+OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials
+MOST = 50_000  # steps that are fitted
+FEW = 8  # values of a column that does not move, but jumps
+STILL, PAUSE = 0.02, 5  # of the motion's 90th percentile; steps
+LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing follows
+BETTER = 0.95  # of the variance that another row leaves
+REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
+ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
+HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
+
+
+class Remark(NamedTuple):
+    """A sentence or two. kind: what it is about; odd: whether it may mislead a diagnosis, and should be mended."""
+
+    kind: str
+    text: str
+    odd: bool = False
+
+    def __str__(self) -> str:
+        return f"{'!' if self.odd else '-'} {self.text}"
+
+
+def look(given: Trials, blind: bool = False) -> list[Remark]:
+    """Remarks on trials, those of a log by the names of its columns; what is odd comes last.
+
+    blind: they are of exploration, of which it does not matter how its actions are chosen.
+    """
+    log = given if isinstance(given, Log) else Log.of(given, "Trials")
+    steps, part = Steps.of(log), given
+    if (total := len(steps.trial)) > MOST:  # evenly spaced trials, for what is fitted
+        index = np.linspace(0, len(log) - 1, max(8, int(len(log) * MOST / total))).astype(int)
+        part = Trials(log.obs[index], log.action[index], log.mask[index], log.actions)
+    fitted = Steps.of(part)
+    remarks = [Remark("size", note) for note in log.notes]
+    for describe in (_ranges, _outliers, _duplicates, _pauses, _states, _tails, *[_repeats] * (not blind)):
+        remarks += describe(log, steps)
+    if not blind:
+        remarks += [*_lag(part), *_lasting(part, fitted)]
+    remarks += _dynamics(part, fitted, log.units.obs, blind)
+    return sorted(remarks, key=lambda remark: remark.odd)
+
+
+def _list(names: list[str]) -> str:
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return ", ".join(names[:LISTED]) + more
+
+
+def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
+    low, middle, high = np.quantile(steps.obs, [0, 0.5, 1], 0)
+    columns = zip(log.units.obs, low, middle, high, strict=True)
+    said = [f"{name} {a:.4g} to {c:.4g} (median {b:.4g})" for name, a, b, c in columns]
+    yield Remark("range", f"Observations: {_list(said)}.")
+    if log.actions:
+        counts = np.bincount(steps.action[:, 0].astype(int), minlength=log.actions) / len(steps.action)
+        named = [f"{name} {share:.0%}" for name, share in zip(log.units.values, counts, strict=True)]
+        yield Remark("range", f"Actions used: {_list(named)}.")
+        return
+    raw = log.units.unscaled(steps.action)
+    said = []
+    for name, column, scaled in zip(log.units.action, raw.T, steps.action.T, strict=True):
+        a, b = np.quantile(column, [0.01, 0.99])
+        said.append(f"{name} {a:.4g} to {b:.4g} ({(np.abs(scaled) > 0.999).mean():.0%} at an end of the range)")
+    yield Remark("range", f"Actions used, but for 1% at each side: {_list(said)}.")
+
+
+def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Trials whose medians, spreads or lengths are far from those of the others."""
+    count = len(log)
+    if count < 8:
+        return
+    per_episode = log.mask.sum(2).sum(1) / np.maximum(log.mask.any(2).sum(1), 1)
+    names, features = ["length of episodes"], [per_episode.astype(float)]
+    least = [0.1 * float(per_episode.mean())]
+    rows = [np.flatnonzero(steps.trial == i) for i in range(count)]
+    columns = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
+    for name, column in columns:
+        quartiles = np.array([np.quantile(column[index], [0.25, 0.5, 0.75]) for index in rows])
+        names += [f"median of {name}", f"interquartile range of {name}"]
+        features += [quartiles[:, 1], quartiles[:, 2] - quartiles[:, 0]]
+        least += [0.05 * float(column.std())] * 2
+    table = np.stack(features, 1)
+    centre = np.median(table, 0)
+    unit = 1.48 * np.median(np.abs(table - centre), 0)
+    low, high = np.quantile(table, [0.05, 0.95], 0)
+    far = np.abs(table - centre) / np.maximum(np.maximum(unit, 0.1 * (high - low)), np.maximum(least, 1e-9))
+    far *= (far > OUTLYING).sum(0) <= max(2, SEVERAL * count)  # more of them are of another kind
+    worst = far.max(1)
+    for i in [i for i in np.argsort(-worst) if worst[i] > OUTLYING][:LISTED]:
+        j = int(far[i].argmax())
+        text = (
+            f"Trial {log.names[i]} is unlike the others: its {names[j]} is {table[i, j]:.4g}, and {centre[j]:.4g} is"
+            f" usual ({worst[i]:.0f} times the usual deviation)."
+        )
+        yield Remark("outlier", text, True)
+
+
+def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Trials and episodes that repeat others."""
+    whole, acted, episodes = fits.copies(log)
+    for kind, groups in (("", whole), (" in its actions", [group for group in acted if group not in whole])):
+        if groups:
+            named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
+            again = sum(len(group) - 1 for group in groups)
+            text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {_list(named)}."
+            yield Remark("duplicate", f"{text} Where one is held out, its copy betrays it; keep one of each.", True)
+    if repeated := [group for group in episodes if group not in whole]:
+        names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
+        again = sum(len(group) - 1 for group in repeated)
+        yield Remark("duplicate", f"{again} episodes repeat others, in trials {_list(names)}.", True)
+
+
+def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Stretches in which nothing moves, at the start of episodes and later."""
+    moving = [i for i, x in enumerate(steps.obs.T) if len(np.unique(x[: 1 << 16])) > FEW]
+    if not moving:
+        return
+    change = np.abs(np.diff(log.obs[..., moving].astype(float), axis=2))
+    spread = np.sqrt((change[log.mask] ** 2).mean(0))
+    motion = (change / np.where(spread > 0, spread, np.inf)).max(-1)
+    usual = np.quantile(motion[log.mask], 0.9)
+    still = (motion <= STILL * usual) & log.mask
+    if usual == 0:
+        yield Remark("pause", "No observation ever changes within an episode.", True)
+        return
+    at_start, later, longest, where = 0, 0, 0, (0, 0)
+    for b, e in np.argwhere(log.mask.any(2)):
+        row = np.concatenate([[False], still[b, e], [False]]).astype(int)
+        begins, ends = np.flatnonzero(np.diff(row) == 1), np.flatnonzero(np.diff(row) == -1)
+        long = ends - begins >= PAUSE
+        at_start += bool(long.any() and begins[long][0] == 0)
+        later += int((begins[long] > 0).sum())
+        if long.any() and (length := int((ends - begins)[long].max())) > longest:
+            longest, where = length, (b, e)
+    if at_start or later:
+        count = int(log.mask.any(2).sum())
+        text = (
+            f"Nothing moves for {PAUSE} steps or more at the start of {at_start:,} of {count:,} episodes, and {later:,}"
+            f" times later; the longest is {longest} steps, in episode {where[1]} of trial {log.names[where[0]]}. In"
+            f" all {still[log.mask].mean():.0%} of steps are at rest. A clone learns to rest, and when to go on is"
+            " nothing that the present observation shows. Cut pauses out, unless waiting is part of the task."
+        )
+        yield Remark("pause", text, at_start + later > 0.02 * count)
+
+
+def _lag(trials: Trials) -> Iterator[Remark]:
+    """The lag at which actions match observations, and the motion that follows, best."""
+    window = fits.Window.of(trials, LATEST + 2)
+    if len(window) < 200 or not window.action.std():
+        return
+    left = [window.unexplained([lag]) for lag in range(-1, LATEST + 1)]
+    lag = int(np.argmin(left)) - 1
+    if not 0 < lag < LATEST or left[lag + 1] > BETTER * left[1]:
+        if lag <= 0 and left[1] < BETTER:
+            yield Remark(
+                "lag",
+                "No earlier observation matches actions better than that of their own row: they are not logged late.",
+            )
+        return
+    motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
+    rows = f"{lag} row{'s' * (lag > 1)}"
+    text = (
+        f"Actions match the observation {rows} before theirs best ({1 - left[lag + 1]:.0%} of their variance, and"
+        f" {1 - left[1]:.0%} by that of their own row)"
+    )
+    if motion[1] > motion[0] + 0.02:
+        text += f", and the motion that follows it: they are probably logged late. Move actions up by {rows}."
+    elif motion[0] > motion[1] + 0.02:
+        text += ", and move what follows their own: a reaction time. An expert that answers late is one with a memory."
+    else:
+        text += ": a reaction time, or logged late."
+    yield Remark("late", text, True)
+
+
+def _states(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Actions that are an observation: of the next row, or of their own."""
+    if log.actions:
+        return
+    raw, spread = log.units.unscaled(steps.action), steps.obs.std(0)
+    for name, action in zip(log.units.action, raw.T, strict=True):
+        errors = [
+            np.sqrt(((x - action[:, None]) ** 2).mean(0)) / np.maximum(spread, 1e-9) for x in (steps.obs, steps.then)
+        ]
+        present, then = (float(error.min()) for error in errors)
+        if action.std() > 0 and min(present, then) < 0.05:
+            which = "the next" if then < present else "the present"
+            column = log.units.obs[int(errors[then < present].argmin())]
+            text = f"The action {name} is {which} {column}, to {min(present, then):.1%} of its spread: "
+            if then < present:
+                text += "the log has no commands, or a controller that follows them at once; the dynamics tell nothing."
+            else:
+                text += "the log has no commands, but what was reached."
+            yield Remark("state", text, True)
+
+
+def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
+    """How well the last action, and a mean action, predict the next one."""
+    mask = log.mask[:, :, 1:]
+    if not mask.any():
+        return
+    now, last = (log.action[:, :, part][mask].astype(float) for part in (slice(1, None), slice(-1)))
+    trial = np.nonzero(mask)[0]
+    if log.actions:
+        most = np.bincount(now[:, 0].astype(int)).max() / len(now)
+        repeat = float((now == last).mean())
+        text = f"The most frequent action is right in {most:.0%} of steps, the last action in {repeat:.0%}."
+    else:
+        total = max(float(now.var(0).sum()), 1e-12)
+        repeat = 1 - float(((now - last) ** 2).mean(0).sum()) / total
+        own = np.stack([fits.by_trial(x, trial, len(log))[trial] for x in now.T], 1)
+        mean = 1 - float(((now - own) ** 2).mean(0).sum()) / total
+        linear = 1 - (1 - mean) * min(1.0, fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial))
+        text = (
+            f"Always the mean action errs by {np.sqrt(total):.2g} (rms, of ranges -1 to 1). Of that variance, repeating"
+            f" the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear function of"
+            f" the observation in each trial {linear:.0%}."
+        )
+    high = repeat > REPEATED
+    text += " A clone can score well by repeating itself; errors of its actions say little." * high
+    yield Remark("repeat", text, high)
+
+
+def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
+    """Whether what observations leave open of the action lasts from step to step, within a trial."""
+    measured = fits.lasting(trials, steps)
+    if measured is None:
+        return
+    correlation, share, alike = measured
+    if correlation > LASTING and share > 0.02 and alike < ALIKE * correlation:
+        half = np.log(0.5) / np.log(min(correlation, 0.999))
+        text = (
+            f"What the observation leaves open of the action in a trial ({share:.0%} of the variance) lasts: its"
+            f" correlation from step to step is {correlation:.2f}, so that it halves in {half:.0f} steps. Noise that"
+            " lasts, AR(1), or the expert's own memory looks like something hidden, and is not in the world."
+        )
+        yield Remark("lasting", text, True)
+
+
+def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Columns with heavy tails, and what mends them."""
+    columns = list(zip(log.units.obs, steps.obs.T, strict=True))
+    if not log.actions:
+        columns += list(zip(log.units.action, log.units.unscaled(steps.action).T, strict=True))
+    for name, x in columns:
+        if (heavy := fits.kurtosis(x)) < HEAVY:
+            continue
+        how, left = fits.mended(name, x)
+        low, high = np.quantile(x, [0.005, 0.995])
+        text = (
+            f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all within {x.min():.4g} and"
+            f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left:.1f})."
+        )
+        yield Remark("tails", text, True)
+
+
+def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
+    """Whether trials differ in their dynamics."""
+    measured = fits.own_dynamics(trials, steps)
+    if measured is None:
+        text = "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
+    elif measured[0]:
+        text = (
+            f"Trials differ in their dynamics: what one half of a trial does to {names[measured[1]]}, beyond a"
+            f" fit of all trials, the other does too (rank correlation {measured[0]:.2f})."
+        )
+    elif blind:
+        text = (
+            "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
+            " what its actions do."
+        )
+    else:
+        text = (
+            "No difference in dynamics is seen between trials. An expert's actions, which make up for it, can hide it;"
+            " exploration would show it."
+        )
+    yield Remark("dynamics", text, blind and measured is not None and not measured[0])

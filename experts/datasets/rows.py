@@ -1,0 +1,224 @@
+"""Episodes of a table: which rows they are, and what is wrong with them, in one line each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from deconfounded.envs.support.errors import InputError
+from deconfounded.experts.datasets.table import EMPTY, Column, Table
+
+CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
+GAP = 1.5  # times the usual time between rows
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Names of columns, or patterns of them: what a trial and an episode is; what is observed, what is done."""
+
+    trial: str | None = None
+    episode: str | None = None
+    obs: Sequence[str] = ()
+    action: Sequence[str] = ()
+
+
+class Episode(NamedTuple):
+    """Observations [n + 1, O] and actions [n, A] of an episode; actions are as in the log. trial: its trial's name."""
+
+    trial: str
+    obs: NDArray[np.float64]
+    action: NDArray[Any]
+
+
+class Episodes(NamedTuple):
+    """Episodes of a table, names of observations and actions, and notes on what is odd."""
+
+    episodes: list[Episode]
+    obs: tuple[str, ...]
+    action: tuple[str, ...]
+    notes: list[str]
+
+
+def episodes_of(table: Table, roles: Roles) -> Episodes:
+    """Episodes by the table's boundaries, or by columns. Raises InputError for what cannot be trials."""
+    for what, given, default in (("obs", roles.obs, table.obs), ("action", roles.action, table.action)):
+        if not given and not default:
+            raise InputError(f"{table.where} does not say what is {what}; give --{what}, of {', '.join(table.columns)}")
+    if roles.episode is None and roles.trial is None and table.boundaries is None:
+        raise InputError(
+            f"{table.where} does not say where an episode begins; give --episode or --trial, of"
+            f" {', '.join(table.columns)}"
+        )
+    names = table.select("obs", roles.obs) or table.obs, table.select("action", roles.action) or table.action
+    action_names = names[1]
+    groups = [None if name is None else table.select(what, [name])[0] for what, name in _groups(table, roles)]
+    obs_names = tuple(name for name in names[0] if name not in action_names and name not in groups)
+    if not obs_names:
+        raise InputError(f"obs of {table.where} are none beside the trial, the episode and the action")
+    trial, labels = (None if name is None else table.columns[name] for name in groups)
+    first = _starts(table, groups, [column for column in (trial, labels) if column is not None], roles)
+    obs = np.stack([_numbers(table, name) for name in obs_names], 1)
+    action, empty = _actions(table, action_names)
+    bounds = list(zip(first, [*first[1:], len(table)], strict=True))
+    late = sum(bool(empty[a].any() and not empty[b - 1].any()) for a, b in bounds if b - a > 1)
+    if 2 * late > len(bounds):
+        raise InputError(
+            f"the action is empty in the first row of {late} episodes of {table.where}: it seems to stand beside the"
+            " observation it led to; move it up by a row, to the observation it was chosen on"
+        )
+    episodes, single, lost = list[Episode](), 0, 0
+    for number, (a, b) in enumerate(bounds):
+        while b > a and np.isnan(obs[b - 1]).all():  # the observation after the last action is missing
+            b -= 1
+        if b - a < 2:
+            single += 1
+            continue
+        _check(table, obs_names, np.isnan(obs[a:b]), a, "holds no number")
+        _check(table, action_names, empty[a : b - 1], a, "is empty")
+        lost += not empty[b - 1].any()
+        episodes.append(Episode(str(number) if trial is None else _text(trial[a]), obs[a:b], action[a : b - 1]))
+    if not episodes:
+        raise InputError(f"{table.where} holds no episode of two rows or more")
+    notes = [*table.notes, *_notes(table, first, obs_names, action_names, single, lost)]
+    if trial is None:
+        shared = [
+            name for name in table.columns if name not in (*obs_names, *action_names) and _repeats(table, name, first)
+        ]
+        hint = f" ({', '.join(shared[:5])} might say: --trial)" if shared else ""
+        notes.append(f"No column says what a trial is: every episode counts as a trial of its own{hint}.")
+    return Episodes(episodes, obs_names, action_names, notes)
+
+
+def _actions(table: Table, names: tuple[str, ...]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Actions [N, A], numbers or, of one column alone, texts; and which of them are empty."""
+    column = table.columns[names[0]]
+    if len(names) > 1 or column.dtype != object:
+        action = np.stack([_numbers(table, name) for name in names], 1)
+        return action, np.isnan(action)
+    cells = [str(cell).strip() for cell in column]
+    empty = np.array([cell.lower() in EMPTY for cell in cells])
+    if any(_is_number(cell) for cell, missing in zip(cells, empty, strict=True) if not missing):
+        _numbers(table, names[0])  # which names the text among them
+    return np.array(cells, object)[:, None], empty[:, None]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _groups(table: Table, roles: Roles) -> list[tuple[str, str | None]]:
+    return [("trial", roles.trial or (None if roles.episode else table.trial)), ("episode", roles.episode)]
+
+
+def _text(value: Any) -> str:
+    """A trial's name; whole numbers without a point."""
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _starts(table: Table, names: list[str | None], columns: list[Column], roles: Roles) -> list[int]:
+    """The first row of each episode. Raises InputError for rows of one episode that stand apart."""
+    used = [name for name in names if name is not None]
+    for name, column in zip(used, columns, strict=True):
+        _check(table, [name], (column == "" if column.dtype == object else np.isnan(column))[:, None], 0, "is empty")
+    own = table.boundaries is not None and roles.episode is None
+    grouping = [table.boundaries] if own else columns
+    keys = [np.unique(column, return_inverse=True)[1] for column in grouping if column is not None]
+    changes = np.any([np.diff(key) != 0 for key in keys], 0)
+    first = [0, *(1 + np.flatnonzero(changes)).tolist()]
+    if own:
+        for name, column in zip(used, columns, strict=True):
+            inside = (column[1:] != column[:-1]) & ~changes
+            if inside.any():
+                row = int(np.flatnonzero(inside)[0]) + 2
+                raise InputError(f"{name!r} of {table.where} changes within an episode, in row {row}; a trial is whole")
+        return first
+    seen: dict[tuple[int, ...], int] = {}
+    for row in first:
+        key = tuple(int(k[row]) for k in keys)
+        if key in seen:
+            what = ", ".join(f"{name} {_text(column[row])}" for name, column in zip(used, columns, strict=True))
+            raise InputError(
+                f"rows of {what} stand apart in {table.where}, from row {seen[key] + 1} and again from row {row + 1};"
+                f" sort it by {', '.join(used)} and time{'' if roles.episode else ', or give --episode'}"
+            )
+        seen[key] = row
+    return first
+
+
+def _numbers(table: Table, name: str) -> NDArray[np.float64]:
+    column = table.columns[name]
+    if column.dtype != object:
+        return column
+    numbers = np.full(len(column), np.nan)
+    for i, cell in enumerate(column):
+        try:
+            numbers[i] = np.nan if str(cell).strip().lower() in EMPTY else float(cell)
+        except ValueError:
+            raise InputError(f"{name!r} of {table.where} is {cell!r} in row {i + 1}; it must be a number") from None
+    return numbers
+
+
+def _check(table: Table, names: Sequence[str], bad: NDArray[np.bool_], offset: int, what: str) -> None:
+    if bad.any():
+        row, column = np.argwhere(bad)[0]
+        raise InputError(f"{names[column]!r} of {table.where} {what} in row {offset + row + 1}")
+
+
+def _repeats(table: Table, name: str, first: list[int]) -> bool:
+    """Whether a column is constant in episodes, and the same in several, but not in all."""
+    column = table.columns[name]
+    if name.lower() in CLOCKS or not 1 < len(first) < len(column):
+        return False
+    inside = np.ones(len(column) - 1, bool)
+    inside[np.array(first[1:]) - 1] = False
+    return bool((column[1:] == column[:-1])[inside].all()) and 1 < len({*column[first].tolist()}) < len(first)
+
+
+def _notes(
+    table: Table, first: list[int], obs: Sequence[str], action: Sequence[str], single: int, lost: int
+) -> list[str]:
+    """What is odd, but can be worked with."""
+    notes = []
+    if single:
+        notes.append(f"{single} episodes of one row, without a step, are left out.")
+    if lost:
+        notes.append(f"In {lost} episodes the last action has no next observation; it is dropped.")
+    constant = [name for name in (*obs, *action) if _constant(table.columns[name])]
+    if constant:
+        notes.append(f"Constant: {', '.join(constant)}.")
+    inside = np.ones(len(table) - 1, bool)
+    inside[np.array(first[1:], int) - 1] = False
+    rows = np.stack([table.columns[name] for name in (*obs, *action)], 1)
+    same = (rows[1:] == rows[:-1]).all(1) & inside
+    clock = next((name for name in table.columns if name.lower() in CLOCKS and name not in (*obs, *action)), None)
+    if clock is not None and table.columns[clock].dtype != object:
+        notes += _of_time(table, clock, np.diff(table.columns[clock]), inside)
+    elif same.any():
+        notes.append(f"{same.sum():,} rows repeat the row before them (the first: row {np.flatnonzero(same)[0] + 2}).")
+    return notes
+
+
+def _constant(column: Column) -> bool:
+    held = column[column != ""] if column.dtype == object else column[~np.isnan(column)]
+    return bool((held == held[:1]).all())
+
+
+def _of_time(table: Table, clock: str, passed: NDArray[np.float64], inside: NDArray[np.bool_]) -> list[str]:
+    """Gaps, rows of the same time, and time that runs backwards, by a column of time."""
+    usual = float(np.median(passed[inside])) if inside.any() else 0.0
+    kinds = {
+        f"{{}} gaps: more than {GAP:g} times the usual {usual:.4g} of {clock} passes": passed > GAP * usual,
+        f"{{}} rows have the {clock} of the row before them: duplicates?": passed == 0,
+        f"{clock} runs backwards {{}} times": passed < 0,
+    }
+    notes = []
+    for text, where in kinds.items():
+        if usual > 0 and (rows := np.flatnonzero(where & inside)).size:
+            notes.append(f"{text.format(f'{len(rows):,}')} (the first: row {rows[0] + 2} of {table.where}).")
+    return notes

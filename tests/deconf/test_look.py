@@ -1,0 +1,304 @@
+"""A first look names what would mislead a diagnosis, and nothing in data that are as they should be."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import diagnose as command
+from deconfounded.benchmarks import look as look_command
+from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.output.diagnosis import WRITTEN
+from deconfounded.deconf.diagnosis import diagnose
+from deconfounded.deconf.diagnosis.look import Remark, look
+from deconfounded.deconf.methods import deconfounded, naive_rnn
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.experts import datasets, policy
+from deconfounded.experts.datasets import Log
+from deconfounded.experts.datasets.units import Units
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
+from tests.deconf.test_diagnose import _tiny_init
+
+B, E, T = 48, 2, 60
+
+
+def driven(lasting: float = 0.0, noise: float = 0.1, reaction: int = 0, same: bool = False, goals: float = 0) -> Trials:
+    """A cart in a hidden wind, which its driver feels.
+
+    lasting: correlation of the driver's noise from step to step. reaction: steps by which the driver answers late.
+    same: one wind for all trials. goals: how far apart the drivers' goals are.
+    """
+    rng, goal = np.random.default_rng(0), goals * np.linspace(-1, 1, B)
+    wind = 0 * rng.uniform(-1, 1, B) + 0.5 if same else rng.uniform(-1, 1, B)
+    obs, action = np.zeros((B, E, T + 1, 2)), np.zeros((B, E, T, 1))
+    for e in range(E):
+        x, v, shaken = rng.uniform(-1, 1, B), rng.uniform(-1, 1, B), np.zeros(B)
+        obs[:, e, 0] = np.stack([x, v], 1)
+        for t in range(T):
+            shaken = lasting * shaken + np.sqrt(1 - lasting**2) * noise * rng.standard_normal(B)
+            seen = obs[:, e, max(0, t - reaction)]
+            action[:, e, t, 0] = (0.5 * (goal - seen[:, 0]) - 0.5 * seen[:, 1] - 0.3 * wind + shaken).clip(-1, 1)
+            v = v + 0.2 * action[:, e, t, 0] + 0.06 * wind + 0.05 * rng.standard_normal(B)
+            x = x + 0.2 * v + 0.02 * rng.standard_normal(B)
+            obs[:, e, t + 1] = np.stack([x, v], 1)
+    return Trials(obs, action, np.ones((B, E, T), bool))
+
+
+def changed(trials: Trials, **arrays: Any) -> Trials:
+    return Trials(**{"obs": trials.obs, "action": trials.action, "mask": trials.mask, "actions": 0} | arrays)
+
+
+def odd(remarks: list[Remark]) -> list[str]:
+    return [remark.kind for remark in remarks if remark.odd]
+
+
+def said(remarks: list[Remark], kind: str) -> str:
+    return " ".join(remark.text for remark in remarks if remark.kind == kind)
+
+
+def late(trials: Trials) -> Trials:
+    action = np.concatenate([0 * trials.action[:, :, :1], trials.action[:, :, :-1]], 2)
+    return changed(trials, action=action)
+
+
+def with_pauses(trials: Trials) -> Trials:
+    """Each episode begins with 8 steps at rest; some rest later too, where a sensor's noise goes on."""
+    obs, action = trials.obs.copy(), trials.action.copy()
+    obs[:, :, :9], action[:, :, :8] = obs[:, :, 8:9], 0
+    obs[::2, 0, 30:38] = obs[::2, 0, 30:31]
+    obs[..., 0] += 1e-4 * np.random.default_rng(0).standard_normal(obs.shape[:-1])
+    return changed(trials, obs=obs, action=action)
+
+
+def with_copies(trials: Trials) -> Trials:
+    obs, action = trials.obs.copy(), trials.action.copy()
+    obs[7], action[7] = obs[3], action[3]
+    return changed(trials, obs=obs, action=action)
+
+
+def with_replays(trials: Trials) -> Trials:
+    action = trials.action.copy()
+    action[7] = action[3]
+    return changed(trials, action=action)
+
+
+def with_an_episode_twice(trials: Trials) -> Trials:
+    obs, action = trials.obs.copy(), trials.action.copy()
+    obs[9, 1], action[9, 1] = obs[3, 0], action[3, 0]
+    return changed(trials, obs=obs, action=action)
+
+
+def with_an_outlier(trials: Trials) -> Trials:
+    obs = trials.obs.copy()
+    obs[5, ..., 0] += 5
+    return changed(trials, obs=obs)
+
+
+def with_heavy_tails(trials: Trials) -> Trials:
+    wild = np.random.default_rng(0).standard_t(1.5, (*trials.obs.shape[:-1], 1))
+    return changed(trials, obs=np.concatenate([trials.obs, wild], -1))
+
+
+def with_the_next_state(trials: Trials) -> Trials:
+    action = trials.obs[:, :, 1:, :1].astype(float)
+    log = Log.of(changed(trials, action=action / 20))
+    return replace(log, units=replace(log.units, low=(-20.0,), high=(20.0,)))
+
+
+def with_the_present_state(trials: Trials) -> Trials:
+    log = Log.of(changed(trials, action=trials.obs[:, :, :-1, :1].astype(float) / 20))
+    return replace(log, units=replace(log.units, low=(-20.0,), high=(20.0,)))
+
+
+PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a kind, and words of it
+    "nothing": (driven, set(), "lag", "No earlier observation matches actions better"),
+    "late": (lambda: late(driven()), {"late"}, "late", "they are probably logged late. Move actions up by 1 row."),
+    "two late": (lambda: late(late(driven())), {"late"}, "late", "they are probably logged late. Move actions up by 2"),
+    "reaction": (lambda: driven(reaction=2), {"late"}, "late", "move what follows their own: a reaction time."),
+    "pauses": (
+        lambda: with_pauses(driven()),
+        {"pause"},
+        "pause",
+        "at the start of 96 of 96 episodes, and 24 times later",
+    ),
+    "AR(1)": (lambda: driven(0.95, 0.3), {"lasting"}, "lasting", "Noise that lasts, AR(1), or the expert's own memory"),
+    "copies": (lambda: with_copies(driven()), {"duplicate"}, "duplicate", "1 of 48 trials repeats another: 3 = 7."),
+    "replays": (lambda: with_replays(driven()), {"duplicate"}, "duplicate", "another in its actions: 3 = 7."),
+    "episode": (
+        lambda: with_an_episode_twice(driven()),
+        {"duplicate"},
+        "duplicate",
+        "1 episodes repeat others, in trials 3, 9",
+    ),
+    "outlier": (
+        lambda: with_an_outlier(driven()),
+        {"outlier"},
+        "outlier",
+        "Trial 5 is unlike the others: its median of obs",
+    ),
+    "tails": (lambda: with_heavy_tails(driven()), {"tails"}, "tails", "arcsinh((observation 2 - "),
+    "next": (lambda: with_the_next_state(driven()), {"state"}, "state", "action 0 is the next observation 0, to 0.0%"),
+    "present": (lambda: with_the_present_state(driven()), {"state"}, "state", "action 0 is the present observation 0"),
+}
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_what_is_planted_is_named(case: str) -> None:
+    """And nothing else is, but that actions which are states, or paused, repeat themselves."""
+    made, kinds, kind, words = PLANTED[case]
+    remarks = look(made())
+    assert set(odd(remarks)) - {"repeat"} == kinds
+    assert words in said(remarks, kind)
+    assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
+
+
+def test_how_far_simple_guesses_get() -> None:
+    """By hand: of slow noise, nearly all by repeating; of a constant for each trial, all by its mean."""
+    rng = np.random.default_rng(0)
+    trials = driven()
+    own = np.broadcast_to(rng.uniform(-1, 1, (B, 1, 1, 1)), trials.action.shape)
+    text = said(look(changed(trials, action=own)), "repeat")
+    assert f"errs by {own.std():.2g} (rms" in text
+    assert "repeating the last action predicts 100%, the mean action of each trial 100%" in text
+    white = rng.uniform(-1, 1, trials.action.shape)
+    text = said(look(changed(trials, action=white)), "repeat")
+    assert "predicts -10" in text or "predicts -9" in text
+    discrete = changed(trials, action=np.arange(T)[:, None] * np.ones(trials.action.shape) % 4 // 3, actions=2)
+    assert "is right in 75% of steps, the last action in 49%" in said(look(discrete), "repeat").replace("51%", "49%")
+
+
+@pytest.mark.parametrize(("name", "differ"), [("slippery_cartpole", True), ("hidden_goal", False), ("icy_stop", True)])
+def test_dynamics_of_exploration(name: str, differ: bool) -> None:
+    """Where theta is in the dynamics, and where it is not; and once episodes of all trials are shuffled."""
+    env = envs.BatchEnv(envs.get(name), 32)
+    trials = run_trials(env, RandomAgent(env.task.action_space), 4, 3).trials
+    assert ("Trials differ in their dynamics" in said(look(trials, blind=True), "dynamics")) is differ
+    assert ("dynamics" in odd(look(trials, blind=True))) is not differ
+    order = np.random.default_rng(0).permutation(32 * 4)
+    obs, action, mask = (
+        x.reshape(-1, *x.shape[2:])[order].reshape(x.shape) for x in (trials.obs, trials.action, trials.mask)
+    )
+    assert "Trials do not differ" in said(look(Trials(obs, action, mask), blind=True), "dynamics")
+
+
+def test_dynamics_of_an_expert() -> None:
+    assert "Trials differ in their dynamics" in said(look(driven()), "dynamics")
+    assert "No difference in dynamics is seen" in said(look(driven(same=True)), "dynamics")
+    assert "No difference in dynamics is seen" in said(look(driven(same=True, goals=1)), "dynamics")
+    few = driven()
+    few = Trials(few.obs[:9], few.action[:9], few.mask[:9])
+    assert "cannot be seen" in said(look(few), "dynamics")
+
+
+@pytest.mark.parametrize("name", ["bandit", "tilted_cartpole"])
+def test_our_own_tasks_are_not_late_or_noisy(name: str) -> None:
+    env = envs.BatchEnv(envs.get(name), 24)
+    remarks = look(run_trials(env, ExpertAgent(env, policy.load(env.task)), env.task.episodes, 5).trials)
+    assert not {"late", "lasting", "pause", "duplicate", "state"} & set(odd(remarks))
+
+
+def test_small_data() -> None:
+    """One trial of one step, and actions or observations that never change."""
+    look(Trials(np.zeros((1, 1, 2, 1)), np.zeros((1, 1, 1, 1)), np.ones((1, 1, 1), bool)))
+    still = changed(driven(), obs=np.zeros((B, E, T + 1, 2)))
+    assert not {"late", "tails"} & set(odd(look(still)))
+    look(changed(driven(), action=np.zeros((B, E, T, 1))))
+
+
+def write_csv(file: Path, trials: Trials, scale: float) -> None:
+    with file.open("w", newline="") as opened:
+        writer = csv.writer(opened)
+        writer.writerow(("vehicle", "lap", "speed_x", "speed_y", "throttle"))
+        for b in range(len(trials)):
+            for e in range(trials.mask.shape[1]):
+                for t in range(trials.mask.shape[2] + 1):
+                    done = scale * trials.action[b, e, t, 0] if t < trials.mask.shape[2] else ""
+                    writer.writerow((f"v{b}", e, *trials.obs[b, e, t], done))
+
+
+OPTIONS = ["--trial", "vehicle", "--episode", "lap", "--obs", "speed*", "--action", "throttle"]
+
+
+def test_from_csv_to_a_verdict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one command; a look comes first, in print, page and json; and the lines that it prints run as they stand."""
+    monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
+    judge = diagnose.judge
+    monkeypatch.setattr(diagnose, "judge", lambda refits: replace(judge(refits), next=diagnose.EXPLORE))
+    monkeypatch.chdir(tmp_path)
+    short = driven()
+    short = Trials(short.obs[:24, :, :9], short.action[:24, :, :8], short.mask[:24, :, :8])
+    write_csv(tmp_path / "logs.csv", short, 100)
+    write_csv(tmp_path / "explored.csv", short, 200)
+    given = ["--data", "logs.csv", "--explore", "explored.csv", *OPTIONS]
+    monkeypatch.setattr("sys.argv", ["look", *given])
+    look_command.main()
+    looked = capsys.readouterr().out.strip().splitlines()
+    monkeypatch.setattr("sys.argv", ["diagnose", *given, "--out", "out"])
+    command.main()
+    out = capsys.readouterr().out
+    assert out.splitlines()[: len(looked)] == looked
+    assert looked[0] == "- logs.csv: 24 trials of 2 episodes, each of 8 steps, 384 in all."
+    made = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
+    assert [f"{'!' if entry['odd'] else '-'} {entry['text']}" for entry in made["look"]] == looked
+    assert looked[0][2:] in (tmp_path / "out" / "index.html").read_text()
+    assert made["units"]["high"][0] == pytest.approx(200 * short.action.max())
+    code = made["next"]["code"]
+    assert code in out
+    held: dict[str, Any] = {}
+    config = deconfounded.DeconfoundedConfig(rounds=1, inference_updates=2, imitation_updates=2, final_updates=2)
+    monkeypatch.setattr(deconfounded, "DeconfoundedConfig", lambda: config)
+    exec(code, held)
+    assert held["trials"].sha256 == datasets.read_together(["logs.csv", "explored.csv"], **_roles())[0].sha256
+    assert type(held["agent"]).__name__ == "RawAgent"
+    assert (tmp_path / "agent" / "agent.json").is_file()
+
+
+@pytest.mark.parametrize("advice", [diagnose.CLONE, diagnose.EXPLORE_FIRST, diagnose.QUERY])
+def test_printed_lines_run(advice: diagnose.Next, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an .npz too; what only the user can write says so."""
+    from deconfounded.benchmarks.output.diagnosis import _code
+    from deconfounded.deconf.methods import deconfounded_offline
+
+    monkeypatch.chdir(tmp_path)
+    driven().save(tmp_path / "expert.npz")
+    units = {"obs": ("x", "v"), "action": ("a",), "low": (-1.0,), "high": (1.0,), "values": ()}
+    assert units == vars(Units(**units))
+    about = {"trials": {"from": "expert.npz"}, "explore": None, "columns": {}, "units": units}
+    monkeypatch.setattr(naive_rnn, "RecurrentConfig", lambda: RecurrentConfig(updates=1, batch=2))
+    few = OfflineConfig(offline_updates=1, online_updates=0, offline_batch=2)
+    monkeypatch.setattr(deconfounded_offline, "OfflineConfig", lambda: few)
+    code = _code(diagnose.Diagnosis("cannot tell", {}, (), None, advice), about)
+    if advice is diagnose.QUERY:
+        assert WRITTEN["query"] in code
+        with pytest.raises(NotImplementedError, match="ask the expert"):
+            exec(code, {})
+        return
+    exec(code, {})
+    assert (tmp_path / "agent" / "agent.json").is_file()
+
+
+def _roles() -> dict[str, Any]:
+    return {"trial": "vehicle", "episode": "lap", "obs": ["speed*"], "action": ["throttle"]}
+
+
+@pytest.mark.parametrize("module", [look_command, command])
+def test_bad_input_is_one_line(
+    module: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_csv(tmp_path / "logs.csv", driven(), 1)
+    options = [word.replace("throttle", "throtle") for word in OPTIONS]
+    monkeypatch.setattr("sys.argv", ["look", "--data", str(tmp_path / "logs.csv"), *options])
+    with pytest.raises(SystemExit) as ended:
+        run_command(module.main)
+    assert ended.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: action 'throtle' is no column of ")
+    assert error.endswith("; did you mean 'throttle'?\n")

@@ -1,0 +1,460 @@
+"""Logs as they come: files of each format, made by its own library, are the same Trials; bad ones are one line."""
+
+import csv
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import deconfounded
+from deconfounded import envs
+from deconfounded.deconf.methods import naive_rnn
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.experts import datasets
+from deconfounded.experts.datasets.units import RawAgent, Units
+from deconfounded.experts.rollout import Trials
+
+LENGTHS = {"a": (3, 5), "b": (4,), "c": (2, 3)}  # steps of each episode of each trial
+OWNERS = [name for name, lengths in LENGTHS.items() for _ in lengths]
+RNG = np.random.default_rng(0)
+OBS = [RNG.normal(size=(n + 1, 2)) for lengths in LENGTHS.values() for n in lengths]
+ACTIONS = [RNG.uniform(0, 100, (n, 1)) for lengths in LENGTHS.values() for n in lengths]
+AFTER = 40.0  # an action without a next observation
+
+
+def expected() -> Trials:
+    """By hand."""
+    obs, action, mask = np.zeros((3, 2, 6, 2)), np.zeros((3, 2, 5, 1)), np.zeros((3, 2, 5), bool)
+    low, high = np.concatenate(ACTIONS).min(), np.concatenate(ACTIONS).max()
+    for i, (b, e) in enumerate(((0, 0), (0, 1), (1, 0), (2, 0), (2, 1))):
+        n = len(ACTIONS[i])
+        obs[b, e, : n + 1], mask[b, e, :n] = OBS[i], True
+        action[b, e, :n] = 2 * (ACTIONS[i] - low) / (high - low) - 1
+    return Trials(obs, action, mask)
+
+
+def rows(last: Any = "", skip: tuple[int, ...] = ()) -> list[dict[str, Any]]:
+    """A row a step, and one of the last observation, with that action."""
+    made = []
+    for i, (obs, action) in enumerate(zip(OBS, ACTIONS, strict=True)):
+        for t, (x, v) in enumerate(obs.tolist()):
+            done = action[t, 0].item() if t < len(action) else last
+            made.append({"vehicle": OWNERS[i], "lap": i, "time": 0.1 * t, "speed x": x, "speed y": v, "throttle": done})
+    return [row for j, row in enumerate(made) if j not in skip]
+
+
+ROLES: dict[str, Any] = {"trial": "vehicle", "episode": "lap", "obs": ["speed*"], "action": ["throttle"]}
+
+
+def write_csv(file: Path, made: list[dict[str, Any]], separator: str = ",") -> Path:
+    with file.open("w", newline="") as opened:
+        writer = csv.DictWriter(opened, list(made[0]), delimiter=separator)
+        writer.writeheader()
+        writer.writerows(made)
+    return file
+
+
+def write_parquet(file: Path, columns: dict[str, Any]) -> Path:
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(pyarrow.table(columns), file)
+    return file
+
+
+def of_csv(folder: Path) -> datasets.Log:
+    return datasets.read(write_csv(folder / "logs.csv", rows()), **ROLES)
+
+
+def of_csv_with_last_actions(folder: Path) -> datasets.Log:
+    return datasets.read(str(write_csv(folder / "logs.csv", rows(AFTER), ";")), **ROLES)
+
+
+def of_csv_without_last_observations(folder: Path) -> datasets.Log:
+    empty = {"speed x": "", "speed y": "", "throttle": AFTER}
+    made = rows(AFTER)
+    later = [
+        {**row, **empty}
+        for row, then in zip(made, [*made[1:], {"lap": None}], strict=True)
+        if row["lap"] != then["lap"]
+    ]
+    return datasets.read(write_csv(folder / "logs.csv", sorted(made + later, key=lambda row: row["lap"])), **ROLES)
+
+
+def of_several_csv(folder: Path) -> datasets.Log:
+    cut = [row for row in rows() if row["lap"] < 3], [row for row in rows() if row["lap"] >= 3]
+    return datasets.read([write_csv(folder / f"{i}.csv", part) for i, part in enumerate(cut)], **ROLES)
+
+
+def of_parquet(folder: Path) -> datasets.Log:
+    made = rows(None)
+    columns = {key: [row[key] for row in made] for key in ("vehicle", "lap", "throttle")}
+    columns["speed"] = [[row["speed x"], row["speed y"]] for row in made]
+    return datasets.read(write_parquet(folder / "logs.parquet", columns), **{**ROLES, "obs": ["speed"]})
+
+
+def of_robomimic(folder: Path, later: bool = True) -> datasets.Log:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(folder / "demos.hdf5", "w") as file:
+        file.create_group("mask")["train"] = np.array([b"demo_0"])
+        for i, (obs, action) in enumerate(zip(OBS, ACTIONS, strict=True)):
+            demo = file.create_group(f"data/demo_{i + 8}")  # demo_10 comes after demo_9
+            demo.attrs["vehicle"], demo.attrs["model_file"] = OWNERS[i], "<mujoco/>" * 99
+            demo["actions"] = action if later else np.append(action, [[AFTER]], 0)
+            demo["obs/speed"] = obs[:-1] if later else obs
+            demo["obs/camera"] = np.zeros((len(demo["actions"]), 4, 4, 3), np.uint8)
+            if later:
+                demo["next_obs/speed"] = obs[1:]
+    return datasets.read(folder / "demos.hdf5", "vehicle")
+
+
+def of_d4rl(folder: Path, later: bool = True) -> datasets.Log:
+    h5py = pytest.importorskip("h5py")
+    actions = ACTIONS if later else [np.append(action, [[AFTER]], 0) for action in ACTIONS]
+    seen = [obs[:-1] for obs in OBS] if later else OBS
+    ends = np.concatenate([np.arange(len(action)) == len(action) - 1 for action in actions])
+    with h5py.File(folder / "d4rl.h5", "w") as file:
+        file["observations"], file["actions"] = np.concatenate(seen), np.concatenate(actions)
+        file["terminals"], file["timeouts"] = ends & (np.cumsum(ends) < 3), ends & (np.cumsum(ends) >= 3)
+        file["infos/vehicle"] = np.repeat([ord(name) for name in OWNERS], [len(action) for action in actions]) * 1.0
+        file["metadata/algorithm"] = "expert"
+        if later:
+            file["next_observations"] = np.concatenate([obs[1:] for obs in OBS])
+    return datasets.read(folder / "d4rl.h5", "infos/vehicle")
+
+
+def of_lerobot(folder: Path, version: str = "v3.0") -> datasets.Log:
+    made = rows(AFTER)
+    frames: dict[int, list[dict[str, Any]]] = {i: [row for row in made if row["lap"] == i] for i in range(5)}
+    features = {
+        "observation.state": {"dtype": "float64", "shape": [2], "names": {"motors": ["x", "y"]}},
+        "observation.images.top": {"dtype": "video", "shape": [4, 4, 3], "names": None},
+        "action": {"dtype": "float64", "shape": [1], "names": None},
+    }
+    info = {"codebase_version": version, "total_episodes": 5, "total_frames": len(made), "features": features}
+    (folder / "set" / "meta").mkdir(parents=True)
+    (folder / "set" / "meta" / "info.json").write_text(json.dumps(info))
+
+    def data(name: str, episodes: list[int]) -> None:
+        held = [(i, t, row) for i in episodes for t, row in enumerate(frames[i])]
+        columns = {"episode_index": [i for i, _, _ in held], "frame_index": [t for _, t, _ in held]}
+        columns |= {"observation.state": [[row["speed x"], row["speed y"]] for *_, row in held]}
+        columns |= {"action": [[row["throttle"]] for *_, row in held], "timestamp": [row["time"] for *_, row in held]}
+        write_parquet(folder / "set" / "data" / "chunk-000" / name, columns)
+
+    if version == "v3.0":
+        data("file-000.parquet", [1, 0])
+        data("file-001.parquet", [2, 3, 4])
+        about: dict[str, list[Any]] = {"episode_index": list(range(5)), "vehicle": OWNERS, "tasks": [["drive"]] * 5}
+        about |= {"stats/action/max": [[1.0]] * 5, "length": [len(frames[i]) for i in range(5)]}
+        write_parquet(folder / "set" / "meta" / "episodes" / "chunk-000" / "file-000.parquet", about)
+    else:
+        for i in range(5):
+            data(f"episode_{i:06d}.parquet", [i])
+        lines = [json.dumps({"episode_index": i, "vehicle": OWNERS[i], "tasks": ["drive"]}) for i in range(5)]
+        (folder / "set" / "meta" / "episodes.jsonl").write_text("\n".join(lines))
+    return datasets.read(folder / "set", "vehicle")
+
+
+def write_minari(folder: Path, about: list[dict[str, Any]]) -> Path:
+    minari = pytest.importorskip("minari")
+    from minari.data_collector import EpisodeBuffer
+
+    buffers = []
+    for i, (obs, action) in enumerate(zip(OBS, ACTIONS, strict=True)):
+        n = len(action)
+        ends = np.arange(n) == n - 1
+        seen: Any = {"speed": obs, "mode": np.zeros(n + 1, np.int64)}
+        buffers.append(EpisodeBuffer(i, None, None, seen, action, [0.0] * n, ends.tolist(), [False] * n, {}))  # type: ignore[arg-type]
+    space = spaces.Dict(speed=spaces.Box(-9.0, 9.0, (2,), float), mode=spaces.Discrete(2))
+    with patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder)):
+        kinds = {"observation_space": space, "action_space": spaces.Box(-np.inf, np.inf, (1,), float)}
+        made = minari.create_dataset_from_buffers("of/others-v0", buffers, data_format="hdf5", **kinds)
+    if about[0]:
+        made.storage.update_episode_metadata(about)
+    return folder
+
+
+def of_minari(folder: Path) -> datasets.Log:
+    made = write_minari(folder, [{"vehicle": name} for name in OWNERS])
+    return datasets.read(made, "vehicle", obs=["observation.speed"])
+
+
+FORMATS: dict[str, tuple[Callable[[Path], datasets.Log], bool]] = {  # how it is read; whether last actions are dropped
+    "csv": (of_csv, False),
+    "last actions": (of_csv_with_last_actions, True),
+    "no last observations": (of_csv_without_last_observations, True),
+    "several csv": (of_several_csv, False),
+    "parquet": (of_parquet, False),
+    "robomimic": (of_robomimic, False),
+    "robomimic, no next_obs": (lambda folder: of_robomimic(folder, False), True),
+    "d4rl": (of_d4rl, False),
+    "d4rl, no next_observations": (lambda folder: of_d4rl(folder, False), True),
+    "lerobot v3": (of_lerobot, True),
+    "lerobot v2.1": (lambda folder: of_lerobot(folder, "v2.1"), True),
+    "minari": (of_minari, False),
+}
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("kind", FORMATS)
+def test_every_format_is_the_same_trials(kind: str, tmp_path: Path) -> None:
+    """Ragged trials and episodes, raw actions, last rows of every kind."""
+    read, drops = FORMATS[kind]
+    log, right = read(tmp_path), expected()
+    for key in ("mask", "obs", "action"):
+        np.testing.assert_array_equal(getattr(log, key), getattr(right, key))
+    assert log.sha256 == right.sha256
+    assert len(log.units.obs) == 2
+    assert ("In 5 episodes the last action" in " ".join(log.notes)) is drops
+    assert log.units.low == (np.concatenate(ACTIONS).min(),)
+    assert [name for name in log.names if name in ("97", "98", "99", "a", "b", "c")] == list(log.names)
+    assert "3 trials of 1 to 2 episodes, each of 2 to 5 steps, 17 in all." in log.notes[0]
+    assert " 0.5" in log.notes[1] or "Actions, each range taken as -1 to 1: " in log.notes[1]
+
+
+class TestNotes:
+    def test_an_episode_is_a_trial(self, tmp_path: Path) -> None:
+        log = datasets.read(write_csv(tmp_path / "x.csv", rows()), episode="lap", obs=["speed x"], action=["throttle"])
+        assert log.mask.shape[:2] == (5, 1)
+        assert "every episode counts as a trial of its own (vehicle might say: --trial)" in " ".join(log.notes)
+
+    def test_a_trial_is_an_episode(self, tmp_path: Path) -> None:
+        log = datasets.read(write_csv(tmp_path / "x.csv", rows()), trial="lap", obs=["speed x"], action=["throttle"])
+        assert log.mask.shape[:2] == (5, 1)
+        assert "every episode counts" not in " ".join(log.notes)
+
+    @pytest.mark.filterwarnings("ignore::UserWarning")
+    def test_minari_without_a_word(self, tmp_path: Path) -> None:
+        log = datasets.read(write_minari(tmp_path, [{}]))
+        assert log.mask.shape[:2] == (5, 1)
+        assert log.units.obs == (
+            "observation.mode.0",
+            "observation.mode.1",
+            "observation.speed.0",
+            "observation.speed.1",
+        )
+        assert "every episode counts as a trial" in " ".join(log.notes)
+
+    def test_gaps_and_constants(self, tmp_path: Path) -> None:
+        made = [{**row, "gear": 3} for row in rows(skip=(6,))]
+        made[3]["time"] = made[2]["time"]
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **{**ROLES, "obs": ["speed*", "gear"]})
+        notes = " ".join(log.notes)
+        assert "1 gaps: more than 1.5 times the usual 0.1 of time passes (the first: row 7 of" in notes
+        assert "1 rows have the time of the row before them: duplicates? (the first: row 4" in notes
+        assert "Constant: gear." in notes
+        assert "Constant" not in " ".join(of_csv(tmp_path).notes)
+
+    def test_duplicates_without_a_clock(self, tmp_path: Path) -> None:
+        made = [{key: value for key, value in row.items() if key != "time"} for row in rows()]
+        log = datasets.read(write_csv(tmp_path / "x.csv", [*made[:3], made[2], *made[3:]]), **ROLES)
+        assert "1 rows repeat the row before them (the first: row 4)." in log.notes
+
+    def test_dropped_and_left_out(self, tmp_path: Path) -> None:
+        notes = " ".join(of_csv_with_last_actions(tmp_path).notes)
+        assert "In 5 episodes the last action has no next observation; it is dropped." in notes
+        made = [*rows(), {**rows()[0], "lap": 9}]
+        notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES).notes)
+        assert "1 episodes of one row, without a step, are left out." in notes
+        assert "is dropped" not in notes
+
+
+class TestActions:
+    def test_one_range_of_all_files(self, tmp_path: Path) -> None:
+        wide = [{**row, "throttle": 2 * row["throttle"] if row["throttle"] else ""} for row in rows()]
+        files = [write_csv(tmp_path / f"{i}.csv", made) for i, made in enumerate((rows(), wide))]
+        expert, explored = datasets.read_together(files, **ROLES)
+        assert expert.units == explored.units
+        assert expert.units.high == (2 * np.concatenate(ACTIONS).max(),)
+        raw = expert.units.unscaled(expert.action[0, 0, :3].astype(float))
+        np.testing.assert_allclose(raw, ACTIONS[0], rtol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("values", "kept"),
+        [
+            (("left", "right", "on"), ("left", "on", "right")),
+            ((3, 4, 5), (3, 4, 5)),
+            (("0.0", "1.0", "2.0"), (0, 1, 2)),
+            ((0, 40, 100), ()),
+            ((0.5, 1, 2), ()),
+        ],
+    )
+    def test_discrete(self, values: tuple[Any, ...], kept: tuple[Any, ...], tmp_path: Path) -> None:
+        made = [{**row, "throttle": values[i % 3] if row["throttle"] else ""} for i, row in enumerate(rows())]
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+        assert log.units.values == kept
+        assert log.actions == len(kept)
+        back = log.units.unscaled(log.action[0, 0, :3])[:, 0].tolist()
+        texts = isinstance(values[0], str) and kept[0] != 0
+        assert back == (list(values) if texts else pytest.approx([float(value) for value in values]))
+
+    def test_in_one_unit_they_stay(self, tmp_path: Path) -> None:
+        """Actions from -1 to 1 keep their bits."""
+        made = rows(AFTER)
+        for row, value in zip(made, np.random.default_rng(0).uniform(-1e-12, 1e-12, len(made)), strict=True):
+            row["throttle"] = value
+        made[0]["throttle"], made[1]["throttle"] = -1, 1
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+        np.testing.assert_array_equal(log.action[0, 0, :3, 0], np.float32([row["throttle"] for row in made[:3]]))
+        assert not log.units.raw
+
+    @pytest.mark.parametrize("discrete", [False, True])
+    def test_an_agent_acts_in_raw_units(self, discrete: bool, tmp_path: Path) -> None:
+        """The same after it was saved; it is told of actions in these units too."""
+        made = rows()
+        if discrete:
+            made = [{**row, "throttle": ("stop", "go")[i % 2] if row["throttle"] else ""} for i, row in enumerate(made)]
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+        plain = naive_rnn.train(log, RecurrentConfig(updates=2, batch=2), np.random.default_rng(0))
+        agent = log.units.agent(plain)
+        assert isinstance(agent, RawAgent)
+        agent.save(tmp_path / "agent")
+        obs, acted = np.zeros((1, 2), np.float32), []
+        for actor in (agent, deconfounded.load(tmp_path / "agent"), plain):
+            actor.begin(1)
+            actor.reset([np.random.default_rng(0)])
+            action = actor.act(obs)
+            for _ in range(2):
+                actor.observe(obs, action, obs + 1, np.ones(1, bool))
+                action = actor.act(obs + 1)
+            acted.append(action)
+        np.testing.assert_array_equal(acted[0], acted[1])
+        np.testing.assert_array_equal(acted[0], log.units.unscaled(acted[2]))
+        assert discrete is (acted[0][0, 0] in ("stop", "go"))
+
+    def test_what_is_no_action(self) -> None:
+        units = Units(("x",), ("y",), (0.0,), (1.0,), ("go", "stop"))
+        with pytest.raises(envs.InputError, match="an action was 'jump'; it must be one of go, stop"):
+            units.scaled(np.array([["jump"]], object))
+
+
+BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes of row 3; what is said
+    "missing": ({"obs": ["speed z"]}, {}, "obs 'speed z' is no column of .*x.csv; did you mean 'speed [xy]'?"),
+    "pattern": (
+        {"action": ["steer*"]},
+        {},
+        "action 'steer.' is no column of .*; there are vehicle, lap, time, speed x",
+    ),
+    "case": ({"trial": "VEHICLE"}, {}, "trial 'VEHICLE' is no column of .*; did you mean 'vehicle'?"),
+    "text": ({}, {"speed x": "fast"}, "'speed x' of .*x.csv is 'fast' in row 3; it must be a number"),
+    "text among actions": ({}, {"throttle": "off"}, "'throttle' of .*x.csv is 'off' in row 3; it must be a number"),
+    "NaN": ({}, {"speed x": "nan"}, "'speed x' of .*x.csv holds no number in row 3"),
+    "no action": ({}, {"throttle": ""}, "'throttle' of .*x.csv is empty in row 3"),
+    "infinite": ({}, {"throttle": "inf"}, "'throttle' is infinite"),
+    "apart": (
+        {},
+        {"lap": 7},
+        "rows of vehicle a, lap 0 stand apart in .*, from row 1 and again from row 4; sort it by",
+    ),
+    "no trial": ({}, {"vehicle": ""}, "'vehicle' of .* is empty in row 3"),
+    "nothing said": ({"obs": []}, {}, "does not say what is obs; give --obs, of vehicle, lap"),
+    "no episode": ({"trial": None, "episode": None}, {}, "does not say where an episode begins; give --episode or"),
+    "one text": ({"obs": "speed x"}, {}, r"obs was 'speed x'; it must be a list of columns, \['speed x'\]"),
+    "all used": ({"obs": ["throttle", "lap"]}, {}, "obs of .* are none beside the trial"),
+}
+
+
+class TestBadInput:
+    @pytest.mark.parametrize("case", BAD)
+    def test_one_line(self, case: str, tmp_path: Path) -> None:
+        roles, changes, says = BAD[case]
+        made = [{**row, **changes} if i == 2 else row for i, row in enumerate(rows())]
+        with pytest.raises(envs.InputError, match=says) as caught:
+            datasets.read(write_csv(tmp_path / "x.csv", made), **{**ROLES, **roles})
+        assert "\n" not in str(caught.value)
+
+    def test_actions_of_the_row_before(self, tmp_path: Path) -> None:
+        made = rows(AFTER)
+        for i, row in enumerate(made):
+            row["throttle"] = "" if not i or made[i - 1]["lap"] != row["lap"] else 1.5 * i
+        with pytest.raises(envs.InputError, match=r"empty in the first row of 5 episodes .* move it up by a row"):
+            datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+
+    def test_text_beyond_the_first_block(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A column whose first blocks are numbers keeps its texts as they are written."""
+        monkeypatch.setattr("deconfounded.experts.datasets.tabular.BLOCK", 4)
+        made = [{**row, "vehicle": {"a": "007", "b": "8", "c": "x"}[row["vehicle"]]} for row in rows()]
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+        assert log.names == ("007", "8", "x")
+        assert log.sha256 == expected().sha256
+
+    @pytest.mark.parametrize(
+        ("name", "content", "says"),
+        [
+            ("x.xlsx", b"PK", "x.xlsx is of an unknown kind; give a .csv, .parquet"),
+            ("x.csv", b"\xff\xfe\x00", "x.csv is no csv in UTF-8"),
+            ("x.csv", b"", "has no header"),
+            ("x.csv", b"a,b\n", "holds no rows beside its header"),
+            ("x.csv", b"a,b\n1,2\n1,2,3\n", "line 3 of .*x.csv has 3 cells; its header has 2"),
+            ("x.csv", b"a,a\n1,2\n", "two columns that are called 'a'"),
+            ("x.parquet", b"junk", "x.parquet cannot be read as parquet"),
+            ("x.hdf5", b"junk", "x.hdf5 cannot be read as HDF5"),
+            ("x.npz", b"junk", "no trials could be read from"),
+        ],
+    )
+    def test_no_such_file(self, name: str, content: bytes, says: str, tmp_path: Path) -> None:
+        if name == "x.parquet":
+            pytest.importorskip("pyarrow")
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(envs.InputError, match=says) as caught:
+            datasets.read(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+    def test_nothing_there(self, tmp_path: Path) -> None:
+        with pytest.raises(envs.InputError, match=r"there is no .*gone.csv; give"):
+            datasets.read(tmp_path / "gone.csv")
+
+    def test_hdf5_of_others(self, tmp_path: Path) -> None:
+        h5py = pytest.importorskip("h5py")
+        for name, content, says in (
+            ("strange", {"x": np.zeros(3)}, "holds x; it must hold `data/demo_0` as of robomimic"),
+            (
+                "flat",
+                {"observations": np.zeros((4, 2)), "actions": np.zeros((4, 1))},
+                "neither `terminals` nor `timeouts`",
+            ),
+            ("less", {"observations": np.zeros((4, 2)), "actions": np.zeros((3, 1))}, "4 observations and 3 actions"),
+            (
+                "demo",
+                {"data/demo_0/obs/x": np.zeros((4, 2)), "data/demo_0/actions": np.zeros((3, 1))},
+                "obs/x of demo_0",
+            ),
+            ("none", {"data/demo_0/states": np.zeros((4, 2))}, "must hold `actions` and `obs`"),
+        ):
+            with h5py.File(tmp_path / f"{name}.hdf5", "w") as file:
+                for key, array in content.items():
+                    file[key] = array
+            with pytest.raises(envs.InputError, match=says):
+                datasets.read(tmp_path / f"{name}.hdf5")
+
+    def test_lerobot_with_files_missing(self, tmp_path: Path) -> None:
+        of_lerobot(tmp_path)
+        (tmp_path / "set" / "data" / "chunk-000" / "file-001.parquet").unlink()
+        with pytest.raises(envs.InputError, match=r"holds 10 frames; its meta/info.json says 22: are files missing?"):
+            datasets.read(tmp_path / "set")
+        (tmp_path / "set" / "meta" / "info.json").write_text('{"codebase_version": "v1.6", "features": {}}')
+        with pytest.raises(envs.InputError, match=r"of version v1.6; it must be v2 or v3"):
+            datasets.read(tmp_path / "set")
+
+    def test_a_trial_that_ends_within_an_episode(self, tmp_path: Path) -> None:
+        of_lerobot(tmp_path)
+        with pytest.raises(envs.InputError, match=r"'timestamp' of .* changes within an episode, in row 2"):
+            datasets.read(tmp_path / "set", "timestamp")
+
+    def test_files_that_differ(self, tmp_path: Path) -> None:
+        first = write_csv(tmp_path / "a.csv", rows())
+        other = write_csv(tmp_path / "b.csv", [{**row, "speed z": 1} for row in rows()])
+        with pytest.raises(envs.InputError, match=r"b.csv and .*a.csv have other columns: speed z"):
+            datasets.read([first, other], **ROLES)
+
+    def test_columns_of_npz(self, tmp_path: Path) -> None:
+        expected().save(tmp_path / "x.npz")
+        assert datasets.read(tmp_path / "x.npz").sha256 == expected().sha256
+        with pytest.raises(envs.InputError, match="has no columns to choose"):
+            datasets.read(tmp_path / "x.npz", trial="vehicle")
