@@ -34,7 +34,7 @@ class TransformerConfig(Configuration):
 
     width: int = 64
     layers: int = 2
-    heads: int = 2
+    heads: int = 4
     updates: int = 600
     batch: int = 16
     shortest: float = 1 / 8
@@ -47,19 +47,20 @@ def normed(x: Tensor) -> Tensor:
     return F.layer_norm(x, x.shape[-1:])
 
 
-def rotation(position: Tensor, width: int) -> Tensor:
-    """Rotary positions: exp(i angle), complex [..., D / 2], of angles that grow with position [...].
+def rotation(position: Tensor, width: int) -> tuple[Tensor, Tensor]:
+    """Rotary positions: cosines and sines [..., D / 2] of angles that grow with position [...].
 
     Dot products of rotated vectors depend on relative positions; wavelengths are 6 to some thousand steps.
     """
-    speed = 1000.0 ** -(torch.arange(width // 2, device=position.device) / (width // 2))
-    angle = position[..., None] * speed
-    return torch.polar(torch.ones_like(angle), angle)
+    half = width // 2
+    angle = position[..., None].float() * 1000.0 ** -(torch.arange(half, device=position.device) / half)
+    return angle.cos(), angle.sin()
 
 
-def rotated(x: Tensor, by: Tensor) -> Tensor:
-    """x [..., D], as D / 2 complex numbers, times `by`."""
-    return torch.view_as_real(torch.view_as_complex(x.unflatten(-1, (-1, 2))) * by).flatten(-2)
+def rotated(x: Tensor, by: tuple[Tensor, Tensor]) -> Tensor:
+    """Pairs of the D of x [..., D], of its first and its second half, rotated by angles of these cosines and sines."""
+    (first, second), (cos, sin) = x.chunk(2, -1), by
+    return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
 
 
 class Cache:
@@ -76,7 +77,7 @@ class Cache:
     def begin(self) -> None:
         """Begin with the next token of each trial: where it is written, and to what it attends."""
         low, high = self.count.min().item(), self.count.max().item()
-        self.turn = rotation(self.count, self.kept[0].shape[-1])[:, None, None]
+        self.turn = rotation(self.count[:, None, None], self.kept[0].shape[-1])
         self.filled, self.mask = min(int(high) + 1, self.window), None
         self.slot: int | Tensor = int(high) % self.window  # of all, where trials have as many steps
         if low < high:
@@ -249,7 +250,6 @@ def train(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor
 
 @uses(
     "demonstrations",
-    version=2,
     cost=30,
     on_control=TransformerConfig(layers=4),
     on_bandit=TransformerConfig(width=32, layers=4, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),

@@ -18,7 +18,7 @@ def read_lerobot(folder: Path) -> Table:
 
     Raises InputError if files are missing, or are of another version.
     """
-    info = _json(folder / "meta" / "info.json", (folder / "meta" / "info.json").read_text())
+    info = _json(folder / "meta" / "info.json", (folder / "meta" / "info.json").read_text(encoding="utf-8"))
     version, features = str(info.get("codebase_version")), info.get("features")
     if not version.startswith(("v2", "v3")) or not isinstance(features, dict):
         raise InputError(f"{folder} is a LeRobot data set of version {version}; it must be v2 or v3")
@@ -64,7 +64,7 @@ def _episodes(folder: Path) -> list[dict[str, Any]]:
     """What is said of each episode: meta/episodes.jsonl of version 2, meta/episodes/**/*.parquet of version 3."""
     lines = folder / "meta" / "episodes.jsonl"
     if lines.is_file():
-        return [_json(lines, line) for line in lines.read_text().splitlines() if line.strip()]
+        return [_json(lines, line) for line in lines.read_text(encoding="utf-8").splitlines() if line.strip()]
     entries: list[dict[str, Any]] = []
     for file in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         columns = parquet_columns(file)
