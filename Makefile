@@ -1,8 +1,8 @@
-# Everything from nothing but Python 3.11, 3.12 or 3.13: `make setup`, `make demo` and `make test`.
+# Everything from nothing but Python 3.11, 3.12 or 3.13: `make setup`, `make demo`, `make test` and `make quick`.
 PYTHON ?= python3
 VENV := .venv
 
-.PHONY: setup demo test lint
+.PHONY: setup demo test quick lint
 
 setup: $(VENV)/installed
 
@@ -10,7 +10,10 @@ demo: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
 
 test: lint
-	$(VENV)/bin/python -m pytest -n auto --dist worksteal
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal
+
+quick: $(VENV)/installed  # what one runs while editing
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal -m "not slow"
 
 lint: $(VENV)/installed
 	$(VENV)/bin/ruff check .

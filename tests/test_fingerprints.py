@@ -18,6 +18,7 @@ from tests import fingerprints
 LEARNED = ("deconfounded", "deconfounded_offline", "dagger", "naive_rnn", "blind_bc")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("label", fingerprints.EVERY)
 def test_nothing_does_otherwise(label: str) -> None:
     entry = fingerprints.kept().get(label)
@@ -34,6 +35,7 @@ def test_the_file_holds_nothing_else() -> None:
 SOME = ["task:ant_goal", "expert:ant_goal", "method:deconfounded_gru", "method:naive_transformer", "method:palr"]
 
 
+@pytest.mark.slow
 def test_the_same_on_another_cpu() -> None:
     """With two threads and the kernels of a CPU without vector extensions."""
     code = f"""

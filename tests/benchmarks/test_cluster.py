@@ -108,6 +108,7 @@ def workers() -> list[str]:
     return [line for _, line in processes(f"{MARK}={os.getpid()}", "ray::work", "ray::Mailbox")]
 
 
+@pytest.mark.slow
 def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Bit for bit what this process makes, from a checkpoint where there was one; and nothing is left running."""
     home = tmp_path / "own"

@@ -124,6 +124,7 @@ def test_bad_input_from_the_shell() -> None:
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_what_lists_or_checks_does_not_import_what_takes_seconds() -> None:
     """`run --list`, and what commands refuse before they begin; paper, whose jobs stand in its file, is slow."""
     lines = [args for args, _ in REFUSALS if not {"paper", "--device", "--out", "--set"} & {*args}]
@@ -142,6 +143,7 @@ for sys.argv in map(list, {lines}):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
     out, args = tmp_path / "out", ("run", "--task", "bandit", "--preset", "smoke", "--out")
@@ -245,6 +247,7 @@ class Deadly(jobs.Job):
         return ""
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     job = Deadly("bandit", tiny_preset(), "random", (0,), tmp_path)
     with pytest.raises(SystemExit) as ended, Local() as engine:
@@ -260,6 +263,7 @@ class Told(jobs.Job):
         return str(os.getpid())
 
 
+@pytest.mark.slow
 def test_workers_are_kept(tmp_path: Path) -> None:
     """From one call to the next, until the end; what they inherit is put back, though a call fails."""
     job, told, heard = Told("bandit", tiny_preset(), "random", (0,), tmp_path), [], signal.getsignal(signal.SIGINT)
@@ -305,6 +309,7 @@ def test_an_error_of_the_system_is_one_line(capsys: pytest.CaptureFixture[str]) 
         assert (ended.value.code, capsys.readouterr().err) == (code, says)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize(
     ("args", "code"),
@@ -432,6 +437,7 @@ class TestScore:
         assert scoring.bootstrap(np.array([1.0])) is None
 
 
+@pytest.mark.slow
 def test_certificate_fails_what_deserves_it() -> None:
     """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
     task = NoStakes()
@@ -442,6 +448,7 @@ def test_certificate_fails_what_deserves_it() -> None:
     assert not result["checks"]["blind_bc"]["passed"]
 
 
+@pytest.mark.slow
 def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Records, picture and certificate go to docs; a clip of an older run does not stay beside them.
 
@@ -492,6 +499,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         publish.keep(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", envs.SUITE)
 def test_records_hold_the_schema(task: str) -> None:
     """Each line of the file; and none is of a setting that pages do not show."""
@@ -507,6 +515,7 @@ def test_records_are_few_and_small() -> None:
     assert sum(file.stat().st_size for file in files) <= 6e6
 
 
+@pytest.mark.slow
 def test_pages_are_up_to_date() -> None:
     """What publish.py writes of tasks, certificates and results; README has a row for each of the latter two."""
     for file, text in publish.texts(results.published()).items():
@@ -518,6 +527,7 @@ def test_pages_are_up_to_date() -> None:
     assert sorted(name for name in rows if name != "task") == sorted(kept)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("marked", ["envs.make_vec", "def simulate"])
 def test_readme_snippets_run(marked: str) -> None:
     """What README shows is what runs; its own task, expert, method and loop are in test_outside.py."""

@@ -57,6 +57,7 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         yield job
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.45, 0.8, 0.9])
 def test_interrupted_training_goes_on(
     whole: jobs.Job, share: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -96,6 +97,7 @@ def test_interrupted_training_goes_on(
     assert not list(broken.folder.glob(".*.pt"))
 
 
+@pytest.mark.slow
 def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From jobs to figures and table: exact curves by their closed forms, budgets by the settings."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)

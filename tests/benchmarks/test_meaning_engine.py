@@ -26,6 +26,7 @@ class Killed(jobs.Job):
         return "not to be said"
 
 
+@pytest.mark.slow
 def test_a_killed_worker_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One line, and exit code 2; nothing is said of the job, and none of it counts as done."""
     job = Killed("bandit", tiny_preset(), "random", (0,), tmp_path)

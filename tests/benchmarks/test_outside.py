@@ -67,6 +67,7 @@ def deconf(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
 
 
+@pytest.mark.slow
 def test_run_play_score(folder: Path) -> None:
     """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
     assert len([line for line in (folder / "my_rnn.py").read_text().splitlines() if line]) <= 40
@@ -109,6 +110,7 @@ def test_run_play_score(folder: Path) -> None:
     assert not list((ROOT / "assets").rglob("bent_cartpole*"))
 
 
+@pytest.mark.slow
 def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """README's task holds the whole contract; one that gives theta away does not."""
     assert len((folder / "bent_cartpole.py").read_text().splitlines()) <= 60
@@ -126,6 +128,7 @@ def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     assert "FAIL noise_covers_every_coordinate_that_matters: theta moves a coordinate without process noise" in told
 
 
+@pytest.mark.slow
 def test_loop_of_readme(tmp_path: Path) -> None:
     """Ten lines that deploy an agent."""
     agent = fit(Context(envs.get(CONTROL), tiny_preset(), [0]), "deconfounded")
@@ -137,6 +140,7 @@ def test_loop_of_readme(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_task_from_outside(folder: Path) -> None:
     """It is known by its name from then on, to gymnasium too; its weights are looked for beside it."""
     task = envs.get(f"{folder}/{BENT}")
@@ -424,6 +428,7 @@ def hunt(start, skipped=(), limit=100_000):
 HIDDEN = {"BatchEnv", "Context", "Physics", "NetworkExpert", "Simulator"}
 
 
+@pytest.mark.slow
 def test_a_hunter_finds_no_theta(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A method that walks all that is reachable from what it is handed, and from the agent that acts in evaluation.
 
@@ -470,6 +475,7 @@ def fit(given):
     assert HIDDEN - {"Simulator"} <= kinds
 
 
+@pytest.mark.slow
 def test_a_hunter_finds_no_theta_in_what_ours_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing that a method of ours is handed, or its agent, refers to theta, seeds, environments or the expert.
 
@@ -581,6 +587,7 @@ class TestSaved:
             with pytest.raises(envs.InputError, match=says):
                 deconfounded.load(tmp_path)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
     def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
@@ -598,6 +605,7 @@ class TestSaved:
                     again = run_trials(env, agent, expected.shape[1], stream(EVALUATION, seed)).returns
                     np.testing.assert_array_equal(again, expected)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
     def test_in_another_process(self, task: str, tmp_path: Path) -> None:
         """One plain gymnasium environment: the agent of a fit and, over there, the loaded one return the same bits."""

@@ -345,6 +345,7 @@ class TestRecords:
 
 
 class TestVerify:
+    @pytest.mark.slow
     def test_same_bits(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -429,6 +430,7 @@ def test_broken_pictures_leave_the_numbers(
     assert (tmp_path / "report.html").stat().st_size > 0
 
 
+@pytest.mark.slow
 def test_table_makes_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

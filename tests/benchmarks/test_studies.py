@@ -12,6 +12,7 @@ from deconfounded.benchmarks.studies import performance, runs, stepping, tune
 from tests.tools import tiny_preset
 
 
+@pytest.mark.slow
 def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All parts, small: each leaves its numbers, which are above 0, and its picture."""
     for module, name, value in (
@@ -57,6 +58,7 @@ def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         runs.run(envs.get("bandit"), tiny_preset(), ["random"], [0], tmp_path)
 
 
+@pytest.mark.slow
 def test_runs_are_those_asked_for(tmp_path: Path) -> None:
     """What else the folder has is not in their records; what it has of them is not made again."""
     task, settings = envs.get("bandit"), tiny_preset()
@@ -70,6 +72,7 @@ def test_runs_are_those_asked_for(tmp_path: Path) -> None:
     assert {file: file.stat().st_mtime_ns for file in (tmp_path / "jobs").glob("*.npz")} == before
 
 
+@pytest.mark.slow
 def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each setting its own numbers, and references that are made once; what is kept is not tried again."""
     (tmp_path / "docs").mkdir()

@@ -89,6 +89,7 @@ print(json.dumps([*found, envs.get("own_cartpole").reference]))
             np.testing.assert_array_equal(obs, env.reset(seed=3)[0])
         assert reference == own.reference == f"{tmp_path}/own.py:Own"
 
+    @pytest.mark.slow
     def test_vectors_of_spawned_processes(self, own: envs.Task) -> None:
         """gymnasium's and Stable-Baselines3's: the same bits as here."""
         first = envs.make_vec(own.name, 1).reset(seed=3)[0]
@@ -100,6 +101,7 @@ print(json.dumps([*found, envs.get("own_cartpole").reference]))
         np.testing.assert_array_equal(vec.reset(), first)
         vec.close()
 
+    @pytest.mark.slow
     def test_registered_by_hand(self, tmp_path: Path) -> None:
         """In a script, and in a module beside it: a spawned process, which runs both too, has one task of each name."""
         by_hand = OWN.replace("class", "@envs.register\nclass")
@@ -147,6 +149,7 @@ print(told)
     assert one == other
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not gl_works() or not hasattr(os, "fork"), reason="no GL, or no fork")
 def test_a_fork_does_not_draw() -> None:
     """The GL library would wait for threads that it left behind: one line in place of that."""
@@ -311,6 +314,7 @@ class TestText:
                         assert given > (method == "write_text"), f"{where}: {method} without an encoding"
                     assert getattr(call.func, "id", "") != "open", f"{where}: open; there are read_bytes and files.py"
 
+    @pytest.mark.slow
     def test_commands_in_the_c_locale(self, tmp_path: Path) -> None:
         """In a folder, and of a task, whose names are not ASCII: what cannot be printed is escaped."""
         home = tmp_path / "caf\u00e9"

@@ -87,6 +87,7 @@ def test_the_suite_cannot_be_imported(tmp_path: Path, monkeypatch: pytest.Monkey
     ]
 
 
+@pytest.mark.slow
 def test_no_theta_can_be_drawn_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Thetas of demonstrations and evaluation come from salts that are drawn, and recorded: no seed gives them away."""
     steal = """    shown = given.demonstrations

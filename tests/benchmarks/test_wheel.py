@@ -68,6 +68,7 @@ def run(built: Path, folder: Path, *args: str | Path) -> subprocess.CompletedPro
     return subprocess.run([sys.executable, *args], cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
 
 
+@pytest.mark.slow
 def test_they_are_whole(built: Path) -> None:
     """The sdist has all that its tests need, the wheel all that is imported and read; neither has it twice."""
     with tarfile.open(next(built.glob("*.tar.gz"))) as sdist:
@@ -140,6 +141,7 @@ play --agent results/bandit-smoke/agents/blind_bc-0 --task bandit
 """
 
 
+@pytest.mark.slow
 def test_commands_work_as_installed(built: Path, empty: Path) -> None:
     """They write under --out or where their --help says, and not in the package, at home or in /tmp.
 

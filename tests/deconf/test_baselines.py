@@ -491,6 +491,7 @@ class Unplugged(Monitor):
         return self.kept
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", NEW)
 def test_interrupted_training_resumes(method: str) -> None:
     """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one."""
@@ -506,6 +507,7 @@ def test_interrupted_training_resumes(method: str) -> None:
     np.testing.assert_array_equal(actions[2], actions[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", NEW)
 def test_a_seed_of_two_alone(method: str) -> None:
     agent = made(method, seeds=(0, 1))

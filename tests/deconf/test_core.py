@@ -463,6 +463,7 @@ class TestMethods:
         assert run_trials(score, oracle, 1, 3).returns.mean() == pytest.approx(60, abs=2)
         assert run_trials(score, blind, 1, 3).returns.mean() == pytest.approx(20, abs=2)
 
+    @pytest.mark.slow
     def test_naive_rnn_is_deluded(self) -> None:
         """Good on the expert's history, bad on its own: it beats blind cloning (20), and misses the exact 54."""
         trials, env = demonstrations("bandit", 1000, 1)
@@ -491,6 +492,7 @@ class TestMethods:
         np.testing.assert_array_equal(first, second)
         assert torch.equal(torch.get_rng_state(), state)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
     @pytest.mark.parametrize(
         "method",
@@ -523,6 +525,7 @@ class TestMethods:
         data = Batch.of(fast, 1)
         assert 0.5 < model.dynamics.change(data.next_obs - data.obs).std() < 2
 
+    @pytest.mark.slow
     def test_deconfounded_learns_from_physics(self) -> None:
         """A minute's budget cut to seconds: after training, the belief tells thetas apart on expert trials."""
         trials, env = demonstrations("tilted_cartpole", 48)

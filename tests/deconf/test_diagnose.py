@@ -78,6 +78,7 @@ class TestBadInput:
         with pytest.raises(InputError, match="where the expert goes for"):
             diagnose.check(expert, away, DiagnoseConfig())
 
+    @pytest.mark.slow
     def test_command(self, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
         """One line and exit code 2: no file, no trials in it, too few."""
         trials(5).save(tmp_path / "few.npz")
@@ -193,6 +194,7 @@ def test_measures(make) -> None:
     assert np.isfinite([alone.memory_gain, alone.stakes, alone.naive, alone.latent]).all()
 
 
+@pytest.mark.slow
 def test_gain_by_memory() -> None:
     """Actions that depend on a hidden sign: a memory gains log 2 nats a step, except for the first."""
     rng = np.random.default_rng(0)
@@ -245,6 +247,7 @@ FEWER = {
 }
 
 
+@pytest.mark.slow
 def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Every line of docs/diagnose.md, on less data and with less training."""
     monkeypatch.chdir(tmp_path)

@@ -43,6 +43,7 @@ def explain(push: float) -> latent.Explanation:
     return latent.from_dynamics(expert, explored, 1, EXPLORING, CLONING, Draws([rng], "cpu"), Monitor())
 
 
+@pytest.mark.slow
 def test_dynamics_with_evidence() -> None:
     """theta moves s by .2 either way, in noise of .1: 8 nats a step between opposite ones, as half of all pairs are."""
     explanation = explain(0.2)
@@ -52,6 +53,7 @@ def test_dynamics_with_evidence() -> None:
     assert (torch.exp(head.log_std) * head.change.std).item() == pytest.approx(NOISE, rel=0.3)
 
 
+@pytest.mark.slow
 def test_dynamics_without_evidence() -> None:
     explanation = explain(0.0)
     assert explanation.exploration_evidence == pytest.approx(0, abs=NO_EVIDENCE)
@@ -77,6 +79,7 @@ def test_even_steps_predict_odd_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not odd[..., ::2].any()
 
 
+@pytest.mark.slow
 def test_theta_that_drifts() -> None:
     """Each episode of the 48 training trials has a latent of its own; in whole trials there is no evidence of one."""
     rng, amounts = np.random.default_rng(0), Amounts(exploring=EXPLORING, cloning=CLONING)

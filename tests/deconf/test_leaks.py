@@ -135,6 +135,7 @@ class TestData:
             assert context.monitor.budget == free.monitor.budget
         assert len(list(tmp_path.iterdir())) == 2
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["bandit", CONTROL, "slippery_walker"])
     @pytest.mark.parametrize(
         "method",

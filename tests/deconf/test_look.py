@@ -225,6 +225,7 @@ def write_csv(file: Path, trials: Trials, scale: float) -> None:
 OPTIONS = ["--trial", "vehicle", "--episode", "lap", "--obs", "speed*", "--action", "throttle"]
 
 
+@pytest.mark.slow
 def test_from_csv_to_a_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

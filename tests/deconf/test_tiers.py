@@ -47,6 +47,7 @@ def test_expert_trials_do_not_tell_theta(name: str) -> None:
         np.testing.assert_allclose(evidence, np.broadcast_to(evidence[:, :1], evidence.shape), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_nobody_wins_where_dynamics_do_not_know() -> None:
     """hidden_goal: neither exact policy comes near the expert, and the interventional one does not learn."""
     env = envs.BatchEnv(envs.get("hidden_goal"), N)
@@ -72,6 +73,7 @@ def trained(name: str, method: str, config: dict[str, Any], **amounts: Any) -> A
     return fit(Context(task, settings, [0]), method)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
 def test_tier_2_fails(name: str) -> None:
     """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
@@ -80,6 +82,7 @@ def test_tier_2_fails(name: str) -> None:
     assert scores(envs.BatchEnv(envs.get(name), N), agent)[-1] < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
 def test_who_sees_theta_can_clone(name: str) -> None:
     """What fails there is not the cloning: from as many trials, the oracle does well."""
@@ -92,6 +95,7 @@ def test_who_sees_theta_can_clone(name: str) -> None:
     assert scores(own, oracle)[-1] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "atleast"), [("deconfounded", 48), ("deconfounded_discrete", 50)])
 def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
     """Best-arm pulls of 100: exact 54 and 32; with one latent a trial, which never hears of the pay-outs, 20."""
@@ -105,6 +109,7 @@ def test_tier_2_works_on_the_bandit(method: str, atleast: float) -> None:
     assert context.monitor.budget["exploration_trials"] == [1000]
 
 
+@pytest.mark.slow
 def test_tier_3_works_at_the_fork() -> None:
     """forked_path: who is told what the expert would do at the bump learns to go where its push points."""
     agent = trained("forked_path", "dagger", {})

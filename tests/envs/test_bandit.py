@@ -37,6 +37,7 @@ def test_beliefs_by_hand() -> None:
     np.testing.assert_allclose(np.exp(conditional[0]), both / both.sum(), rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("who", "pulls", "curve"),
     [
@@ -55,6 +56,7 @@ def test_exact_policies(env: envs.BatchEnv, who: str, pulls: float, curve: list[
     np.testing.assert_allclose(best[[0, 4, 9, 19, 49, 99]], curve, atol=4 * 0.5 / np.sqrt(N) + 0.0005)
 
 
+@pytest.mark.slow
 def test_payouts(env: envs.BatchEnv) -> None:
     """Eq. (4): 3/4 for the best arm, 1/4 for others, 4 standard errors."""
     trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 1, seed=6).trials

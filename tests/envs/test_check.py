@@ -296,6 +296,7 @@ def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     assert rest == ["ok   reset_options", "ok   bounds_are_wide_enough"]
 
 
+@pytest.mark.slow
 def test_check_command_says_one_line() -> None:
     """Of a task that is not there, without a word of the interpreter's; and nothing is lost under `python -O`."""
     command = [sys.executable, "-O", "-m", "deconfounded", "check", "--task", "nowhere"]

@@ -15,6 +15,7 @@ from deconfounded.experts import policy
 TASKS = envs.names()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("check", CONTRACT)
 @pytest.mark.parametrize("name", TASKS)
 def test_contract(name: str, check: str) -> None:

@@ -132,6 +132,7 @@ def test_forgetting(kind: str) -> None:
     assert not torch.allclose(half, model.belief(memory))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in envs.SUITE if envs.get(name).drifts])
 def test_the_static_filter_loses(name: str) -> None:
     """A belief that only ever grows surer: in the last episode of 96 trials it scores .05 less, or lower still."""

@@ -35,6 +35,7 @@ def thetas(task: envs.Task, seed: int, k: int) -> Array:
 
 @pytest.mark.parametrize("name", TASKS)
 class TestTrials:
+    @pytest.mark.slow
     @pytest.mark.parametrize("episodes", [1, 3])
     def test_vector_equals_single_environments(self, name: str, episodes: int) -> None:
         """Bit for bit, with keep_theta given by hand; theta is the next of its own stream after `episodes` of them."""
@@ -147,6 +148,7 @@ def test_a_forced_theta_starts_a_trial() -> None:
 
 @pytest.mark.parametrize("name", TASKS)
 class TestTimeLimits:
+    @pytest.mark.slow
     def test_registered_limit_is_the_task_s(self, name: str) -> None:
         """The made environment truncates when ours does; only an episode that ends by itself then is called both."""
         task, n = envs.get(name), 8
@@ -242,6 +244,7 @@ def test_render_modes(name: str) -> None:
         envs.make_dm(name).render()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 @pytest.mark.parametrize("name", TASKS)
 class TestPictures:
@@ -275,6 +278,7 @@ class TestPictures:
                 since = 0
         assert ended.all()
 
+    @pytest.mark.slow
     def test_a_renderer_lives_as_long_as_its_theta(self, name: str) -> None:
         """A new one for each new theta, and for no other environment."""
         task = envs.get(name)

@@ -20,6 +20,7 @@ from tests.tools import tiny_preset
 minari = pytest.importorskip("minari")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole", "icy_road"])
 def test_the_same_in_another_process(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
