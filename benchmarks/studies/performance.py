@@ -3,9 +3,10 @@
 speed: how fast environments step (minutes). growth: CPU seconds by the steps of a trial (an update of the belief, a
 pass of the RNN) and by the values of the exact policies' grid, each with the power of n that fits best. seeds: seconds
 an update of S seeds in one program over those of one seed: S means that stacking gains nothing, 1 that the other seeds
-come for free. latency: milliseconds of an agent's step in one environment, by method (minutes). cost: score in the
-last episode against CPU seconds, for each learned method, with shares of the default preset's updates; where the curve
-is flat, a smaller share does. Each part writes a .json, and most a .png.
+come for free. training: CPU seconds of one seed of each learned method (set OMP_NUM_THREADS=1). latency: milliseconds
+of an agent's step in one environment, by method (minutes). cost: score in the last episode against CPU seconds, for
+each learned method, with shares of the default preset's updates; where the curve is flat, a smaller share does. Each
+part writes a .json, and most a .png.
 """
 
 import argparse
@@ -204,6 +205,23 @@ def cost(args: argparse.Namespace) -> None:
             grid[0, 0].legend(frameon=False, fontsize=8)
 
 
+def training(args: argparse.Namespace) -> None:
+    """Of one seed of each learned method on a task, its data included."""
+    from deconfounded.benchmarks.engine.context import Context
+    from deconfounded.benchmarks.engine.presets import preset
+    from deconfounded.benchmarks.engine.provider import fit
+    from deconfounded.deconf.core.monitor import Monitor
+
+    task, measured = envs.get(GRID), dict[str, float]()
+    settings = preset("default", task, args.device)
+    for method in LEARNED:
+        start = time.process_time()
+        fit(Context(task, settings, (0,), Monitor()), method)
+        measured[method] = round(time.process_time() - start, 3)
+        print(f"{task.name}, {method:22} {measured[method]:6.1f} CPU s")
+    write_json(args.out / "training.json", {"task": task.name, "versions": identity.versions(), "cpu_s": measured})
+
+
 def latency(args: argparse.Namespace) -> None:
     """Of each learned method on a task."""
     from deconfounded.benchmarks.studies.latency import by_method
@@ -213,7 +231,7 @@ def latency(args: argparse.Namespace) -> None:
     write_json(args.out / "latency.json", {"task": task.name, "versions": identity.versions(), "methods": measured})
 
 
-PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "latency": latency, "cost": cost}
+PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "training": training, "latency": latency, "cost": cost}
 
 
 def main() -> None:

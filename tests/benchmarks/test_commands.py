@@ -392,6 +392,7 @@ def test_time_worked_counts_overlaps_once() -> None:
     assert records.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
 def test_no_gl_is_only_a_note(backend: str) -> None:
     """Without a GL, pictures raise InputError, which run.py turns into a note."""
@@ -429,6 +430,7 @@ class TestScore:
         assert methods["other"]["ci95"] == pytest.approx([0.7, 0.8])
         assert methods["expert"]["score_last"] == 1
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("seeds", "share"), [(3, 0.75), (5, 0.84), (10, 0.89)])
     def test_few_seeds_cover_less(self, seeds: int, share: float) -> None:
         """As often as the pages say: 500 tries, four standard errors."""

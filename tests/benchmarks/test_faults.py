@@ -21,6 +21,7 @@ def test_planted_faults_are_in_step_with_the_code() -> None:
         assert all((planted.ROOT / name).is_file() for name in files), fault.name
 
 
+@pytest.mark.slow
 def test_odd_calls_are_told() -> None:
     for what, call in inputs.calls().items():
         became = inputs.called(call)

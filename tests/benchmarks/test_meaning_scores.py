@@ -144,6 +144,7 @@ def some() -> Found:
     return [(task, records.gather(of, list(METHODS))) for task, of in zip(tasks, kept, strict=True)]
 
 
+@pytest.mark.slow
 def test_a_number_in_readme_is_its_method_s(some: Found) -> None:
     """Each cell is the mean score of the task in its row, of the method over its column: on the page, and made anew."""
     expected, seen = last_of_records(), 0

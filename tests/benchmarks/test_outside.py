@@ -258,6 +258,7 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
     return context, Guest(context, "mine", f"{folder}/mine.py:fit", uses)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -278,6 +279,7 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -34,6 +34,8 @@ def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     }
     assert [*read["growth"]["steps of a trial"]["a pass of the RNN"]] == ["10", "20"]
     assert [*read["seeds"]["methods"]["naive_rnn"]] == ["1", "2"]
+    assert read["training"]["cpu_s"]["blind_bc"] > 0
+    assert 0 < read["latency"]["methods"]["blind_bc"]["median_ms"] <= read["latency"]["methods"]["blind_bc"]["p99_ms"]
     cost = read["cost-tilted_cartpole"]["methods"]
     assert [(method, *points) for method, points in cost.items()] == [("blind_bc", "0.5")]
     for name in ("speed", "growth", "cost-tilted_cartpole"):

@@ -184,6 +184,7 @@ MAKERS: dict[str, tuple[Callable[[envs.Task], Any], Steps]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*after the end of an episode")
 @pytest.mark.parametrize("how", ["deepcopy", "pickle"])
 @pytest.mark.parametrize("kind", MAKERS)

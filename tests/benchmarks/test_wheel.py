@@ -90,6 +90,7 @@ def test_they_are_whole(built: Path) -> None:
     assert {name for name in held if ".dist-info/" not in name} == ours
 
 
+@pytest.mark.slow
 def test_what_needs_a_checkout_says_so(built: Path, empty: Path) -> None:
     """At once, in a line: the studies, which no wheel has."""
     before = files(built / "site")

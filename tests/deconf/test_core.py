@@ -372,6 +372,7 @@ class TestExact:
         assert belief.max(-1).mean() > 0.8
         assert (belief * near).sum(-1).mean() < 0.6
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("conditional", [False, True])
     def test_pruned_values(self, conditional: bool) -> None:
         """In the agent's trials its belief is that of the full grid, to .01 in total variation on average.
@@ -453,6 +454,7 @@ class TestExact:
 class TestMethods:
     """Methods learn from little data; margins are wide, seeds fixed."""
 
+    @pytest.mark.slow
     def test_bandit_oracle_and_blind(self) -> None:
         trials, env = demonstrations("bandit", 500, 1)
         encode, config = env.task.encode_theta, memoryless_bc.MemorylessConfig(updates=300)
@@ -471,6 +473,7 @@ class TestMethods:
         agent = naive_rnn.train(trials, config, np.random.default_rng(0))
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3).returns.mean() < 42
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
     def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
         """The same seed gives the same agent, and neither training nor acting touches torch's global generator."""

@@ -182,6 +182,7 @@ def _bandit(n: int = 24) -> tuple[Trials, Trials]:
     return expert, run_trials(env, RandomAgent(task.action_space), task.episodes, 1).trials
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [_bandit, lambda: (trials(), trials(seed=1))], ids=["discrete", "continuous"])
 def test_measures(make) -> None:
     """Figures come out finite, for both kinds of actions, and the same again from the same seed."""

@@ -61,6 +61,7 @@ class TestEnvironments:
             np.testing.assert_array_equal(obs, expected)
             obs = batch.step(action)[0]
 
+    @pytest.mark.slow
     def test_every_trial_of_sb3_has_its_own_theta(self, name: str) -> None:
         """Episode number e of environment i has theta number e of that environment's own stream."""
         task = envs.get(name)
@@ -113,6 +114,7 @@ def test_expert_density_is_one(name: str) -> None:
 class TestData:
     """What methods are handed is what an environment without theta gives, from seeds that are nobody else's."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", ["bandit", CONTROL, "slippery_walker"])
     def test_demonstrations(self, name: str) -> None:
         """Bit for bit those of the expert in a plain environment with each seed's own stream; theta goes with them."""
@@ -291,6 +293,7 @@ def test_naive_memory_outlives_the_episode() -> None:
     assert not agent.features().any()
 
 
+@pytest.mark.slow
 def test_kl_is_of_the_posterior_from_the_prior() -> None:
     """Eq. (6): what beta adds to the loss is torch's own KL(q || p), with a prior that is not N(0, 1)."""
     model, data, draws, _ = make("evidence")
@@ -308,6 +311,7 @@ def test_kl_is_of_the_posterior_from_the_prior() -> None:
     torch.testing.assert_close(added, expected, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_offline_kl_is_of_the_posterior_from_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eq. (7) hands posterior and prior over in that order: the prior is N(0, 1), the posterior is not."""
     seen: list[tuple[torch.Tensor, ...]] = []
@@ -358,6 +362,7 @@ def test_offline_beta_rises(monkeypatch: pytest.MonkeyPatch) -> None:
     assert betas == pytest.approx([0, 0.025, 0.05, 0.075, 0.1, 0.1, 0.1, 0.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fit_prior", [True, False])
 def test_prior_is_fitted_if_asked_for(fit_prior: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     model, _ = fitted(monkeypatch, fit_prior=fit_prior)

@@ -173,6 +173,7 @@ def test_how_far_simple_guesses_get() -> None:
     assert "is right in 75% of steps, the last action in 49%" in said(look(discrete), "repeat").replace("51%", "49%")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "differ"), [("slippery_cartpole", True), ("hidden_goal", False), ("icy_stop", True)])
 def test_dynamics_of_exploration(name: str, differ: bool) -> None:
     """Where theta is in the dynamics, and where it is not; and once episodes of all trials are shuffled."""
@@ -196,6 +197,7 @@ def test_dynamics_of_an_expert() -> None:
     assert "cannot be seen" in said(look(few), "dynamics")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bandit", "tilted_cartpole"])
 def test_our_own_tasks_are_not_late_or_noisy(name: str) -> None:
     env = envs.BatchEnv(envs.get(name), 24)

@@ -58,6 +58,7 @@ def test_nobody_wins_where_dynamics_do_not_know() -> None:
     assert abs(interventional[-1] - interventional[0]) < 0.1
 
 
+@pytest.mark.slow
 def test_exact_policies_at_the_fork() -> None:
     """forked_path: the bump tells, to whom actions are no evidence; the deluded go wrong half of the time."""
     env = envs.BatchEnv(envs.get("forked_path"), N)

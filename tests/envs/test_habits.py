@@ -168,6 +168,7 @@ class TestTimeLimits:
                     break
             assert mine[2] or step == task.horizon
 
+    @pytest.mark.slow
     def test_vectors_of_gymnasium(self, name: str) -> None:
         """By the vector entry point and in a SyncVectorEnv: the same bits, over an autoreset."""
         task = envs.get(name)
@@ -306,6 +307,7 @@ class TestPictures:
         np.testing.assert_array_equal(made, [low])  # the second alone
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 def test_renderers_that_live_to_the_end_leave_in_silence() -> None:
     """The GL library is gone before the first finalizer of the process, whose place the others share."""
@@ -330,6 +332,7 @@ class TestVideos:
         recorded.close()
         film(tmp_path / "one" / "rl-video-episode-0.mp4", 11, (240, 320, 3))
 
+    @pytest.mark.slow
     @pytest.mark.skipif(not hasattr(vector, "RecordVideo"), reason="gymnasium has it from 1.2.1 on")
     def test_vector_record_video(self, tmp_path: Path) -> None:
         vec = envs.make_vec(CONTROL, 4, render_mode="rgb_array")

@@ -32,6 +32,7 @@ def expected(name: str, policy_name: str) -> float:
     return float(np.mean([line["returns"] for line in lines if line["method"] == policy_name]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TASKS)
 def test_returns_are_the_certificate_s(name: str) -> None:
     """The means of 24 episodes of expert and random actions, to four standard errors and 2% of their difference."""
