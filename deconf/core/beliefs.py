@@ -144,9 +144,8 @@ class GruMemory(nn.Module):
         return self.recurrent.weight.new_zeros(self.seeds, n, self.width)
 
     def _embed(self, batch: Batch) -> Tensor:
-        inputs = self.inputs
-        embedded = [inputs.obs(batch.obs), inputs.action(batch.action), inputs.obs(batch.next_obs)]
-        return self.input(torch.cat(embedded, -1))
+        before, after = self.inputs.obs(torch.stack([batch.obs, batch.next_obs], 1)).unbind(1)
+        return self.input(torch.cat([before, self.inputs.action(batch.action), after], -1))
 
     def forward(self, batch: Batch, memory: Tensor) -> Tensor:
         """Transitions [S, B, T, ...] after a memory [S, B, W] -> memories [S, B, T + 1, W]."""

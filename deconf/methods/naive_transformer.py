@@ -48,19 +48,20 @@ def normed(x: Tensor) -> Tensor:
 
 
 def rotation(position: Tensor, width: int) -> tuple[Tensor, Tensor]:
-    """Rotary positions: cosines and sines [..., D / 2] of angles that grow with position [...].
+    """Rotary positions: cosines, and sines with a sign, [..., D] of angles that grow with position [...].
 
     Dot products of rotated vectors depend on relative positions; wavelengths are 6 to some thousand steps.
     """
     half = width // 2
     angle = position[..., None].float() * 1000.0 ** -(torch.arange(half, device=position.device) / half)
-    return angle.cos(), angle.sin()
+    cos, sin = angle.cos(), angle.sin()
+    return torch.cat([cos, cos], -1), torch.cat([-sin, sin], -1)
 
 
 def rotated(x: Tensor, by: tuple[Tensor, Tensor]) -> Tensor:
     """Pairs of the D of x [..., D], of its first and its second half, rotated by angles of these cosines and sines."""
-    (first, second), (cos, sin) = x.chunk(2, -1), by
-    return torch.cat([first * cos - second * sin, first * sin + second * cos], -1)
+    cos, sin = by
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
 class Cache:
