@@ -155,6 +155,28 @@ class Agent(ABC):
         raise InputError(f"{cls.__name__} cannot be loaded; give it `state` and `from_state`")
 
 
+class AgentWrapper(Agent):
+    """An agent that passes on what it is asked to another; subclasses change a part of it, as gymnasium's wrappers do.
+
+    Features and state are not passed on.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        self.agent = agent
+
+    def begin(self, n: int) -> None:
+        self.agent.begin(n)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self.agent.reset(rngs)
+
+    def act(self, obs: Obs) -> Array:
+        return self.agent.act(obs)
+
+    def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:
+        self.agent.observe(obs, action, next_obs, alive)
+
+
 class _Drawing(Agent):
     """An agent that draws random numbers."""
 

@@ -20,13 +20,13 @@ from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved_agents
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, Trials, run_trials
+from deconfounded.experts.rollout import Agent, AgentWrapper, Trials, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 QUANTILE = 0.85  # of the first latent, in the trial of the video
 
 
-class Recorder(Agent):
+class Recorder(AgentWrapper):
     """Passes everything on to an agent; keeps what it knows at the end of each episode, and a clip of one trial.
 
     The clip, if it is filmed, is of the first task.episodes of that trial of the first seed whose first latent is
@@ -35,10 +35,11 @@ class Recorder(Agent):
     """
 
     def __init__(self, agent: Agent, env: envs.BatchEnv, filmed: bool = False) -> None:
-        self.agent, self.env, self.filmed = agent, env, filmed
+        super().__init__(agent)
+        self.env, self.filmed = env, filmed
 
     def begin(self, n: int) -> None:
-        self.agent.begin(n)
+        super().begin(n)
         self.features_after: list[NDArray[np.float32]] = []  # [N, F] of each episode
         self.episode = 0
         self.clip: dict[str, list[Any]] = {}
@@ -54,7 +55,7 @@ class Recorder(Agent):
             self.trial = int(np.abs(theta - np.quantile(theta, QUANTILE)).argmin())
         else:
             self.note()
-        self.agent.reset(rngs)
+        super().reset(rngs)
         self.episode += 1
         self._film(np.zeros(self.env.task.action_width))
 
@@ -67,13 +68,10 @@ class Recorder(Agent):
         for kind, value in row.items():
             self.clip.setdefault(kind, []).append(value)
 
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        return self.agent.act(obs)
-
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        self.agent.observe(obs, action, next_obs, alive)
+        super().observe(obs, action, next_obs, alive)
         if alive[self.trial]:
             self._film(action[self.trial])
 

@@ -28,7 +28,7 @@ from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs.task import Array
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.rollout import Agent, AgentWrapper
 
 MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
 
@@ -191,22 +191,8 @@ def fresh(rngs: Sequence[np.random.Generator]) -> list[int]:
     return [int(rng.integers(2**63)) for rng in rngs]
 
 
-class ReseededAgent(Agent):
+class ReseededAgent(AgentWrapper):
     """An agent of somebody else's class in this process: it gets the random numbers that it would get as a guest."""
 
-    def __init__(self, agent: Agent) -> None:
-        self.agent = agent
-
-    def begin(self, n: int) -> None:
-        self.agent.begin(n)
-
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self.agent.reset([np.random.default_rng(seed) for seed in fresh(rngs)])
-
-    def act(self, obs: NDArray[np.float32]) -> Array:
-        return self.agent.act(obs)
-
-    def observe(
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
-        self.agent.observe(obs, action, next_obs, alive)
+        super().reset([np.random.default_rng(seed) for seed in fresh(rngs)])

@@ -90,20 +90,20 @@ class Job(ABC):
 
     def load(self, seed: int) -> dict[str, Any] | None:
         """What was written of a seed: arrays, and `meta` decoded. None if there is nothing that fits: see `unfit`."""
-        found = job_files.read(self.file(seed))
-        return None if found is None or self.unfit(seed, found) else found
+        result = job_files.read(self.file(seed))
+        return None if result is None or self.unfit(seed, result) else result
 
-    def unfit(self, seed: int, found: dict[str, Any]) -> str:
+    def unfit(self, seed: int, result: dict[str, Any]) -> str:
         """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""
-        if why := job_files.broken(found):
+        if why := job_files.broken(result):
             return why
-        meta, expected = found["meta"], identity(self)
+        meta, expected = result["meta"], identity(self)
         told = meta["identity"]
         if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
             return f"it was made with another {differ[0].replace('_', ' ')}"
         if meta["seed"] != seed:
             return f"it is of seed {meta['seed']}"
-        for key, value in found.items():
+        for key, value in result.items():
             if key.endswith("/returns") and len(value) != self.preset.eval_trials:
                 return f"{key} has shape {value.shape}, for {self.preset.eval_trials} trials"
         return ""

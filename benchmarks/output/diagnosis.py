@@ -1,6 +1,7 @@
 """A diagnosis for people: index.html, which needs no other file, and diagnosis.json for programs."""
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,7 @@ def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     if about["explore"]:
         sources = f"[{source}, {about['explore']['from']!r}]"
         read = f"trials, explored = datasets.read_together({sources}{columns})  # with one range of actions\n"
-    asked = next(
-        (name for name in WRITTEN if f", {name}," in diagnosis.next.fit or f"({name}," in diagnosis.next.fit), ""
-    )
+    asked = next((name for name in WRITTEN if name in re.findall(r"\w+", diagnosis.next.fit)), "")
     own = WRITTEN[asked].format(log="explored" if about["explore"] else "trials") if asked else ""
     raw = "agent = trials.units.agent(agent)  # acts in the units of the log\n" if Units(**about["units"]).raw else ""
     return f"""import numpy as np

@@ -30,7 +30,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, run_trials
+from deconfounded.experts.rollout import Agent, AgentWrapper, ExpertAgent, run_trials
 
 SHOWN = ("naive_rnn", "deconfounded")  # in Figure 3
 LEARNERS = (*SHOWN, "deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")
@@ -39,28 +39,24 @@ WINDOW = 20  # steps of a smoothed curve, as in the paper
 COLOURS_OF_ARMS = ["#2ca02c", "#d62728", "#ff7f0e", "#9467bd", "#8c564b"]  # the first is the best arm
 
 
-class Onlooker(Agent):
+class Onlooker(AgentWrapper):
     """Sees what the expert does, and notes what it would have done itself: `would` holds [N, A] a step."""
 
     def __init__(self, agent: Agent, expert: ExpertAgent) -> None:
-        self.agent, self.expert = agent, expert
+        super().__init__(agent)
+        self.expert = expert
 
     def begin(self, n: int) -> None:
-        self.agent.begin(n)
+        super().begin(n)
         self.would: list[Array] = []
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self.agent.reset(rngs)
+        super().reset(rngs)
         self.expert.reset([np.random.default_rng(rng.integers(2**63)) for rng in rngs])
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        self.would.append(self.agent.act(obs))
+        self.would.append(super().act(obs))
         return self.expert.act(obs)
-
-    def observe(
-        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> None:
-        self.agent.observe(obs, action, next_obs, alive)
 
 
 class ExactPolicyRecorder(ExactAgent):

@@ -52,19 +52,17 @@ class GruScan(torch.autograd.Function):
         moved = 1 - keep
         to_new = (1 - new.square()).mul_(moved)  # of n's input, for each unit of the gradient of the memory
         # inner: of h U + b, which this gradient multiplies as well.
-        by_reset, by_keep = (
-            (recurrent[..., 2 * w :] * to_new).mul_(reset).mul_(1 - reset),
-            (memories[:-1] - new).mul_(keep).mul_(moved),
-        )
+        by_reset = (recurrent[..., 2 * w :] * to_new).mul_(reset).mul_(1 - reset)
+        by_keep = (memories[:-1] - new).mul_(keep).mul_(moved)
         inner = torch.stack([by_reset, by_keep, to_new * reset], -2)
+        flat = inner.flatten(-2)  # of the same memory
         grad = grads[0].permute(2, 0, 1, 3).contiguous()
         transposed = weight.transpose(1, 2).contiguous()
-        columns = (inner, inner.flatten(-2), keep, grad[:-1])
+        columns = (inner, flat, keep, grad[:-1])
         h = grad[-1]
-        for whole, flat, kept, before in zip(*(column.unbind()[::-1] for column in columns), strict=True):
-            whole.mul_(h[..., None, :])
-            h = add_product(before.addcmul_(h, kept), flat, transposed)
-        flat = inner.flatten(-2)
+        for by_gate, by_unit, kept, before in zip(*(column.unbind()[::-1] for column in columns), strict=True):
+            by_gate.mul_(h[..., None, :])
+            h = add_product(before.addcmul_(h, kept), by_unit, transposed)
         outer = torch.cat([flat[..., : 2 * w], to_new.mul_(grad[1:])], -1)
         by_weight, by_bias = parameter_gradients(*(x.transpose(0, 1).flatten(1, 2) for x in (memories[:-1], flat)))
         return outer.permute(1, 2, 0, 3), h, by_weight, by_bias, None

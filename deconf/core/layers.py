@@ -29,8 +29,9 @@ def prepare_torch() -> None:
     """
     torch.set_num_threads(1)
     if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
         for option, size in ((M_MMAP_THRESHOLD, 2**25), (M_TRIM_THRESHOLD, 2**30), (M_TOP_PAD, 2**26)):
-            ctypes.CDLL(None).mallopt(option, size)
+            libc.mallopt(option, size)
     capabilities, processor = torch.cpu.get_capabilities(), Path("/proc/cpuinfo")
     amd = processor.exists() and "AuthenticAMD" in processor.read_text(encoding="utf-8", errors="replace")
     if amd and capabilities.get("avx512_f") and not capabilities.get("amx_bf16"):
@@ -40,11 +41,18 @@ def prepare_torch() -> None:
 prepare_torch()
 
 
+def stack_differs(rows: Tensor, weight: Tensor) -> bool:
+    """Whether the product of stacked rows [S, R, I] and weights [S, I, O] has other bits than that of each seed alone.
+
+    A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors.
+    """
+    seeds, inputs, outputs = weight.shape
+    return seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1)
+
+
 def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """Add rows [S, R, I] weight [S, I, O] to out [S, R, O], with the same bits for a seed however many are stacked."""
-    seeds, inputs, outputs = weight.shape
-    # A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors: bits would differ.
-    if seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1):
+    if stack_differs(rows, weight):
         for operands in zip(out.split(1), rows.split(1), weight.split(1), strict=True):
             operands[0].baddbmm_(*operands[1:])
         return out
@@ -53,11 +61,8 @@ def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
-    seeds, inputs, outputs = weight.shape
-    # A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors: bits would differ.
-    if seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1):
-        by_seed = zip(bias.split(1), rows.split(1), weight.split(1), strict=True)
-        return torch.cat([torch.baddbmm(*operands) for operands in by_seed])
+    if stack_differs(rows, weight):
+        return torch.cat([*map(torch.baddbmm, bias.split(1), rows.split(1), weight.split(1))])
     return torch.baddbmm(bias, rows, weight)
 
 

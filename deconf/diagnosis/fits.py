@@ -52,16 +52,16 @@ def kurtosis(x: Array) -> float:
 
 
 def mended(name: str, x: Array) -> tuple[str, float]:
-    """The first of some ways to write a column that has no heavy tails, or else the best, and its excess kurtosis."""
+    """The first transform of a column that leaves no heavy tails, or else the best, and its excess kurtosis."""
     centre = float(np.median(x))
     distance = np.abs(x - centre)
     scale = 1.48 * float(np.median(distance)) or float(np.quantile(distance, 0.9)) or 1.0
     low, high = np.quantile(x, [0.005, 0.995])
-    ways = {f"arcsinh(({name} - {centre:.3g}) / {scale:.3g})": np.arcsinh((x - centre) / scale)}
+    transforms = {f"arcsinh(({name} - {centre:.3g}) / {scale:.3g})": np.arcsinh((x - centre) / scale)}
     if x.min() > 0:
-        ways[f"log({name})"] = np.log(x)
-    ways[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
-    tails = {how: kurtosis(written) for how, written in ways.items()}
+        transforms[f"log({name})"] = np.log(x)
+    transforms[f"{name} clipped to {low:.4g} and {high:.4g}"] = x.clip(low, high)
+    tails = {how: kurtosis(written) for how, written in transforms.items()}
     how = next((how for how, left in tails.items() if left < MENDED), min(tails, key=tails.__getitem__))
     return how, tails[how]
 
@@ -80,7 +80,7 @@ def copies(trials: Trials) -> tuple[list[list[int]], ...]:
         for e in np.flatnonzero(mask.any(1)):
             bits = trials.obs[b, e].tobytes() + trials.action[b, e].tobytes()
             groups[2].setdefault(hashlib.sha256(bits).digest(), []).append(b)
-    return tuple([numbers for numbers in found.values() if len(numbers) > 1] for found in groups)
+    return tuple([numbers for numbers in by_hash.values() if len(numbers) > 1] for by_hash in groups)
 
 
 def _standard(x: Array) -> Array:

@@ -111,15 +111,15 @@ class Transformer(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         x = self.embed(tokens)
+        turn = rotation(torch.arange(tokens.shape[2], device=tokens.device), self.width // self.heads)
         for i in range(self.depth):
-            x = x + self.mix[i](self._attention(self.attend[i](normed(x))))
+            x = x + self.mix[i](self._attention(self.attend[i](normed(x)), turn))
             x = x + self.narrow[i](F.gelu(self.widen[i](normed(x))))
         return normed(x)
 
-    def _attention(self, projected: Tensor) -> Tensor:
+    def _attention(self, projected: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
         """[S, B, T, 3 W] -> [S, B, T, W]."""
         qkv = projected.unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5)  # [3, S, B, H, T, D]
-        turn = rotation(torch.arange(projected.shape[2], device=projected.device), qkv.shape[-1])
         query, key = rotated(qkv[:2].flatten(1, 2), turn)
         mixed = F.scaled_dot_product_attention(query, key, qkv[2].flatten(0, 1), is_causal=True)
         return mixed.unflatten(0, projected.shape[:2]).transpose(2, 3).flatten(3)

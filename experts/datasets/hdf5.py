@@ -1,6 +1,6 @@
 """Tables of HDF5 files: robomimic's, with a group for each demonstration, and D4RL's, with flat arrays."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,14 +45,19 @@ def _rows(where: str, arrays: dict[str, Any], n: int) -> dict[str, Column]:
     for name, array in arrays.items():
         if array.ndim in (1, 2) and array.dtype.kind in "biuf" and len(array) == n:
             columns |= spread(name, np.asarray(array, float))
-    if not any(name.split(".")[0] == "actions" for name in columns):
+    if not _of("actions", columns):
         raise InputError(f"{where} has no `actions` of numbers, a row a step")
     return columns
 
 
+def _of(array: str, names: Iterable[str]) -> tuple[str, ...]:
+    """Names of an array's columns: its own, or that and a part after a dot."""
+    return tuple(name for name in names if name.split(".")[0] == array)
+
+
 def _ending(name: str, x: Column, later: dict[str, Column]) -> Column:
     """What a column would hold in a row of the next observation: no action, and what is neither stays."""
-    return np.full_like(x, np.nan) if name.split(".")[0] == "actions" else later.get(name, x)
+    return np.full_like(x, np.nan) if _of("actions", [name]) else later.get(name, x)
 
 
 def _robomimic(file: Path, data: Any) -> Table:
@@ -86,7 +91,7 @@ def _robomimic(file: Path, data: Any) -> Table:
     obs = tuple(key for key in columns if key.startswith("obs/"))
     if not obs:
         raise InputError(f"demonstrations of {file} hold no observations of numbers; pictures alone are not enough")
-    action = tuple(key for key in columns if key.split(".")[0] == "actions")
+    action = _of("actions", columns)
     columns |= {key: x for key, x in of_episodes(attributes, lengths).items() if key not in columns}
     return Table(str(file), columns, np.repeat(np.arange(len(demos)), lengths), obs, action)
 
@@ -109,8 +114,8 @@ def _d4rl(file: Path, opened: Any) -> Table:
         at = last + 1  # after each episode's last row, a row of its last observation
         columns = {key: np.insert(x, at, _ending(key, x, later)[last]) for key, x in columns.items()}
         episode = np.insert(episode, at, episode[last])
-    obs = tuple(key for key in columns if key.split(".")[0] == "observations")
+    obs = _of("observations", columns)
     if not obs:
         raise InputError(f"observations of {file} have shape {arrays['observations'].shape}; they must be [N, O]")
-    action = tuple(key for key in columns if key.split(".")[0] == "actions")
+    action = _of("actions", columns)
     return Table(str(file), columns, episode, obs, action)

@@ -119,9 +119,9 @@ def trials_of(sources: list[list[Table]], roles: Roles) -> list[Log]:
     units, said = _units(tables, parts)
     horizon = max(table.horizon for table in tables)
     logs = []
-    for group, found in zip(sources, read, strict=True):
+    for group, episodes in zip(sources, read, strict=True):
         own = roles.trial is None and all(table.trial is None for table in group)
-        logs.append(_log(group, found, units, said, horizon, own))
+        logs.append(_log(group, episodes, units, said, horizon, own))
     return logs
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import EMPTY, Column, Table
+from deconfounded.experts.datasets.table import EMPTY, Column, Table, number
 
 CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
 GAP = 1.5  # times the usual time between rows
@@ -69,7 +69,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
             " observation it led to; move it up by a row, to the observation it was chosen on"
         )
     episodes, single, lost = list[Episode](), 0, 0
-    for number, (a, b) in enumerate(bounds):
+    for i, (a, b) in enumerate(bounds):
         while b > a and np.isnan(obs[b - 1]).all():  # the observation after the last action is missing
             b -= 1
         if b - a < 2:
@@ -78,7 +78,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
         _check(table, obs_names, np.isnan(obs[a:b]), a, "holds no number")
         _check(table, action_names, empty[a : b - 1], a, "is empty")
         lost += not empty[b - 1].any()
-        episodes.append(Episode(str(number) if trial is None else _text(trial[a]), obs[a:b], action[a : b - 1]))
+        episodes.append(Episode(str(i) if trial is None else _text(trial[a]), obs[a:b], action[a : b - 1]))
     if not episodes:
         raise InputError(f"{table.where} holds no episode of two rows or more")
     notes = [*table.notes, *_notes(table, first, obs_names, action_names, single, lost)]
@@ -106,7 +106,7 @@ def _actions(table: Table, names: tuple[str, ...]) -> tuple[NDArray[Any], NDArra
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        number(cell)
     except ValueError:
         return False
     return True
@@ -158,7 +158,7 @@ def _numbers(table: Table, name: str) -> NDArray[np.float64]:
     numbers = np.full(len(column), np.nan)
     for i, cell in enumerate(column):
         try:
-            numbers[i] = np.nan if str(cell).strip().lower() in EMPTY else float(cell)
+            numbers[i] = number(cell)
         except ValueError:
             raise InputError(f"{name!r} of {table.where} is {cell!r} in row {i + 1}; it must be a number") from None
     return numbers
@@ -170,13 +170,19 @@ def _check(table: Table, names: Sequence[str], bad: NDArray[np.bool_], offset: i
         raise InputError(f"{names[column]!r} of {table.where} {what} in row {offset + row + 1}")
 
 
+def _inside(n: int, first: list[int]) -> NDArray[np.bool_]:
+    """Which of n - 1 pairs of neighbouring rows [n - 1] are of one episode. first: the first row of each episode."""
+    inside = np.ones(n - 1, bool)
+    inside[np.array(first[1:], int) - 1] = False
+    return inside
+
+
 def _repeats(table: Table, name: str, first: list[int]) -> bool:
     """Whether a column is constant in episodes, and the same in several, but not in all."""
     column = table.columns[name]
     if name.lower() in CLOCKS or not 1 < len(first) < len(column):
         return False
-    inside = np.ones(len(column) - 1, bool)
-    inside[np.array(first[1:]) - 1] = False
+    inside = _inside(len(column), first)
     return bool((column[1:] == column[:-1])[inside].all()) and 1 < len({*column[first].tolist()}) < len(first)
 
 
@@ -192,8 +198,7 @@ def _notes(
     constant = [name for name in (*obs, *action) if _constant(table.columns[name])]
     if constant:
         notes.append(f"Constant: {', '.join(constant)}.")
-    inside = np.ones(len(table) - 1, bool)
-    inside[np.array(first[1:], int) - 1] = False
+    inside = _inside(len(table), first)
     rows = np.stack([table.columns[name] for name in (*obs, *action)], 1)
     same = (rows[1:] == rows[:-1]).all(1) & inside
     clock = next((name for name in table.columns if name.lower() in CLOCKS and name not in (*obs, *action)), None)

@@ -80,6 +80,12 @@ def spread(name: str, values: NDArray[Any], parts: Sequence[str] = ()) -> dict[s
     return {f"{name}.{suffix}": values[:, i] for i, suffix in enumerate(suffixes)}
 
 
+def number(cell: Any) -> float:
+    """A cell as a number, NaN if it is empty. Raises ValueError for text."""
+    text = str(cell).strip()
+    return float("nan") if text.lower() in EMPTY else float(text)
+
+
 def label(value: Any) -> Any:
     """A scalar attribute of an episode as a column's value; None for what is no number or short text."""
     value = value.decode(errors="replace") if isinstance(value, bytes) else value

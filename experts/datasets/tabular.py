@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import EMPTY, EXTRA, Column, Table, spread
+from deconfounded.experts.datasets.table import EXTRA, Column, Table, number, spread
 
 BLOCK = 1 << 16  # rows that are converted at once
 
@@ -77,7 +77,7 @@ def _numbers(cells: tuple[str, ...]) -> Column | None:
     except ValueError:
         pass
     try:
-        return np.array([np.nan if cell.strip().lower() in EMPTY else float(cell) for cell in cells])
+        return np.array([*map(number, cells)])
     except ValueError:
         return None
 

@@ -1,6 +1,5 @@
 """Units of logs: what columns are called, and how actions of a log become actions of Trials and back."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from deconfounded.envs.streams import Array, Mask, Obs
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import saved_agents
-from deconfounded.experts.rollout import Agent, State
+from deconfounded.experts.rollout import Agent, AgentWrapper, State
 
 
 @dataclass(frozen=True)
@@ -68,24 +67,19 @@ class Units:
         return RawAgent(agent, self) if self.raw else agent
 
 
-class RawAgent(Agent):
+class RawAgent(AgentWrapper):
     """An agent that acts, and is told of actions, in the units of the log it was trained on."""
 
     def __init__(self, agent: Agent, units: Units) -> None:
-        self.agent, self.units = agent, units
-
-    def begin(self, n: int) -> None:
-        self.agent.begin(n)
-
-    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self.agent.reset(rngs)
+        super().__init__(agent)
+        self.units = units
 
     def act(self, obs: Obs) -> Array:
-        return self.units.unscaled(self.agent.act(np.asarray(obs, np.float32)))
+        return self.units.unscaled(super().act(np.asarray(obs, np.float32)))
 
     def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:
         obs, next_obs = np.asarray(obs, np.float32), np.asarray(next_obs, np.float32)
-        self.agent.observe(obs, self.units.scaled(action), next_obs, alive)
+        super().observe(obs, self.units.scaled(action), next_obs, alive)
 
     def features(self) -> NDArray[np.float32] | None:
         return self.agent.features()

@@ -163,17 +163,17 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     assert [str(error) for error in failed] == ["method my_guest_broken: no luck (ValueError, my_guest.py:18)"]
     spans = []
     for seed, mine, theirs in zip((0, 1), local, dawdling, strict=True):
-        expected, found = job_files.read(mine.file(seed)), job_files.read(theirs.file(seed))
+        expected, result = job_files.read(mine.file(seed)), job_files.read(theirs.file(seed))
         assert expected is not None
-        assert found is not None
+        assert result is not None
         for key in expected.keys() - {"meta"}:
-            np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
-        spans.append(len(found["meta"]["spans"]))
+            np.testing.assert_array_equal(result[key], expected[key], err_msg=key)
+        spans.append(len(result["meta"]["spans"]))
         for name in (f"jobs/demonstrations-{seed}.npz", f"agents/naive_rnn-{seed}/agent.safetensors"):
             assert (there.parent / name).read_bytes() == (here.parent / name).read_bytes()
-    found = guests[0].load(0)
-    assert found is not None
-    assert found["meta"]["reference"] == f"{home}/my_guest.py:fit"  # where it is here
+    result = guests[0].load(0)
+    assert result is not None
+    assert result["meta"]["reference"] == f"{home}/my_guest.py:fit"  # where it is here
     assert not list(there.glob(".*"))
     assert not list((there.parent).rglob("__pycache__"))
     deadline = time.monotonic() + 30

@@ -201,14 +201,14 @@ class TestOutcome:
     EXACT = {"interventional": entry(1, tier="reference"), "conditional": entry(0.6, tier="reference")}
 
     def test_sides(self) -> None:
-        found = scoring.outcome(
+        outcome = scoring.outcome(
             {
                 **self.EXACT,
                 **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5), "mute": entry(0.4, known=False)},
                 **{"good_episode": {**entry(0.1), "deployment": "episode"}, "oracle": entry(1, tier="sees theta")},
             }
         )
-        assert found == (
+        assert outcome == (
             "good (0.90) inferred theta, like the exact policy interventional (1.00); unsure (0.81) may be"
             " on either side of the middle between the exact policies, 0.80; bad (0.50) scored like the deluded exact"
             " policy, conditional (0.60); mute (0.40) has no memory to infer theta with. Scores of the last episode,"

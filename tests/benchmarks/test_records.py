@@ -130,10 +130,10 @@ class TestKeptFiles:
 
     def spoilt(self, job: BenchmarkJob, **changes: Any) -> str:
         """Why the file of seed 0 is not believed, with these arrays or parts of meta in the place of its own."""
-        found = job_files.read(job.file(0))
-        assert found is not None
-        meta = {**found["meta"], **{key: value for key, value in changes.items() if key in found["meta"]}}
-        arrays = {key: changes.get(key, value) for key, value in found.items() if key != "meta"}
+        result = job_files.read(job.file(0))
+        assert result is not None
+        meta = {**result["meta"], **{key: value for key, value in changes.items() if key in result["meta"]}}
+        arrays = {key: changes.get(key, value) for key, value in result.items() if key != "meta"}
         np.savez(job.file(0), meta=np.array(json.dumps(meta)), **arrays)
         assert job.load(0) is None
         spoilt = job_files.read(job.file(0))
@@ -147,17 +147,17 @@ class TestKeptFiles:
 
     def test_another_seed(self, job: BenchmarkJob) -> None:
         shutil.copy(job.file(1), job.file(0))
-        found = job_files.read(job.file(0))
-        assert found is not None
-        assert job.unfit(0, found) == "it is of seed 1"
+        result = job_files.read(job.file(0))
+        assert result is not None
+        assert job.unfit(0, result) == "it is of seed 1"
 
     def test_another_method(self, job: BenchmarkJob) -> None:
         other = replace(job, method="random", seeds=(0,))
         other.run()
         shutil.copy(other.file(0), job.file(0))
-        found = job_files.read(job.file(0))
-        assert found is not None
-        assert job.unfit(0, found) == "it was made with another method"
+        result = job_files.read(job.file(0))
+        assert result is not None
+        assert job.unfit(0, result) == "it was made with another method"
 
     def test_contents(self, job: BenchmarkJob) -> None:
         few = {"blind_bc/returns": np.ones((3, 1)), "blind_bc/objective": np.ones((3, 1))}
