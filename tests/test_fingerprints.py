@@ -1,6 +1,5 @@
 """What is kept in fingerprints.json is what today's code does, on any CPU; and a change of behaviour moves it."""
 
-import functools
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import torch
 
 from deconfounded import envs
 from deconfounded.deconf import equations
+from deconfounded.deconf.core import adam
 from deconfounded.deconf.methods import deconfounded_offline
 from tests import fingerprints
 
@@ -39,7 +39,6 @@ SOME = ["task:ant_goal", "expert:ant_goal", "method:deconfounded_gru", "method:n
 def test_the_same_on_another_cpu() -> None:
     """With two threads and the kernels of a CPU without vector extensions."""
     code = f"""
-import torch
 from tests.fingerprints import kept, problem
 torch.set_num_threads(2)
 assert torch.backends.cpu.get_cpu_capability() == "DEFAULT"
@@ -70,7 +69,7 @@ class TestChangesAreNoticed:
 
     def test_adams_epsilon(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Ten times as much: whatever trains with Adam."""
-        monkeypatch.setattr(torch.optim, "Adam", functools.partial(torch.optim.Adam, eps=1e-7))
+        monkeypatch.setattr(adam, "EPSILON", 1e-7)
         labels = {f"method:{name}" for name in LEARNED}
         assert moved(*labels, "method:conditional", "task:bandit", "scores:all") == labels
 

@@ -6,8 +6,11 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from deconfounded.envs.support.errors import InputError
+
+BETAS, EPSILON = (0.9, 0.999), 1e-8
 
 
 class Adam:
@@ -15,6 +18,7 @@ class Adam:
 
     A seed's parameters become views of one flat row, so that an update is a few operations. The newest Adam of a module
     owns its parameters: an older one raises RuntimeError when it steps. `gradient` [S, N]: the last update's, clipped.
+    `rate`: the next one's.
     """
 
     def __init__(self, modules: Iterable[nn.Module], learning_rate: float, updates: int | None = None) -> None:
@@ -29,23 +33,21 @@ class Adam:
             for p, own in zip(self.parameters, self._flat.split(sizes, 1), strict=True):
                 own.copy_(p.flatten(1))
                 p.data = own.unflatten(1, p.shape[1:])
-        # Seed by seed: the fused kernel rounds the end of a tensor otherwise than its middle.
-        by_seed = list(self._flat)
-        for row, grad in zip(by_seed, self.gradient, strict=True):
-            row.grad = grad
-        self._adam = torch.optim.Adam(by_seed, learning_rate, fused=True)
-        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._adam, updates) if updates else None
+        self.rate, self._updates = learning_rate, updates
+        self._mean, self._square = (torch.zeros_like(rows)[:, : sum(sizes)] for _ in range(2))
+        self._done = [rows.new_zeros(()) for _ in rows]
 
     def state_dict(self) -> dict[str, Any]:
-        """States of Adam and of the schedule."""
-        schedule = {} if self._schedule is None else self._schedule.state_dict()
-        return {"adam": self._adam.state_dict(), "schedule": schedule}
+        """Both moments [S, N], how many updates were made, and the learning rate of the next."""
+        return {"mean": self._mean, "square": self._square, "done": int(self._done[0]), "rate": self.rate}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore both."""
-        self._adam.load_state_dict(state["adam"])
-        if self._schedule is not None:
-            self._schedule.load_state_dict(state["schedule"])
+        """Restore all of it."""
+        self._mean.copy_(state["mean"])
+        self._square.copy_(state["square"])
+        for done in self._done:
+            done.fill_(state["done"])
+        self.rate = state["rate"]
 
     def step(self, loss: Tensor) -> None:
         """Take one step on losses [S]. Raises InputError, which names the update, where parameters would become NaN."""
@@ -58,12 +60,20 @@ class Adam:
         if not math.isfinite(sum(loss.flatten().tolist())) or math.isnan(sum(squares.tolist())):
             self._fail(loss)
         self.gradient *= (1 / (squares.sqrt() + 1e-6)).clamp(max=1)[:, None]
-        self._adam.step()
-        if self._schedule is not None:
-            self._schedule.step()
+        # Seed by seed: the fused kernel rounds the end of a tensor otherwise than its middle. torch.optim.Adam itself
+        # would import torch._dynamo: one or two seconds in every process that trains.
+        flat, clipped, mean, square = (list(x) for x in (self._flat, self.gradient, self._mean, self._square))
+        adam(
+            flat, clipped, mean, square, [], self._done, fused=True, amsgrad=False, beta1=BETAS[0], beta2=BETAS[1],
+            lr=self.rate, weight_decay=0, eps=EPSILON, maximize=False,
+        )  # fmt: skip
+        done, updates = int(self._done[0]), self._updates
+        if updates and done <= updates:  # from one rate to the next, as torch's CosineAnnealingLR
+            before, now = (1 + math.cos(math.pi * n / updates) for n in (done - 1, done))
+            self.rate = now / before * self.rate
 
     def _fail(self, loss: Tensor) -> None:
-        update = 1 + max((int(state["step"]) for state in self._adam.state.values()), default=0)
+        update = 1 + int(self._done[0])
         value = next((x for x in loss.flatten().tolist() if not math.isfinite(x)), None)
         what = "its gradient was NaN" if value is None else f"it was {value}"
         raise InputError(

@@ -159,7 +159,7 @@ def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
     optimizer, rates = Adam([layer], 0.1, 10), []
     for _ in range(10):
         optimizer.step(layer(torch.ones(2, 3, 2)).flatten(1).mean(1))
-        rates.append(optimizer.state_dict()["adam"]["param_groups"][0]["lr"])
+        rates.append(optimizer.rate)
     assert rates[4] == pytest.approx(0.05)
     assert rates[-1] == pytest.approx(0, abs=1e-9)
 
