@@ -45,8 +45,15 @@ def iqm(runs: list[Array]) -> Array:
 
 
 def profile(runs: list[Array], thresholds: Array) -> Array:
-    """Share of runs [..., S] above each threshold [K], the mean over tasks: [..., K]."""
-    return np.mean([(x[..., None, :] > thresholds[:, None]).mean(-1) for x in runs], 0)
+    """Share of runs [..., S] above each of the ascending thresholds [K], the mean over tasks: [..., K]."""
+    k, shares = len(thresholds), []
+    for x in runs:
+        passed = np.searchsorted(thresholds, x).reshape(-1, x.shape[-1])  # how many thresholds a run is above
+        cells = passed + (k + 1) * np.arange(len(passed))[:, None]
+        counts = np.bincount(cells.ravel(), minlength=(k + 1) * len(passed)).reshape(-1, k + 1)
+        above = counts[:, :0:-1].cumsum(1)[:, ::-1]
+        shares.append(above.reshape(*x.shape[:-1], k) / x.shape[-1])
+    return np.mean(shares, 0)
 
 
 def improvement(one: list[Array], other: list[Array]) -> Array:

@@ -40,11 +40,14 @@ def effect(task: Task) -> None:
 
     Actions are random, or constant along an axis, since a Tier 3 task may show theta only where one goes on purpose.
     """
-    plans, thetas = [actions(task, 1, task.horizon)], far_thetas(task)
+    plans, thetas = actions(task, 1, task.horizon), far_thetas(task)
     if isinstance(task, MujocoTask):
-        plans += [np.tile(axis, (task.horizon, 1, 1)) for axis in np.eye(task.action_width)]
-    runs = np.array([[observations(task, plan, 3, theta=theta) for plan in plans] for theta in thetas])
-    alike = (runs[1:] == runs[0]).reshape(len(thetas) - 1, -1).all(1)
+        constant = np.eye(task.action_width)[None]
+        plans = np.concatenate([plans, np.repeat(constant, task.horizon, 0)], 1)
+    j, p = len(thetas), plans.shape[1]
+    runs = observations(task, np.tile(plans, (1, j, 1)), [3] * (j * p), theta=np.repeat(thetas, p, 0))
+    runs = runs.reshape(len(runs), j, p, -1)
+    alike = (runs[:, 1:] == runs[:, :1]).all((0, 2, 3))
     if task.tier is None:
         require(alike.all(), "theta changes a trajectory, and the tier is None: nothing must tell of theta")
     else:

@@ -64,7 +64,7 @@ def actions(task: Task, n: int, steps: int) -> Array:
     return rng.integers(task.n_actions, size=shape).astype(float) if task.n_actions else rng.uniform(-1, 1, shape)
 
 
-def observations(task: Task, acts: Array, seed: int, **options: Any) -> Array:
+def observations(task: Task, acts: Array, seed: int | list[int], **options: Any) -> Array:
     """Observations [T + 1, N, O] of environments that are reset with a seed and options, and take actions [T, N, A]."""
     batch = BatchEnv(task, acts.shape[1])
     return np.array([batch.reset(seed, options)] + [batch.step(action)[0] for action in acts])
