@@ -26,6 +26,7 @@ from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.rollout import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
+LAYOUT = 2  # of checkpoints: those of another one are not gone on with
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ class JobMonitor(Monitor):
         if time.monotonic() - self.saved >= SAVE_EVERY_S:
             buffer = io.BytesIO()
             known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
-            torch.save({"training": state(), "identity": json.dumps(self.identity), **known}, buffer)
+            made_of = {"layout": LAYOUT, "identity": json.dumps(self.identity)}
+            torch.save({"training": state(), **made_of, **known}, buffer)
             write_atomically(self.file, hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
             self.saved = time.monotonic()
 
@@ -181,7 +183,7 @@ class JobMonitor(Monitor):
             if hashlib.sha256(content[32:]).digest() != content[:32]:
                 return None
             state = torch.load(io.BytesIO(content[32:]), self.device, weights_only=True)
-            if state["identity"] != json.dumps(self.identity):
+            if state["layout"] != LAYOUT or state["identity"] != json.dumps(self.identity):
                 print(f"{self.file.name} was begun with other code or amounts; training begins again")
                 return None
         except Exception:  # missing, or of other code, which torch tells in many ways: begin again

@@ -126,11 +126,11 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("figure2", "figure3", "tiers"))
 
 
-@pytest.mark.parametrize("edited", ["method", "task", "amount"])
+@pytest.mark.parametrize("edited", ["method", "task", "amount", "layout"])
 def test_a_checkpoint_of_other_code_is_refused(
     edited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One that was begun under another version of the method or the task, or other amounts, is not gone on with."""
+    """One of another version of method, task or checkpoints, or of other amounts, is not gone on with."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
     job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
@@ -141,6 +141,8 @@ def test_a_checkpoint_of_other_code_is_refused(
         monkeypatch.setattr(naive_rnn.fit, "method", replace(METHODS["naive_rnn"], version=9))
     elif edited == "task":
         monkeypatch.setattr(type(envs.get("bandit")), "version", 9)
+    elif edited == "layout":
+        monkeypatch.setattr(jobs, "LAYOUT", 9)
     else:
         job = replace(job, preset=job.preset.configured("naive_rnn", updates=13))
     assert CurveMonitor(job, 0.8).load() is None
