@@ -77,6 +77,12 @@ class ModelEdit(Edit):
         self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
         self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
 
+    def geom_friction(self, name: str, value: float) -> None:
+        try:
+            super().geom_friction(name, value)
+        except KeyError:  # a model for stepping alone has no visual geoms
+            self._nominal.geom(name)
+
     def actuator_gain(self, name: str, scale: float) -> None:
         self.model.actuator(name).gainprm[0] = self._nominal.actuator(name).gainprm[0] * scale
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from deconfounded.envs import render
 from deconfounded.envs.edits import Edit, ModelEdit
+from deconfounded.envs.models import lean, no_clock
 from deconfounded.envs.noise import ProcessNoise, columns
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.support.errors import InputError
@@ -36,21 +37,21 @@ class Physics(Simulator):
     def __init__(self, task: "MujocoTask", n: int) -> None:
         super().__init__(task, n)
         self._mujoco_task = task
-        self.models = [copy.copy(task.model) for _ in range(n)]
+        self.models = [copy.copy(task.stepped_model) for _ in range(n)]
         self._allocate()
         for i in range(n):
             self.set_theta(i, self.theta[i])
 
     def _allocate(self) -> None:
         """Create thread pools and scratch space, which belong to this process and are no part of the state."""
-        model, threads = self._mujoco_task.model, cores()
+        model, threads = self._mujoco_task.stepped_model, cores()
         self._threads = threads if threads > 1 else 0
         self._pools = {size: Handle(partial(rollout.Rollout, nthread=size)) for size in {0, self._threads}}
         self._datas = [mujoco.MjData(model) for _ in range(max(threads, 1))]
         self._warned = [data.warning.number for data in self._datas]  # views of MuJoCo's counts of warnings, by kind
         self._quiet = [np.zeros_like(warned).tobytes() for warned in self._warned]
         self._timestep = float(model.opt.timestep)
-        self._edits = [ModelEdit(edited, model, self._datas[0]) for edited in self.models]
+        self._edits = [ModelEdit(edited, self._mujoco_task.model, self._datas[0]) for edited in self.models]
         self._buffer: Array = np.empty(0)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -89,17 +90,18 @@ class Physics(Simulator):
         # Arrays are float64 and contiguous already. There is no warm start: the solver starts from scratch in every
         # control step, so that the next state is a function of this state alone.
         try:
-            self._pools[threads]().rollout(
-                models,
-                self._datas[: max(threads, 1)],
-                np.ascontiguousarray(state),
-                control,
-                nstep=steps,
-                state=out,
-                sensordata=np.empty((n, steps, models[0].nsensordata)),
-                skip_checks=True,
-                chunk_size=max(1, n // (2 * max(threads, 1))),  # two chunks a thread: each hand-over takes time
-            )
+            with no_clock():
+                self._pools[threads]().rollout(
+                    models,
+                    self._datas[: max(threads, 1)],
+                    np.ascontiguousarray(state),
+                    control,
+                    nstep=steps,
+                    state=out,
+                    sensordata=np.empty((n, steps, models[0].nsensordata)),
+                    skip_checks=True,
+                    chunk_size=max(1, n // (2 * max(threads, 1))),  # two chunks a thread: each hand-over takes time
+                )
         except mujoco.FatalError as error:  # too little memory for the solver, for example
             raise InputError(f"the physics of {self.task.name} failed: {error}") from None
         self._check_stability(models, state, control, rows, out)
@@ -184,8 +186,21 @@ class MujocoTask(Task):
 
     @cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled nominal model. It is never edited: environments copy it."""
+        """The compiled nominal model, as the MJCF has it. It is never edited."""
         return self.spec().compile()
+
+    @cached_property
+    def stepped_model(self) -> mujoco.MjModel:
+        """The nominal model without what changes no state. It is never edited: environments copy it."""
+        return lean(self.spec())
+
+    def edited(self, model: mujoco.MjModel, theta: Array) -> mujoco.MjModel:
+        """A copy of a model under theta [L]."""
+        model = copy.copy(model)
+        edit = ModelEdit(model, copy.copy(model), mujoco.MjData(model))
+        self.apply_latent(edit, theta)
+        edit.finish()
+        return model
 
     @property
     def control_dt(self) -> float:  # type: ignore[override]
@@ -235,11 +250,7 @@ class MujocoTask(Task):
     def renderer(self, theta: Array) -> Renderer:
         spec = self.spec()
         self.decorate(spec)
-        model = spec.compile()
-        edit = ModelEdit(model, copy.copy(model), mujoco.MjData(model))
-        self.apply_latent(edit, theta)
-        edit.finish()
-        return render.MujocoRenderer(model)
+        return render.MujocoRenderer(self.edited(spec.compile(), theta))
 
     def sample_noise(self, rng: Streams) -> Array:
         """Unit normal noise: of the process first, then a column for each reading."""

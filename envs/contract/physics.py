@@ -10,6 +10,7 @@ from deconfounded.envs.adapters import GymEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract.probe import Skipped, actions, beyond_bounds, far_thetas, gl_works, require, same
 from deconfounded.envs.edits import SpecEdit
+from deconfounded.envs.models import lean
 from deconfounded.envs.physics import STATE, MujocoTask
 from deconfounded.envs.render import gravity_in_view, level
 from deconfounded.envs.task import Task
@@ -37,7 +38,7 @@ def set_in_place_equals_recompiled(task: MujocoTask) -> None:
         simulator.set_theta(0, theta)
         spec = task.spec()
         task.apply_latent(SpecEdit(spec), theta)
-        same_model(simulator.models[0], spec.compile(), f"set in place and compiled with theta {theta.tolist()}")
+        same_model(simulator.models[0], lean(spec), f"set in place and compiled with theta {theta.tolist()}")
 
 
 def nominal_model_is_not_touched(task: MujocoTask) -> None:
@@ -62,21 +63,22 @@ def same_model(model: mujoco.MjModel, other: mujoco.MjModel, what: str) -> None:
 
 
 def rollout_equals_single_steps(task: MujocoTask) -> None:
-    """The thread pool gives the states of mj_step, without a warm start at a control step."""
-    batch = BatchEnv(task, 3)
+    """The thread pool gives the states of mj_step on the whole model, without a warm start at a control step."""
+    batch, size = BatchEnv(task, 3), mujoco.mj_stateSize(task.model, STATE.value)  # without the readings
     batch.reset(4)
-    action = actions(task, 3, 1)[0]
-    outcome = batch.simulator.outcome(batch.state, action)
-    for i, model in enumerate(batch.simulator.models):  # type: ignore[attr-defined]
-        data = mujoco.MjData(model)
-        size = mujoco.mj_stateSize(model, STATE.value)  # without the readings
-        mujoco.mj_setState(model, data, batch.state[i, :size], STATE.value)
-        data.ctrl[:] = task.control(action)[i]
-        for _ in range(task.substeps):
-            mujoco.mj_step(model, data)
-        state = np.zeros(size)
-        mujoco.mj_getState(model, data, state, STATE.value)
-        same(outcome[i, :size], state, "states of the thread pool and of mj_step")
+    models = [task.edited(task.model, theta) for theta in batch.theta]
+    datas, state = [mujoco.MjData(model) for model in models], np.zeros(size)
+    for action in actions(task, 3, 12):
+        outcome, control = batch.simulator.outcome(batch.state, action), task.control(action[:, None])[:, 0]
+        for i, (model, data) in enumerate(zip(models, datas, strict=True)):
+            mujoco.mj_resetData(model, data)
+            mujoco.mj_setState(model, data, batch.state[i, :size], STATE.value)
+            data.ctrl[:] = control[i]
+            for _ in range(task.substeps):
+                mujoco.mj_step(model, data)
+            mujoco.mj_getState(model, data, state, STATE.value)
+            same(outcome[i, :size], state, "states of the thread pool and of mj_step on the whole model")
+        batch.step(action)
 
 
 def every_element_is_named(task: MujocoTask) -> None:
