@@ -102,11 +102,11 @@ class BatchEnv:
         if mask.dtype != bool or mask.shape not in ((), (self.n,)):
             right = f"True, False, or bool of shape ({self.n},), one for each environment"
             raise InputError(f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be {right}")
-        return np.broadcast_to(mask, self.n)
+        return mask if mask.shape else np.full(self.n, mask)
 
     def observe(self) -> Obs:
         """Observations [N, O] of the present states; the privileged view appends the encoded theta."""
-        obs = np.clip(self.task.observe(self.state).astype(np.float32), self._space.low, self._space.high)
+        obs = self.task.observe(self.state).astype(np.float32).clip(self._space.low, self._space.high)
         if self.privileged:
             obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
         return obs
@@ -129,11 +129,12 @@ class BatchEnv:
         rows = np.flatnonzero(self.alive) if over.any() else None
         on = slice(None) if rows is None else rows
         before, taken, noise = self.state[on], checked[on], self._noise[self._all_rows[on], self._steps[on]]
+        theta = self.theta[on]
         self.action[on] = taken
         after = task.apply_noise(self.simulator.outcome(before, taken, rows), noise)
-        after = task.sense(after, self.theta[on], noise)
+        after = task.sense(after, theta, noise)
         reward, terminated, truncated = np.zeros(self.n), np.zeros(self.n, bool), np.zeros(self.n, bool)
-        reward[on] = task.reward(before, taken, after, self.theta[on])
+        reward[on] = task.reward(before, taken, after, theta)
         terminated[on] = task.terminated(after)
         self._steps[on] += 1
         truncated[on] = self._steps[on] >= task.horizon

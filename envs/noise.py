@@ -63,11 +63,17 @@ class ProcessNoise:
             self.size += len(drawn)
         index, draws, sigma = zip(*plain, strict=True) if plain else ((), (), ())
         self._index, self._draws, self._sigma = np.array(index, int), np.array(draws, int), np.array(sigma, float)
+        # `apply` takes the coordinates in the state's order, in which they are a slice as a rule, without a gather
+        order = np.argsort(self._index)
+        first, n = (int(self._index.min()), len(plain)) if plain else (0, 0)
+        whole = (self._index[order] == np.arange(first, first + n)).all()
+        self._place: slice | NDArray[np.int64] = slice(first, first + n) if whole else self._index[order]
+        self._place_draws, self._place_sigma = self._draws[order], self._sigma[order]
         self.columns: NDArray[np.int64] = np.sort(np.concatenate([self._index, *(at for at, _, _ in self._rotations)]))
 
     def apply(self, outcome: Array, noise: Array) -> Array:
         """Outcome [N, S] and unit noise [N, Z] -> next state [N, S], in place; quaternions stay of unit length."""
-        outcome[:, self._index] += self._sigma * noise[:, self._draws]
+        outcome[:, self._place] += self._place_sigma * noise[:, self._place_draws]
         for at, drawn, std in self._rotations:
             w = std * noise[:, drawn]  # rad
             half = np.linalg.norm(w, axis=-1, keepdims=True) / 2
@@ -110,8 +116,8 @@ def _parts(model: mujoco.MjModel, joint: str, stds: tuple[float, ...]) -> list[t
 
 def _product(p: Array, q: Array) -> Array:
     """Product p q [..., 4] of quaternions [..., 4]: q's rotation, then p's."""
-    a, b, c, d = np.moveaxis(p, -1, 0)
-    e, f, g, h = np.moveaxis(q, -1, 0)
+    a, b, c, d = (p[..., i] for i in range(4))
+    e, f, g, h = (q[..., i] for i in range(4))
     real, x = a * e - b * f - c * g - d * h, a * f + b * e + c * h - d * g
     y, z = a * g - b * h + c * e + d * f, a * h + b * g - c * f + d * e
     return np.stack([real, x, y, z], -1)

@@ -73,7 +73,11 @@ class Physics(Simulator):
         if self._buffer.size < (size := int(np.prod(shape))):  # kept, as large arrays are slow to allocate
             self._buffer = np.empty(size)
         rolled = self._roll(state[:, :physical], action[:, None], rows, self._buffer[:size].reshape(shape))[:, -1]
-        return np.pad(rolled, ((0, 0), (0, width - physical))) if width > physical else rolled.copy()
+        if width == physical:
+            return rolled.copy()
+        outcome = np.zeros((len(state), width))
+        outcome[:, :physical] = rolled
+        return outcome
 
     def rollout(self, state: Array, action: Array) -> Array:
         """Noise-free states [n, T * substeps, S - readings] from states [n, S] and actions [n, T, A], in open loop."""
@@ -221,13 +225,19 @@ class MujocoTask(Task):
         """
         pairs = [zip(self._address(joint), pair, strict=True) for joint, pair in joints.items()]
         values = [(at, np.asarray(value, float)) for pair in pairs for at, value in pair]
-        rows = (value.shape if isinstance(at, int) else value.shape[:-1] for at, value in values)
-        width = mujoco.mj_stateSize(self.model, STATE.value) + self.readings
-        state = np.zeros((*np.broadcast_shapes((1,), *rows), width))
-        state[:, 1 : 1 + self.model.nq] = self.model.qpos0
+        rows = {value.shape if isinstance(at, int) else value.shape[:-1] for at, value in values}
+        state = np.empty((*np.broadcast_shapes((1,), *rows), len(self._rest)))
+        state[:] = self._rest
         for at, value in values:
             state[:, at] = value
         return state
+
+    @cached_property
+    def _rest(self) -> Array:
+        """The state [S] at the MJCF's rest."""
+        rest = np.zeros(mujoco.mj_stateSize(self.model, STATE.value) + self.readings)
+        rest[1 : 1 + self.model.nq] = self.model.qpos0
+        return rest
 
     def _address(self, joint: str) -> tuple[int | slice, int | slice]:
         if joint not in self._addresses:

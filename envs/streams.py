@@ -23,16 +23,23 @@ class Streams:
 
     def random(self, size: tuple[int, ...]) -> Array:
         """Draws from U(0, 1) of a given size, whose first axis is rows: an equal group of them from each generator."""
-        return np.concatenate([rng.random((size[0] // self.groups, *size[1:])) for rng in self.rngs])
+        out = np.empty(size)
+        for rng, rows in zip(self.rngs, out.reshape(self.groups, size[0] // self.groups, *size[1:]), strict=True):
+            rng.random(out=rows)
+        return out
 
     def standard_normal(self, size: tuple[int, ...]) -> Array:
         """Draws from N(0, 1) of a given size, whose first axis is rows: an equal group of them from each generator."""
-        return np.concatenate([rng.standard_normal((size[0] // self.groups, *size[1:])) for rng in self.rngs])
+        out = np.empty(size)
+        for rng, rows in zip(self.rngs, out.reshape(self.groups, size[0] // self.groups, *size[1:]), strict=True):
+            rng.standard_normal(out=rows)
+        return out
 
     def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:
         """Draws from U(low, high) with bounds [K], a row for each generator: K columns [K, groups], to be unpacked."""
-        low, high = np.broadcast_arrays(np.asarray(low, float), high)
-        return (low + (high - low) * self.random((self.groups, len(low)))).T
+        low = np.asarray(low, float)
+        span = high - low
+        return (low + span * self.random((self.groups, len(span)))).T
 
 
 def unseeded(rng: np.random.Generator) -> np.random.Generator:

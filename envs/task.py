@@ -233,7 +233,7 @@ class Task(ABC):
         if not np.isfinite(array).all():
             raise InputError(f"action of {self.name} held NaN or infinity; every entry must be a finite number")
         if isinstance(self.action_space, spaces.Box):
-            return np.clip(array, self.action_space.low, self.action_space.high)
+            return array.clip(self.action_space.low, self.action_space.high)
         if ((array != np.floor(array)) | (array < 0) | (array >= self.n_actions)).any():
             last = self.n_actions - 1
             raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")

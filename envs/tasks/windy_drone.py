@@ -27,11 +27,17 @@ MIXING = np.array([[1, 1, -1, 1], [1, -1, -1, -1], [1, 1, 1, -1], [1, -1, 1, 1]]
 HOVER, SHARE = 3.0, np.array((2.75, 0.33, 0.33, 0.25))  # N, of each rotor
 
 
-def rotated(quaternion: Array) -> Array:
-    """World coordinates [..., 6] of the x and the z axis of a body with attitude [..., 4], a quaternion."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    forward = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-    return np.stack([*forward, 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
+def upward(quaternion: Array) -> Array:
+    """World coordinate z [...] of the z axis of a body with attitude [..., 4], a quaternion."""
+    x, y = quaternion[..., 1], quaternion[..., 2]
+    return 1 - 2 * (x * x + y * y)
+
+
+def rotated(quaternion: Array) -> list[Array]:
+    """World coordinates, six of [...], of the x and the z axis of a body with attitude [..., 4], a quaternion."""
+    w, x, y, z = (quaternion[..., i] for i in range(4))
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    return [*forward, 2 * (x * z + w * y), 2 * (y * z - w * x), upward(quaternion)]
 
 
 class WindyDrone(MujocoTask):
@@ -59,7 +65,7 @@ class WindyDrone(MujocoTask):
 
     def init_state(self, rng: Streams) -> Array:
         spread = np.repeat((0.05, 0.1, 0.1, 0.2), 3)
-        drawn = np.moveaxis(rng.uniform(-spread, spread), 0, -1)
+        drawn = rng.uniform(-spread, spread).T
         turn = np.concatenate([np.ones((len(drawn), 1)), drawn[:, 3:6] / 2], -1)
         place = drawn[:, :3] + (0, 0, HEIGHT)
         attitude = turn / np.linalg.norm(turn, axis=-1, keepdims=True)
@@ -67,7 +73,9 @@ class WindyDrone(MujocoTask):
 
     def observe(self, state: Array) -> Array:
         flight = self.qpos(state, "flight")
-        return np.concatenate([flight[..., 2:3] - HEIGHT, rotated(flight[..., 3:]), self.qvel(state, "flight")], -1)
+        velocities = self.qvel(state, "flight")
+        axes = rotated(flight[..., 3:])
+        return np.stack([flight[..., 2] - HEIGHT, *axes, *(velocities[..., i] for i in range(6))], -1)
 
     def _off(self, state: Array) -> Array:
         return np.linalg.norm(self.qpos(state, "flight")[..., :3] - (0, 0, HEIGHT), axis=-1)
@@ -77,5 +85,4 @@ class WindyDrone(MujocoTask):
         return 0.7 * np.exp(-0.5 * (off / 0.25) ** 2) + 0.3 * np.exp(-off)
 
     def terminated(self, state: Array) -> Mask:
-        upward = rotated(self.qpos(state, "flight")[..., 3:])[..., 5]
-        return (self._off(state) > LOST) | (upward < 0)
+        return (self._off(state) > LOST) | (upward(self.qpos(state, "flight")[..., 3:]) < 0)
