@@ -37,7 +37,7 @@ class Streams:
 
     def uniform(self, low: ArrayLike, high: ArrayLike) -> Array:
         """Draws from U(low, high) with bounds [K], a row for each generator: K columns [K, groups], to be unpacked."""
-        low = np.asarray(low, float)
+        low, high = np.asarray(low, float), np.asarray(high, float)
         span = high - low
         return (low + span * self.random((self.groups, len(span)))).T
 
