@@ -1,6 +1,7 @@
 """What the benchmark costs: `deconf performance` (hours), or some of its parts: `deconf performance speed growth`
 
-speed: how fast environments step (minutes). growth: CPU seconds by the steps of a trial (an update of the belief, a
+speed: how fast environments step (minutes). peer: EnvPool beside ours, on its models (a minute; `pip install
+envpool`; only where it is named). growth: CPU seconds by the steps of a trial (an update of the belief, a
 pass of the RNN) and by the values of the exact policies' grid, each with the power of n that fits best. seeds: seconds
 an update of S seeds in one program over those of one seed: S means that stacking gains nothing, 1 that the other seeds
 come for free. training: CPU seconds of one seed of each learned method (set OMP_NUM_THREADS=1). latency: milliseconds
@@ -53,6 +54,14 @@ def speed(args: argparse.Namespace) -> None:
     made = {**about, "versions": identity.versions(), "tasks": measured, "envpool": peer}
     write_json(args.out / "speed.json", made)
     stepping.picture(measured, args.out / "speed.png")
+
+
+def peer(args: argparse.Namespace) -> None:
+    """EnvPool beside our vector environment."""
+    from deconfounded.benchmarks.studies.peer import against_envpool
+
+    about = {"machine": f"{platform.machine()}, {cores()} threads", "versions": identity.versions()}
+    write_json(args.out / "peer.json", {**about, **against_envpool()})
 
 
 def by_steps(steps: int) -> dict[str, float]:
@@ -231,7 +240,15 @@ def latency(args: argparse.Namespace) -> None:
     write_json(args.out / "latency.json", {"task": task.name, "versions": identity.versions(), "methods": measured})
 
 
-PARTS = {"speed": speed, "growth": growth, "seeds": seeds, "training": training, "latency": latency, "cost": cost}
+PARTS = {
+    "speed": speed,
+    "peer": peer,
+    "growth": growth,
+    "seeds": seeds,
+    "training": training,
+    "latency": latency,
+    "cost": cost,
+}
 
 
 def main() -> None:
@@ -245,6 +262,6 @@ def main() -> None:
     args.tasks = [envs.get(name) for name in args.tasks]
     commands.check_device(args.device)
     check_folder(args.out)
-    for part in args.parts or PARTS:
+    for part in args.parts or [part for part in PARTS if part != "peer"]:
         PARTS[part](args)
     print(f"-> {args.out}")
