@@ -5,6 +5,8 @@ and hidden latents are those of our tasks with these bodies. EnvPool (C++) bring
 measured on the same MJCF, in one thread of ours, times the threads.
 """
 
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -38,7 +40,7 @@ class HalfCheetah(CheetahSpeed):
 class Ant(AntGoal):
     """Gymnasium's, with the reward and the bearings of `ant_goal`, and with gymnasium's end of an episode."""
 
-    substeps, horizon, controls = FRAME_SKIP, LIMIT, (0.0, 1.0)
+    substeps, horizon, controls = FRAME_SKIP, LIMIT, (np.zeros(8), np.ones(8))
 
     def spec(self) -> mujoco.MjSpec:
         return gymnasium_body.load("ant", TIMESTEP)
@@ -49,6 +51,11 @@ class Ant(AntGoal):
 
 
 PEERS: dict[str, type[envs.MujocoTask]] = {"HalfCheetah-v4": HalfCheetah, "Ant-v4": Ant}
+
+
+def _steps(env: Any, actions: Array) -> None:
+    for action in actions:
+        env.step(action)
 
 
 def against_envpool() -> dict[str, Any]:
@@ -63,9 +70,9 @@ def against_envpool() -> dict[str, Any]:
         theirs = envpool.make(name, env_type="gymnasium", num_envs=ENVIRONMENTS, num_threads=cores(), seed=0)
         theirs.reset()
         actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, ENVIRONMENTS, task.action_width))
-        runs = {
+        runs: dict[str, Callable[[], object]] = {
             "ours": closed_loop(envs.GymVectorEnv(task, ENVIRONMENTS), actions),
-            "envpool": lambda theirs=theirs, actions=actions: [theirs.step(action) for action in actions],
+            "envpool": partial(_steps, theirs, actions),
             "mj_step": raw(task.model, PHYSICS),
         }
         counts = {**dict.fromkeys(("ours", "envpool"), STEPS * ENVIRONMENTS), "mj_step": PHYSICS * cores() / FRAME_SKIP}
