@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from multiprocessing.connection import Client, Connection
 from typing import Any
 
@@ -96,7 +97,8 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
             except Exception as error:
                 send("done", error_line(error), time.process_time())
     except (Exception, SystemExit) as error:  # among them that the other end is gone
-        send("failed", error_line(error))
+        file = outside.file(reference)
+        send("failed", error_line(error, file and file.parent), "".join(traceback.format_exception(error)))
 
 
 def _end_with_parent() -> None:

@@ -234,7 +234,9 @@ class Task(ABC):
             raise InputError(f"action of {self.name} held NaN or infinity; every entry must be a finite number")
         if isinstance(self.action_space, spaces.Box):
             return array.clip(self.action_space.low, self.action_space.high)
-        if ((array != np.floor(array)) | (array < 0) | (array >= self.n_actions)).any():
-            last = self.n_actions - 1
-            raise InputError(f"action of {self.name} was {array.ravel()}; each must be a whole number 0..{last}")
+        wrong = (array != np.floor(array)) | (array < 0) | (array >= self.n_actions)
+        if wrong.any():
+            others = f", and {wrong.sum() - 1} others were as wrong" if wrong.sum() > 1 else ""
+            each = f"each must be a whole number 0..{self.n_actions - 1}"
+            raise InputError(f"action of {self.name} was {array[wrong][0]:g}{others}; {each}")
         return array

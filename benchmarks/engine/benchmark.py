@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import label
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.engine.guest_host import Guest
+from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -112,6 +112,8 @@ class BenchmarkJob(Job):
         with contextlib.ExitStack() as guests:
             if self.guest is None:
                 agents = deployed(self.method, fit(context, self.method))
+            elif not self.walled:
+                agents = {"": fit_guest(context, self.method, self.guest)}
             else:
                 guest = Guest(context, self.method, self.guest.reference, self.guest.uses)
                 agents = {"": guests.enter_context(contextlib.closing(guest))}

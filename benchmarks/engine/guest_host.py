@@ -26,7 +26,10 @@ import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import Method
 from deconfounded.deconf.wire import unpack
+from deconfounded.envs.support import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts.rollout import Agent, AgentWrapper
 
@@ -99,7 +102,9 @@ class Guest(Agent):
         if not isinstance(said, list) or not said or not isinstance(said[0], str):
             raise envs.InputError(f"method {self.name}: it said {said!r}, out of turn")
         if said[0] == "failed":
-            raise envs.InputError(f"method {self.name}: {said[1]}")
+            failure = envs.InputError(f"method {self.name}: {said[1]}")
+            failure.add_note(str(said[-1]))  # its traceback
+            raise failure
         return said
 
     def _fit(self) -> None:
@@ -196,3 +201,23 @@ class ReseededAgent(AgentWrapper):
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset([np.random.default_rng(seed) for seed in fresh(rngs)])
+
+    def features(self) -> NDArray[np.float32] | None:
+        return self.agent.features()
+
+
+def fit_guest(context: Context, name: str, method: Method) -> Agent:
+    """The agent of a method from outside, fitted in this process to the data that `Guest` would hand it."""
+    provider, function = Provider(context, method.uses, context.rngs), outside.find("method", method.reference)
+    provider.open -= {"acting theta"}
+
+    def ask(kind: str, *details: Any, agent: Agent | None = None) -> Any:
+        return provider(kind, *details, agent=agent and ReseededAgent(agent))
+
+    rngs = [np.random.default_rng(stream(GUEST, context.seeds[0], context.salt))]
+    config = function.method.config(context.preset.configs.get(name, {}))
+    agent = function(Given(ask, provider.about(), config, rngs, context.monitor))
+    provider.fitted = True
+    if not isinstance(agent, Agent):
+        raise envs.InputError(f"method {name} returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
+    return ReseededAgent(agent)

@@ -98,4 +98,20 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")
     before, now = read_sealed(file), json.loads(json.dumps(settings))
     if differ := [key for key in {**now, **before} if before.get(key) != now.get(key)]:
-        raise envs.InputError(f"{folder} holds a run that differs in its {differ[0]}; give another --out, or remove it")
+        which = differing(differ[0], before.get(differ[0]), now.get(differ[0]))
+        raise envs.InputError(f"{folder} holds a run that differs in its {which}; give another --out, or remove it")
+
+
+def differing(key: str, before: Any, now: Any) -> str:
+    """What differs in two values under a key, e.g. `versions (torch was 2.13.0, is 2.14.0)`; at most three parts."""
+
+    def parts(name: str, one: Any, other: Any) -> list[str]:
+        if isinstance(one, dict) and isinstance(other, dict):
+            inner = [(f"{name}.{each}".lstrip("."), one.get(each), other.get(each)) for each in {**one, **other}]
+            return [part for each in inner if each[1] != each[2] for part in parts(*each)]
+        was, now = ("none" if each is None else str(each)[:60] or "empty" for each in (one, other))
+        return [f"{name} was {was}, is {now}".lstrip()]
+
+    found = parts("", before, now)
+    more = f", and {len(found) - 3} more" if len(found) > 3 else ""
+    return f"{key} ({'; '.join(found[:3])}{more})"

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from deconfounded import envs
+from deconfounded import __version__, envs
 from deconfounded.benchmarks.engine import job_files
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.context import Context
@@ -43,6 +43,7 @@ class Job(ABC):
     guest: Method | None = None  # a method from outside
     salts: tuple[str, str] | None = None  # of a guest's training and evaluation; None: drawn
     track: bool = False  # whether losses go to TensorBoard as they come
+    walled: bool = True  # whether a guest has a process of its own
 
     @property
     def about(self) -> Method:
@@ -84,7 +85,7 @@ class Job(ABC):
         if monitor.last_edit != last_edit() and version:  # not the code of that commit alone
             version = f"{version.rstrip('+')}+"
         origin = {"identity": monitor.identity, "seed": seed, "commit": version, "machine": machine(monitor.device)}
-        origin |= {"reference": self.about.reference, "arrays": list(arrays)}
+        origin |= {"package": __version__, "reference": self.about.reference, "arrays": list(arrays)}
         whole = {**meta, **origin, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
         np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
@@ -101,7 +102,8 @@ class Job(ABC):
         meta, expected = result["meta"], identity(self)
         told = meta["identity"]
         if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
-            return f"it was made with another {differ[0].replace('_', ' ')}"
+            which = job_files.differing(differ[0], told.get(differ[0]), expected.get(differ[0]))
+            return f"it was made with another {which}"
         if meta["seed"] != seed:
             return f"it is of seed {meta['seed']}"
         for key, value in result.items():

@@ -1,4 +1,4 @@
-"""Jobs in processes of this machine, one a core."""
+"""Jobs in processes of this machine, one a core; or, to debug a method, in this one."""
 
 import multiprocessing
 import os
@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.queues import Queue
+from queue import SimpleQueue
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import escape_output
@@ -101,3 +102,21 @@ class Local(Engine):
             if isinstance(error, BrokenProcessPool):
                 raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
             raise
+
+
+class Here(Engine):
+    """This process, one job after another: for a debugger. What a job raises is raised here."""
+
+    def __exit__(self, *error: object) -> None:
+        pass
+
+    def slots(self, device: str) -> int:
+        return 1
+
+    def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
+        told = SimpleQueue[int]()
+        progress.tell(told)
+        for job in jobs:
+            say(job, job.run())
+            while not told.empty():
+                tick(told.get())

@@ -4,6 +4,8 @@ import sys
 import time
 from typing import Any, Protocol
 
+BAR = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}<{remaining}{postfix}"  # ticks have no unit that says anything
+
 
 class Progress:
     """A bar with an ETA on a terminal; elsewhere a plain line now and then."""
@@ -15,7 +17,7 @@ class Progress:
         if sys.stderr.isatty():
             from tqdm import tqdm  # who has the environments alone has no bars
 
-            self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False)
+            self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False, bar_format=BAR)
 
     def update(self, n: int, note: str = "") -> None:
         """n more are done."""

@@ -15,6 +15,7 @@ from deconfounded.benchmarks.engine.job_files import Finished, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.errors import InputError, error_line
+from deconfounded.envs.support.files import check_folder, write_atomically
 
 
 class Work(Protocol):
@@ -92,7 +93,7 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         if not job.context().has_demonstrations(seed)
     ]
     run_jobs(first, label, engine.run)
-    run_jobs(parts, label, engine.run)
+    run_jobs(parts, label, engine.run, folder.parent / "errors")
     for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
         stale.unlink()
     done = written(every[0], folder)
@@ -116,16 +117,26 @@ def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]
     return [tuple(part.tolist()) for part in np.array_split(left, n)] if left else []
 
 
-def run_jobs(jobs: list[Some], label: str, run: Run[Some]) -> None:
-    """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say."""
+def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None = None) -> None:
+    """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say.
+
+    errors: a folder that keeps the tracebacks of methods from outside that failed, until they do not.
+    """
     if not jobs:
         return
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
     def say(job: Some, outcome: str | Exception) -> None:
+        file = errors and errors / f"{job.method}-{'-'.join(map(str, job.seeds))}.txt"
+        if file is not None:
+            file.unlink(missing_ok=True)
         if isinstance(outcome, Exception):
             failed.append(outcome)
             outcome = f"failed: {outcome}"
+            if file is not None and (traces := getattr(failed[-1], "__notes__", ())):
+                check_folder(file.parent)
+                write_atomically(file, "\n".join(traces))
+                outcome += f"; its traceback: {file}"
         progress.line(f"{job.method}, {listed(job.seeds)}: {outcome}")
 
     run(jobs, progress.update, say)
