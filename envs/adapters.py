@@ -64,12 +64,15 @@ class GymEnv(gym.Env[Any, Any]):
     """One environment with gymnasium's interface: the batch of one.
 
     `reset(options={"keep_theta": True})` starts the next episode of a trial; `options={"theta": [...]}` forces theta.
-    theta is in no info, and in no observation unless privileged=True, for experts. Raises InputError for bad input.
+    With `episodes`, a reset without seed and options does so too, until the trial has had as many: for clients that
+    reset without options. theta is in no info, and in no observation unless privileged=True, for experts. Raises
+    InputError for bad input.
     """
 
-    def __init__(self, task: Task, privileged: bool = False, render_mode: str | None = None) -> None:
+    def __init__(self, task: Task, privileged: bool = False, render_mode: str | None = None, episodes: int = 1) -> None:
+        check_number("episodes", episodes)
         self.metadata = _metadata(task, render_mode)
-        self.task, self.render_mode = task, render_mode
+        self.task, self.render_mode, self.episodes, self._episode = task, render_mode, episodes, 0
         self.batch = BatchEnv(task, 1, privileged)
         self.observation_space = _observation_space(task, privileged)
         self.action_space = copy.deepcopy(task.action_space)
@@ -78,7 +81,11 @@ class GymEnv(gym.Env[Any, Any]):
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
         super().reset(seed=seed)
         self._warned = False
-        return self.batch.reset(seed, options)[0], {}
+        if seed is None and not options and 0 < self._episode < self.episodes:
+            options = {"keep_theta": True}
+        obs = self.batch.reset(seed, options)[0]
+        self._episode = self._episode + 1 if (options or {}).get("keep_theta", False) else 1
+        return obs, {}
 
     def step(self, action: Any) -> tuple[Obs, float, bool, bool, Info]:
         row, alive = _array(action), self.batch.alive
@@ -95,16 +102,26 @@ class GymEnv(gym.Env[Any, Any]):
 class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
 
-    A finished environment is reset by the next step (AutoresetMode.NEXT_STEP): under the same theta until its trial has
-    had `episodes` episodes, then under a new theta. `reset` takes the options of GymEnv.reset; keep_theta may be a mask
+    A finished environment is reset by the next step, or with AutoresetMode.SAME_STEP by the step that finished it, and
+    info then has `final_obs`: under the same theta until its trial has had `episodes` episodes, then under a new theta.
+    `reset` takes the options of GymEnv.reset; keep_theta may be a mask
     [N]: where True, the next episode of the trial starts, elsewhere the first episode of a new trial.
     """
 
     def __init__(
-        self, task: Task, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
+        self,
+        task: Task,
+        n: int,
+        privileged: bool = False,
+        episodes: int = 1,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         check_number("episodes", episodes)
-        self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode.NEXT_STEP}
+        if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
+            right = "it must be AutoresetMode.NEXT_STEP or SAME_STEP"
+            raise InputError(f"autoreset_mode of {task.name} was {autoreset_mode!r}; {right}")
+        self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode(autoreset_mode)}
         self.batch = BatchEnv(task, n, privileged)
         self.task, self.num_envs, self.episodes, self.render_mode = task, n, episodes, render_mode
         self._pictures, self._episode = _Pictures(self.batch), np.zeros(n, int)
@@ -120,14 +137,20 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         return obs, {}
 
     def step(self, actions: Any) -> tuple[Obs, NDArray[Any], Mask, Mask, Info]:
-        rows, alive = _array(actions), self.batch.alive
+        rows, over = _array(actions), ~self.batch.alive
         ended = self.batch.advance(rows[:, None] if rows.ndim == 1 else rows)
-        if alive.all():
-            return self.batch.observe(), *ended, {}
+        info: Info = {}
+        if self.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP and (over := ~self.batch.alive).any():
+            final, last = np.full(self.num_envs, None, object), self.batch.observe()
+            for i in np.flatnonzero(over):
+                final[i] = last[i]
+            info = {"final_obs": final, "_final_obs": over, "final_info": {}, "_final_info": over.copy()}
+        if not over.any():
+            return self.batch.observe(), *ended, info
         keep = self._episode < self.episodes
-        obs = self.batch.reset(options={"keep_theta": keep}, where=~alive)
-        self._episode = np.where(alive, self._episode, np.where(keep, self._episode + 1, 1))
-        return obs, *ended, {}
+        obs = self.batch.reset(options={"keep_theta": keep}, where=over)
+        self._episode = np.where(over, np.where(keep, self._episode + 1, 1), self._episode)
+        return obs, *ended, info
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture [H, W, 3] of each environment; None without a render_mode."""

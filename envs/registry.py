@@ -7,6 +7,7 @@ from importlib.metadata import entry_points
 from typing import Any
 
 import gymnasium
+from gymnasium.vector import AutoresetMode
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.support import outside
@@ -84,16 +85,21 @@ def get(name: str) -> Task:
     return register(cls)()
 
 
-def make(name: str, privileged: bool = False, render_mode: str | None = None) -> GymEnv:
-    """A gymnasium environment; `privileged` appends theta to the observation, for experts."""
-    return GymEnv(get(name), privileged, render_mode)
+def make(name: str, privileged: bool = False, render_mode: str | None = None, episodes: int = 1) -> GymEnv:
+    """A gymnasium environment; `privileged` appends theta to the observation, for experts; see GymEnv."""
+    return GymEnv(get(name), privileged, render_mode, episodes)
 
 
 def make_vec(
-    name: str, n: int, privileged: bool = False, episodes: int = 1, render_mode: str | None = None
+    name: str,
+    n: int,
+    privileged: bool = False,
+    episodes: int = 1,
+    render_mode: str | None = None,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
 ) -> GymVectorEnv:
     """A gymnasium VectorEnv of n environments, stepped natively in a thread pool; a trial has `episodes` episodes."""
-    return GymVectorEnv(get(name), n, privileged, episodes, render_mode)
+    return GymVectorEnv(get(name), n, privileged, episodes, render_mode, autoreset_mode)
 
 
 def make_registered_vec(name: str, num_envs: int = 1, max_episode_steps: int | None = None, **kw: Any) -> GymVectorEnv:
