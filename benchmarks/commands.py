@@ -34,7 +34,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="run what is not finished in the output folder")
-    made.set_defaults(expert=None, salt="", track=None)  # of run.py alone
+    made.set_defaults(expert=None, salt="", track=None, debug=False)  # of run.py alone
     return made
 
 
@@ -85,8 +85,12 @@ def about(
     return {"kind": kind.__name__, **made_of, "salt": salt, "episodes": task.episodes}
 
 
-def engine(cluster: str | None) -> "Engine":
-    """What jobs run on: processes of this machine, or the Ray cluster of that address."""
+def engine(cluster: str | None, debug: bool = False) -> "Engine":
+    """What jobs run on: processes of this machine, or the Ray cluster of that address; or, to debug, this process."""
+    if debug:
+        from deconfounded.benchmarks.engine.local import Here
+
+        return Here()
     if cluster is None:
         from deconfounded.benchmarks.engine.local import Local
 
@@ -97,7 +101,12 @@ def engine(cluster: str | None) -> "Engine":
 
 
 def run(
-    kind: "type[Job]", task: envs.Task, args: argparse.Namespace, methods: Sequence[str], folder: Path
+    kind: "type[Job]",
+    task: envs.Task,
+    args: argparse.Namespace,
+    methods: Sequence[str],
+    folder: Path,
+    where: "Engine",
 ) -> "tuple[Finished, dict[str, Any]]":
     """Run what is not finished in the folder; returns all that is, and what the folder is for."""
     from deconfounded.benchmarks.engine.job_files import know_guests, prepare
@@ -118,11 +127,11 @@ def run(
                 *(task.reference, settings, name, tuple(range(seeds)), folder / "jobs", *own),
                 guest=catalogue.guest(name),
                 track=track,
+                walled=not args.debug,
             )
             for name in methods
         ]
-        with engine(args.cluster) as where:
-            finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
+        finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
     return finished, {**described, "resumed": resumed}
 
 

@@ -1,6 +1,7 @@
 """The benchmark: expert demonstrations, exploration, imitation, deployment over resets, scores, a report.
 
     python benchmarks/run.py --task slippery_cartpole
+    deconf run --tasks certified --methods my_rnn.py:fit --seeds 5
 
 Seeds of a method run side by side in one program, in as many groups as there are cores (one group on a GPU). Every
 (method, seed) has a file, written when it is done, and --resume goes on from the files that are there.
@@ -12,12 +13,16 @@ if __name__ == "__main__":  # this file is `deconf run` too
     deconf("run")
     raise SystemExit
 
+import argparse
+import tempfile
+import traceback
 from importlib.util import find_spec
 from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import COMMON
+from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.experts import policy
 
@@ -26,35 +31,75 @@ def main() -> None:
     """The experiment on one page."""
     parser = commands.parser(__doc__, "`all`, or some of those that --list names; your own is path/file.py:fit")
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
+    several = f"several tasks, a folder each: names, or {' or '.join(published.GROUPS)}"
+    parser.add_argument("--tasks", nargs="+", metavar="NAME", help=several)
     parser.add_argument("--expert", **COMMON["--expert"])
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
     parser.add_argument("--track", choices=["tensorboard"], help="log losses during training, in the run's folder")
     parser.add_argument("--salt", default="", help="any text: evaluation draws other thetas by it")
+    parser.add_argument("--debug", action="store_true", help="run in this process, for a debugger; keeps nothing")
     args = parser.parse_args()
     if args.list:
-        if args.task is not None:
-            raise envs.InputError(f"--list was given with --task {args.task}; it lists all; give it alone")
-        for name in envs.names():
-            try:
-                task = envs.get(name)
-            except envs.InputError as error:  # of another package
-                print(f"{name}: {error}")
-                continue
-            latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
-            print(f"{name}: {', '.join(latents)}")
-        print(f"methods: {', '.join(METHODS)}\n    by default: {', '.join(DEFAULT)}")
-        return
-    if args.task is None:
-        raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
-    task = envs.get(args.task)
+        return listed(args)
+    if (args.task is None) == (args.tasks is None):
+        raise envs.InputError(f"--task is missing, or given with --tasks; there are {', '.join(envs.names())}")
+    tasks = [envs.get(args.task)] if args.task is not None else published.tasks(args.tasks)
     wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
-    envs.check_task(task)
-    policy.load(task, args.expert)
+    for task in tasks:
+        envs.check_task(task)
+        policy.load(task, args.expert)
     if args.track and not find_spec("tensorboard"):
         raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
+    if args.debug and (args.cluster or args.out or args.resume):
+        raise envs.InputError("--debug runs in this process and keeps nothing; leave out --cluster, --out and --resume")
+    from deconfounded.benchmarks.engine.presets import changed, preset  # torch takes seconds
+
+    for task in tasks:
+        changed(preset(args.preset, task, args.device), args.set)
+    with tempfile.TemporaryDirectory(prefix="deconfounded-debug-") as aside:
+        base = Path(aside) if args.debug else args.out or Path("results")
+        own = args.out is not None and args.task is not None
+        folders = {task.name: base if own else base / f"{task.name}-{args.preset}" for task in tasks}
+        run_tasks(tasks, args, [name for name in METHODS if name in wanted], folders)
+
+
+def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[str], folders: dict[str, Path]) -> None:
+    """Run the methods on each task; where one fails, the others go on. Raises InputError in the end if one failed."""
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is refused at once
 
-    folder = args.out or Path("results") / f"{task.name}-{args.preset}"
-    finished, about = commands.run(BenchmarkJob, task, args, [name for name in METHODS if name in wanted], folder)
-    print(run_report.write(task, about, finished, folder))
+    begun = [str(folder) for folder in folders.values() if (folder / "settings.json").exists()]
+    if begun and not args.resume and len(tasks) > 1:
+        raise envs.InputError(f"there are runs in {', '.join(begun)}; give --resume to go on, or another --out")
+    failed: dict[str, Exception] = {}
+    with commands.engine(args.cluster, args.debug) as where:
+        for task in tasks:
+            try:
+                finished, about = commands.run(BenchmarkJob, task, args, methods, folders[task.name], where)
+            except envs.InputError as error:
+                if args.debug:
+                    traceback.print_exc()
+                if len(tasks) == 1:
+                    raise
+                failed[task.name] = error
+                print(f"{task.name} failed: {error}")
+                continue
+            print(run_report.write(task, about, finished, folders[task.name]))
+    if failed:
+        name, reason = next(iter(failed.items()))
+        raise envs.InputError(f"{len(failed)} of {len(tasks)} tasks failed; {name}: {reason}")
+
+
+def listed(args: argparse.Namespace) -> None:
+    """Print the tasks with their latents, and the methods."""
+    if args.task is not None or args.tasks is not None:
+        raise envs.InputError(f"--list was given with {args.task or ' '.join(args.tasks)}; it lists all; give it alone")
+    for name in envs.names():
+        try:
+            task = envs.get(name)
+        except envs.InputError as error:  # of another package
+            print(f"{name}: {error}")
+            continue
+        latents = (f"{lat.name} {lat.low:g}..{lat.high:g} {lat.unit}".strip() for lat in task.latents)
+        print(f"{name}: {', '.join(latents)}")
+    print(f"methods: {', '.join(METHODS)}\n    by default: {', '.join(DEFAULT)}")

@@ -69,11 +69,11 @@ def main() -> None:
         check_file(args.out)
     agent = ready(args.agent, task)
     from deconfounded.benchmarks.engine.context import EVALUATION, stream  # torch takes seconds
-    from deconfounded.benchmarks.output.scoring import two_decimals
+    from deconfounded.benchmarks.output import scoring
 
     scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
-    last = "last {:.2f} to {:.2f}, 95% over trials".format(*scored["ci95_last"])
-    scores = " ".join(map(two_decimals, scored["score"]))
+    last = f"last {scoring.interval(scored['ci95_last'], args.trials)} over trials"
+    scores = " ".join(map(scoring.two_decimals, scored["score"]))
     print(f"{task.name}, {args.trials} trials: score of each episode {scores} (0 random, 1 expert; {last})")
     if args.out is not None:
         asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}

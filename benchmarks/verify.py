@@ -11,9 +11,10 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.console import ROOT, Parser
+from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import records
 from deconfounded.envs.support import outside
 
@@ -23,6 +24,7 @@ COMPARED = ("commit", "machine", "expert", "outside", "protocol", "task_version"
 def verdict(record: records.Record, again: records.Record) -> tuple[str, list[str]]:
     """What to say of a record whose seed was run again, and what differs in how they were made."""
     differs = [f"{key}: {record[key]}, now {again[key]}" for key in COMPARED if record[key] != again[key]]
+    differs += [f"package: {record.get('package', 'unknown')}, now {again['package']}"] * ("package" in again)
     for name in sorted({*record["versions"], *again["versions"]}):
         was, now = record["versions"].get(name, "none"), again["versions"].get(name, "none")
         differs += [f"{name}: {was}, now {now}"] * (was != now)
@@ -78,13 +80,11 @@ def main() -> None:
     parser.add_argument("task", help="its name, or path/file.py:Class")
     parser.add_argument("method", help="its name, or path/file.py:fit")
     parser.add_argument("seed", type=int)
-    parser.add_argument("--records", type=Path, help="folder or file of records; default: docs/records of the checkout")
+    parser.add_argument("--records", type=Path, help="folder or file; default: those that come with the package")
     args = parser.parse_args()
     task = envs.get(args.task)
     method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
-    file = args.records or ROOT / "docs" / "records"
-    if not args.records and not file.is_dir():
-        raise envs.InputError("--records is missing; outside of a checkout give a run's, results/<run>/records")
+    file = args.records or RECORDS
     file = file / records.place(task.name) if file.is_dir() else file
     record = pick(file, method, args.seed)
     if record["method"] not in METHODS:

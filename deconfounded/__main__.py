@@ -24,6 +24,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "score": ("benchmarks.score", "score a saved agent on fresh thetas, or on another range", NOTHING),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),
     "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
+    "compare": ("benchmarks.compare", "compare methods over seeds and tasks: tables and figures for a paper", NOTHING),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
     "table": ("benchmarks.studies.table", "make the records that are missing", RESUMED),
     "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),

@@ -230,7 +230,7 @@ const COLUMNS = [
   ["method", "method", (r) => r.method, (r) => swatch(r.method) + text(r.method), "left"],
   ["tier", "tier", (r) => D.methods[r.method].tier, (r) => text(D.methods[r.method].tier)],
   ["value", "score", (r) => r.value, (r) => two(r.value), "open"],
-  ["low", "95% interval", (r) => r.interval && r.interval[0], (r) => range(r.interval)],
+  ["low", "interval", (r) => r.interval && r.interval[0], (r) => range(r.interval) + (r.interval ? ` (${r.held}%)` : "")],
   ["n", "seeds", (r) => r.n, (r) => r.n],
   ...D.compared.map((other) => [`vs ${other}`, `vs ${other}`, (r) => r.minus[other]?.value, (r) => (r.minus[other] ? `${signed(r.minus[other].value)} <span class="soft">(${r.minus[other].interval ? range(r.minus[other].interval) : ""}${r.minus[other].n < r.n ? `, ${seeds(r.minus[other].n)}` : ""})</span>` : "")]),
   ["r2", "theta R2", (r) => r.r2.at(-1), (r) => (r.r2.length ? two(r.r2.at(-1)) : "")],

@@ -12,7 +12,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import scoring, statistics
-from deconfounded.benchmarks.output.pictures import colour
+from deconfounded.benchmarks.output.pictures import colours
 from deconfounded.envs.streams import Array
 
 NOTE = (
@@ -44,7 +44,7 @@ def template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None)
 
 def last_scores(methods: dict[str, Any]) -> dict[str, dict[int, float]]:
     """The `methods` of results.json -> score in the last episode, by method and seed."""
-    zero, one = (float(np.mean(methods[name]["return"])) for name in REFERENCES)
+    zero, one = (methods[name]["reference"] for name in REFERENCES)
     last = {name: scoring.normalise(np.array(entry["return"])[:, -1], zero, one) for name, entry in methods.items()}
     return {name: dict(zip(methods[name]["seeds"], scores.tolist(), strict=True)) for name, scores in last.items()}
 
@@ -71,6 +71,7 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "n": len(entry["seeds"]),
         "value": entry["score_last"],
         "interval": None if entry["ci95"] is None else _short(entry["ci95"]),
+        "held": round(100 * scoring.coverage(len(entry["seeds"]))),
         "scores": entry["score"] + entry.get("score_beyond", []),
         "band": entry["band"],
         "trained": len(entry["score"]),
@@ -152,6 +153,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
     rows, tasks, scores = [], [], {}
     tiers: dict[str, list[str]] = {}
     methods: dict[str, dict[str, str]] = {}
+    hues = colours(entry["method"] for _, results in found for entry in results["methods"].values())
     for task, results in found:
         described = about(docs, task, results, certificates.get(task.name))
         tasks.append({**described, "command": command(task, results)})
@@ -162,7 +164,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
             made = row(task, name, entry, scores[task.name])
             rows.append({**made, "command": command(task, results, name)})
             kind = "exact" if name in EXACT else "reference" if name in REFERENCES else entry["tier"]
-            hue = "var(--ink)" if name == "expert" else colour(entry["method"])
+            hue = "var(--ink)" if name == "expert" else hues[entry["method"]]
             methods.setdefault(name, {"tier": entry["tier"], "kind": kind, "colour": hue})
     rank = {name: i for i, name in enumerate(labels(METHODS))}
     order = sorted(methods, key=lambda name: rank.get(name, len(rank)))
@@ -220,5 +222,7 @@ def page(
     content = data(docs, found, certificates, command)
     counts = [entry["n"] for entry in content["rows"]]
     opened = next((task["name"] for task in content["tasks"] if task["episodes"] > 1), "")
+    held = " to ".join(dict.fromkeys(f"{scoring.coverage(n):.0%}" for n in (min(counts), max(counts))))
     head = {"records": sum(counts), "seeds": scoring.fewest_to_most(counts), "peer": PEER, "opened": opened}
+    head |= {"held": held, "intervals": scoring.INTERVALS}
     return template("index.html.jinja").render(data=content, tiers=tiers, **head) + "\n"

@@ -1,11 +1,12 @@
 """Pictures: panels to draw in, the colour of each method, and marks in files that say what they are made of."""
 
 import base64
+import colorsys
 import hashlib
 import io
+import itertools
 import json
-import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,30 @@ COLOURS = {
     "oracle_bc": "#7f7f7f",
     "blind_bc": "#8c564b",
     "random": "#b8b8b8",
+    "deconfounded_mean": "#5254a3",
+    "gail": "#637939",
+    "rma": "#7b4173",
+    "palr": "#31a354",
+    "naive_obs": "#e6ab02",
+    "naive_dropout": "#ad494a",
+    "naive_transformer": "#e6550d",
 }
-OTHERS = ("#5254a3", "#637939", "#8c6d31", "#ad494a", "#7b4173", "#3182bd", "#e6550d", "#31a354", "#756bb1", "#843c39")
+OTHERS = ("#d6006e", "#00857c", "#8c6d31", "#3b3bd1", "#b35900", "#66a61e", "#a020f0", "#843c39", "#0a6ebd", "#555500")
 
 
 def colour(method: str) -> str:
-    """A method's own, or one that its name decides."""
-    return COLOURS.get(method, OTHERS[zlib.crc32(method.encode()) % len(OTHERS)])
+    """A method's own, or the first of OTHERS: for pictures of several from outside see `colours`."""
+    return colours([method])[method]
+
+
+def colours(methods: Iterable[str]) -> dict[str, str]:
+    """A colour for each method of a picture, none twice: its own, else one of OTHERS, then of hues far apart."""
+    left = itertools.chain(OTHERS, (_hue(0.618034 * i % 1) for i in itertools.count()))
+    return {name: COLOURS.get(name) or next(left) for name in dict.fromkeys(methods)}
+
+
+def _hue(share: float) -> str:
+    return "#" + "".join(f"{round(255 * part):02x}" for part in colorsys.hsv_to_rgb(share, 0.6, 0.65))
 
 
 @contextmanager
@@ -43,9 +61,10 @@ def panels(
     size: tuple[float, float],
     dpi: int = 110,
     mark: str = "",
+    pdf: bool = False,
     **shared: Any,
 ) -> Iterator[Any]:
-    """Panels [rows, columns] to draw in, saved as .png at the end. mark: of what it is made of, for `mark_of`."""
+    """Panels [rows, columns] to draw in, saved as .png at the end; pdf: and as .pdf. mark: what for, see `mark_of`."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -55,6 +74,10 @@ def panels(
     try:
         yield axes
         save_figure(figure, file, dpi, mark)
+        if pdf and isinstance(file, Path):
+            buffer = io.BytesIO()
+            figure.savefig(buffer, format="pdf")
+            write_atomically(file.with_suffix(".pdf"), buffer.getvalue())
     finally:
         plt.close(figure)
 

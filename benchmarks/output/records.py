@@ -15,6 +15,7 @@ import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
 from deconfounded.benchmarks.engine.job_files import Finished
+from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import scoring
 from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
 from deconfounded.envs.task import InputError
@@ -37,7 +38,7 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
     seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
     seed |= {"curve": thinned(meta["curve"])} if meta["curve"] else {}
-    seed |= {"salts": meta["salts"]} if "salts" in meta else {}
+    seed |= {key: meta[key] for key in ("salts", "package") if key in meta}
     records = []
     for name, deployment in meta["agents"].items():
         returns = data[f"{name}/returns"]
@@ -216,6 +217,36 @@ def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
     return sorted(kept, key=lambda record: (named(record), record["seed"]))
 
 
+REFERENCED = ("task", "task_version", "protocol", "expert", "expert_version")  # what 0 and 1 are of
+
+
+def references(record: Record, beside: Sequence[Record] = ()) -> tuple[float, float]:
+    """The returns that have score 0 and 1, for the record: one rule for all scores.
+
+    They are the mean returns of random actions and of the expert, over the episodes of a trial and over all seeds of
+    the records that come with the package, if these are of the same REFERENCED; else over the records `beside`. Raises
+    InputError if these have none.
+    """
+    of = tuple(record[key] for key in REFERENCED)
+    return _published(*of) or _references([one for one in beside if tuple(one[key] for key in REFERENCED) == of])
+
+
+@cache
+def _published(*of: Any) -> tuple[float, float] | None:
+    kept = [one for one in of_task(RECORDS, of[0]) if tuple(one[key] for key in REFERENCED) == of]
+    return _references(kept) if {one["method"] for one in kept} >= set(REFERENCES) else None
+
+
+def _references(records: Sequence[Record]) -> tuple[float, float]:
+    returns = {
+        name: [one["returns"][: one["episodes"]] for one in records if named(one) == name] for name in REFERENCES
+    }
+    if missing := [name for name in REFERENCES if not returns[name]]:
+        raise InputError(f"records are without those of {missing[0]}, which scores need")
+    random, expert = (float(np.mean(returns[name])) for name in REFERENCES)
+    return random, expert
+
+
 def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, Any]:
     """Records -> results: what they share, and of each method the scores over seeds; methods in that order, first.
 
@@ -241,7 +272,9 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         "versions": first["versions"],
         "machine": "; ".join(sorted({record["machine"] for record in records})),
         "wall_s": round(covered([span for record in records for span in record["spans"]]), 1),
-        "methods": scoring.summarise({name: by_agent[name] for name in names}, first["episodes"]),
+        "methods": scoring.summarise(
+            {name: by_agent[name] for name in names}, first["episodes"], references(first, records)
+        ),
     }
 
 

@@ -1,6 +1,7 @@
 """Pictures, video and a self-contained report.html from the files of a finished run."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.job_files import Finished
 from deconfounded.benchmarks.output import film, records, scoring
 from deconfounded.benchmarks.output.index import template
-from deconfounded.benchmarks.output.pictures import colour, encoded, mark, panels
+from deconfounded.benchmarks.output.pictures import colour, colours, encoded, mark, panels
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
 
@@ -35,8 +36,9 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
         print(f"no pictures: {error_line(error)}")
     write_atomically(folder / "report.html", page(results, folder))
     head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
-    table = scoring.plain_table(scoring.COLUMNS, scoring.rows(results["methods"]))
-    return f"\n{head}\n\n{table}\n\n{results['wall_s']:.0f} s -> {folder / 'report.html'}"
+    table = scoring.plain_table(scoring.COLUMNS, scoring.rows(results["methods"]), scoring.DROPPED)
+    note = f"{scoring.INTERVALS}\n\n" if len(results["seeds"]) > 1 else ""
+    return f"\n{head}\n\n{table}\n\n{note}{results['wall_s']:.0f} s -> {folder / 'report.html'}"
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
@@ -57,14 +59,15 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
 
 
 def adaptation(results: dict[str, Any], file: Path) -> None:
-    """Score over the episodes of a trial, each method a line in its 95% band; later episodes than trained on shaded."""
+    """Score over the episodes of a trial, each method a line in its band; later episodes than trained on shaded."""
     drawn = ("score", "score_beyond", "band")
     data = {name: [entry.get(key) for key in drawn] for name, entry in results["methods"].items()}
     made_of = mark(results["task"], data, sources.of_code(adaptation))
     with panels(file, size=(7, 4.2), mark=made_of) as [[axes]]:
-        trained = longest = 0
+        trained, longest = 0, 0
+        hues = colours(entry["method"] for entry in results["methods"].values())
         for name, entry in results["methods"].items():
-            values, hue = entry["score"] + entry.get("score_beyond", []), colour(entry["method"])
+            values, hue = entry["score"] + entry.get("score_beyond", []), hues[entry["method"]]
             trained, longest, at = len(entry["score"]), max(longest, len(values)), range(1, len(values) + 1)
             # Dotted: another way of deploying the same agent.
             style = ":" if entry["deployment"] else "--" if name in (*EXACT, *REFERENCES) else "-"
@@ -86,12 +89,13 @@ def learning(results: dict[str, Any], file: Path) -> None:
     trained = {name: entry for name, entry in results["methods"].items() if not entry["deployment"]}
     curves = [(kind, name, curve) for name, entry in trained.items() for kind, curve in entry.get("curve", {}).items()]
     kinds = list(dict.fromkeys(kind for kind, *_ in curves))
+    hues = colours(entry["method"] for entry in results["methods"].values())
     if not kinds:
         return
     with panels(file, 1, len(kinds), size=(4.5 * len(kinds), 3.4)) as [row]:
         for kind, name, curve in curves:
             panel, loss = row[kinds.index(kind)], np.array(curve["loss"], float)
-            panel.plot(curve["update"], loss, color=colour(name), lw=1.2, label=name)
+            panel.plot(curve["update"], loss, color=hues[name], lw=1.2, label=name)
         for panel, kind in zip(row, kinds, strict=True):
             panel.set(xlabel="update", title=f"{kind} loss")
             panel.legend(frameon=False, fontsize=8)
@@ -122,7 +126,7 @@ def beliefs(task: envs.Task, clips: film.Clips, file: Path) -> None:
 
 
 PICTURES = {
-    "adaptation.png": ("Score by episode", "Bands: 95% intervals of the mean over seeds."),
+    "adaptation.png": ("Score by episode", "Bands: intervals of the mean over seeds, as in the table."),
     "beliefs.png": (
         "What the agents believed of theta",
         "In the trial that is filmed, as a linear probe, fitted at the end of trials, reads it off belief or memory.",
@@ -151,13 +155,15 @@ def page(results: dict[str, Any], folder: Path) -> str:
         command = f"deconf certify --task {results['task']}"
         pictures.append(("Is it confounded?", f"The task's certificate, of {command}.", encoded(certified)))
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None
-    filters = {
+    filters: dict[str, Callable[..., Any]] = {
         "two_decimals": scoring.two_decimals,
+        "interval": scoring.interval,
         "height": lambda value: 23 - 20 * min(max(value, -0.1), 1.1),
         "last_mean": lambda returns: np.mean(returns, 0)[-1],
     }
     parts = {
         "outcome": scoring.outcome(results["methods"]),
+        "intervals": scoring.INTERVALS,
         "methods": sorted(results["methods"].items(), key=lambda item: -item[1]["score_last"]),
         "how": json.dumps({key: value for key, value in results.items() if key != "methods"}, indent=2),
     }

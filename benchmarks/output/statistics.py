@@ -36,6 +36,30 @@ def paired(one: Mapping[int, float], other: Mapping[int, float]) -> Figure | Non
     return Figure(differences.mean(), interval, len(seeds))
 
 
+def mean_difference(differences: Mapping[str, Array]) -> Figure:
+    """The mean over tasks of mean differences by seed [S] of each task, with Welch's interval; None if a task has one.
+
+    Its variance is that of a mean of independent means: the sum of s^2 / S over tasks, by their number squared, with
+    Welch and Satterthwaite's degrees of freedom.
+    """
+    every = [np.asarray(x) for x in differences.values()]
+    value, n = np.mean([x.mean() for x in every]), sum(map(len, every))
+    if min(map(len, every)) < 2:
+        return Figure(value, None, n)
+    parts = np.array([x.var(ddof=1) / len(x) for x in every])
+    freedom = parts.sum() ** 2 / max(sum(part**2 / (len(x) - 1) for part, x in zip(parts, every, strict=True)), 1e-300)
+    reach = stats.t.ppf(0.975, max(freedom, 1)) * np.sqrt(parts.sum()) / len(every)
+    return Figure(value, (value - reach, value + reach), n)
+
+
+def coverage(seeds: int) -> float:
+    """The share of cases in which an interval of `over_tasks` holds the truth, of so many seeds of many tasks.
+
+    For normal scores: a bootstrap of S seeds has (S - 1) / S of their variance.
+    """
+    return float(2 * stats.norm.cdf(1.96 * np.sqrt((seeds - 1) / seeds)) - 1)
+
+
 def iqm(runs: list[Array]) -> Array:
     """Interquartile mean, of all runs of all tasks as one: the lowest and the highest quarter are left out.
 

@@ -256,5 +256,6 @@ def main() -> None:
     methods = commands.check(args, LEARNERS, SHOWN)
     task = envs.get("bandit")
     folder = args.out or Path("results") / f"paper-{args.preset}"
-    finished, about = commands.run(FigureJob, task, args, methods, folder)
+    with commands.engine(args.cluster) as where:
+        finished, about = commands.run(FigureJob, task, args, methods, folder, where)
     print(write(task, about, finished, exact(task), folder))

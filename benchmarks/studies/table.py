@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
+from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.studies import runs
 
@@ -42,7 +43,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
     parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
     args = parser.parse_args()
-    tasks = [envs.get(name) for name in args.tasks]
+    tasks = published.tasks(args.tasks)
     asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
     methods = [name for name in METHODS if name in asked]
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob

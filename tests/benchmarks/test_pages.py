@@ -211,8 +211,8 @@ class TestOutcome:
         assert outcome == (
             "good (0.90) inferred theta, like the exact policy interventional (1.00); unsure (0.81) may be"
             " on either side of the middle between the exact policies, 0.80; bad (0.50) scored like the deluded exact"
-            " policy, conditional (0.60); mute (0.40) has no memory to infer theta with. Scores of the last episode,"
-            " means of 3 seeds."
+            " policy, conditional (0.60); mute (0.40) scored below the middle between the exact policies, 0.80, and has"
+            " no features to read theta from. Scores of the last episode, means of 3 seeds."
         )
 
     def test_what_cannot_be_told(self) -> None:
@@ -413,6 +413,10 @@ def test_report_in_a_browser(seen: "Page", errors: list[str], tmp_path: Path) ->
     wide = "box.scrollWidth > box.clientWidth && getComputedStyle(box).overflowX"
     assert seen.evaluate(f"(box => {wide})(document.querySelector('.scroll'))") == "auto"
     assert seen.evaluate("document.images.length") == 3  # adaptation, learning, certificate
+    dark = seen.evaluate("matchMedia('(prefers-color-scheme: dark)').matches")
+    filters = seen.evaluate("[...document.images].map(image => getComputedStyle(image).filter)")
+    assert all(("invert" in each) == dark for each in filters)
+    assert min(seen.evaluate("[...document.images].map(image => image.clientWidth)")) >= 400  # it scrolls on a phone
 
 
 def test_certificate_of_a_report(tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def test_they_are_whole(built: Path) -> None:
     ours = {f"deconfounded/{name}" for name in ("__init__.py", "__main__.py", "py.typed")}
     ours |= {f"deconfounded/{folder}/{name}" for folder in PACKAGES for name in files(ROOT / folder)}
     ours = {name for name in ours if "/studies/" not in name}
+    kept = [*(ROOT / "docs").glob("records/*.jsonl"), *(ROOT / "docs").glob("certificates/*.json")]
+    ours |= {f"deconfounded/{file.relative_to(ROOT)}" for file in kept}
     assert {name for name in held if ".dist-info/" not in name} == ours
 
 
@@ -132,6 +134,7 @@ run --task bandit --preset smoke --methods blind_bc --set eval_trials=4 expert_t
 report results/bandit-smoke
 score --agent results/bandit-smoke/agents/blind_bc-0 --task bandit --trials 4 --out scores/bandit.json
 verify bandit blind_bc 0 --records results/bandit-smoke/records
+compare results/bandit-smoke --against naive_rnn
 data --task bandit --trials 24 --out sets
 look --data sets/deconf/bandit/expert24s0-v0
 diagnose --data sets/deconf/bandit/expert24s0-v0
@@ -161,5 +164,10 @@ def test_commands_work_as_installed(built: Path, empty: Path) -> None:
     assert {name.partition("/")[0] for name in files(empty.parent)} == {"at work"}
     weights = {"slippery_cartpole.safetensors", "slippery_cartpole.json"}
     assert {name.partition("/")[0] for name in files(empty)} == {"results", "scores", "sets", *weights}
-    assert {file.name for file in (empty / "results").iterdir()} == {"bandit-smoke", "certificates", "diagnosis"}
+    assert {file.name for file in (empty / "results").iterdir()} == {
+        "bandit-smoke",
+        "certificates",
+        "comparison",
+        "diagnosis",
+    }
     assert files(built / "site") == before

@@ -1,0 +1,40 @@
+"""Compare the methods of runs with others, over seeds and tasks: `deconf compare results/*-default`
+
+Differences by seed, interquartile means and probabilities of improvement, in the first and the last episode of a trial;
+the others are of the runs given, or of the records that come with the package. A method from outside has thetas of its
+own, and shares no more than a seed's number with them. Written to --out: csv, LaTeX (booktabs), pdf and png.
+"""
+
+from pathlib import Path
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import Parser, place
+from deconfounded.benchmarks.output import records
+
+
+def read(given: Path) -> list[records.Record]:
+    """The records of a run, of a folder of records, or of a file."""
+    folder = given / "records" if (given / "records").is_dir() else given
+    files = [folder] if folder.is_file() else sorted(folder.glob("*.jsonl"))
+    if not files:
+        raise envs.InputError(f"{given} holds no records; give the folder of a run, or a file of records")
+    return [record for file in files for record in records.read(file)]
+
+
+def main() -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("results", nargs="+", type=Path, help="folders of runs, or files of records")
+    default = ["deconfounded", "naive_rnn"]
+    parser.add_argument("--against", nargs="+", metavar="NAME", default=default, help="default: deconfounded naive_rnn")
+    parser.add_argument("--out", type=place, default=Path("results") / "comparison", help="default: results/comparison")
+    args = parser.parse_args()
+    from deconfounded.benchmarks.output import comparison  # it takes seconds
+
+    against = list(dict.fromkeys(args.against))
+    every = [record for given in dict.fromkeys(args.results) for record in read(given)]
+    scores = comparison.gathered(every, against)
+    own = list(dict.fromkeys(records.named(record) for record in every))
+    methods = [name for name in scores if name in own and (name not in against or len(against) > 1)]
+    print(comparison.write(scores, methods, against, args.out))
+    if presets := sorted({record["preset"] for record in every} - {"default"}):
+        print(f"note: runs of preset {', '.join(presets)}; the records that come with the package are of default")

@@ -1,0 +1,26 @@
+"""What comes with the package, in a checkout and installed alike: certificates of tasks, and records of methods."""
+
+import json
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import ROOT
+
+CERTIFICATES, RECORDS = ROOT / "docs" / "certificates", ROOT / "docs" / "records"
+GROUPS = ("certified", "suite")  # names for several tasks
+
+
+def certified() -> list[str]:
+    """Names of the suite's tasks whose certificate is passed."""
+
+    def passed(name: str) -> bool:
+        file = CERTIFICATES / f"{name}.json"
+        return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
+
+    return [name for name in envs.SUITE if passed(name)]
+
+
+def tasks(asked: list[str]) -> list[envs.Task]:
+    """Tasks by names, references and GROUPS, each once. Raises InputError for a name that is unknown."""
+    groups = {"certified": certified, "suite": lambda: list(envs.SUITE)}
+    names = [name for each in asked for name in (groups[each]() if each in groups else [each])]
+    return [envs.get(name) for name in dict.fromkeys(names)]

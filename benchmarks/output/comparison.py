@@ -1,0 +1,243 @@
+"""Methods against others, by the same seeds: differences on each task, and over tasks; as text, csv, LaTeX, pictures.
+
+Scores are normalised by one rule (`records.references`). A method is compared on the tasks where both were run.
+"""
+
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.benchmarks.engine.published import RECORDS
+from deconfounded.benchmarks.output import records, scoring, statistics
+from deconfounded.benchmarks.output.pictures import colours, panels
+from deconfounded.benchmarks.output.records import Record
+from deconfounded.benchmarks.output.statistics import Figure
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.files import check_folder, write_atomically
+
+Scores = Mapping[str, Mapping[str, Mapping[int, Array]]]
+"""By method, task and seed: scores [E] of the episodes of a trial."""
+EPISODES = {"first": 0, "last": -1}
+
+
+def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[str, dict[int, Array]]]:
+    """Scores of all methods in records of runs, and of those in `against`: with the package where no run has them.
+
+    Raises InputError for two records of a method, task and seed, for a method that has none, and for a task without
+    records of random and expert.
+    """
+    scores: dict[str, dict[str, dict[int, Array]]] = {}
+
+    def add(record: Record) -> None:
+        of = scores.setdefault(records.named(record), {}).setdefault(record["task"], {})
+        if record["seed"] in of:
+            what = f"{records.named(record)} on {record['task']} with seed {record['seed']}"
+            raise InputError(f"there are two records of {what}; give one run of it")
+        zero, one = records.references(record, every)
+        of[record["seed"]] = scoring.normalise(np.array(record["returns"][: record["episodes"]]), zero, one)
+
+    for record in every:
+        if records.named(record) not in REFERENCES:
+            add(record)
+    if not scores:
+        raise InputError("the records given are of random and expert alone; give those of a method")
+    made_by = {record["task"]: tuple(record[key] for key in records.REFERENCED) for record in every}
+    for task, made in made_by.items():
+        for record in records.of_task(RECORDS, task):
+            name = records.named(record)
+            same = tuple(record[key] for key in records.REFERENCED) == made
+            if same and name in against and not any(records.named(one) == name for one in every if one["task"] == task):
+                add(record)
+    for name in against:
+        if name not in scores:
+            known = list(dict.fromkeys([*scores, *METHODS]))
+            raise InputError(f"--against {name}: no record is of it on these tasks; there are {', '.join(known)}")
+    return scores
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method on a task, or over tasks (task ""): its scores, and its differences to each of the others."""
+
+    method: str
+    task: str
+    n: int  # seeds; over tasks, tasks
+    score: dict[str, Figure]  # of EPISODES: the mean; over tasks the interquartile mean
+    minus: dict[str, dict[str, Figure]]  # by EPISODES and the other, paired by seed
+    better: dict[str, Figure]  # probability of improvement over the other in the last episode; over tasks
+
+
+def at(scores: Scores, method: str, task: str, episode: str) -> dict[int, float]:
+    """Of an episode of EPISODES, by seed."""
+    return {seed: float(values[EPISODES[episode]]) for seed, values in scores[method].get(task, {}).items()}
+
+
+def of_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -> list[Row]:
+    """A row of each method on each task, then those of the others there."""
+    made = []
+    for task in dict.fromkeys(task for name in methods for task in scores[name]):
+        for name in (name for name in dict.fromkeys([*methods, *against]) if task in scores[name]):
+            mean: dict[str, Figure] = {}
+            minus: dict[str, dict[str, Figure]] = {episode: {} for episode in EPISODES}
+            for episode in EPISODES:
+                own = at(scores, name, task, episode)
+                mean[episode] = Figure(np.asarray(np.mean(list(own.values()))), None, len(own))
+                for other in against if name in methods else ():
+                    pairs = statistics.paired(own, at(scores, other, task, episode)) if other != name else None
+                    if pairs is not None:
+                        minus[episode][other] = pairs
+            made.append(Row(name, task, len(scores[name][task]), mean, minus, {}))
+    return made
+
+
+def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -> list[Row]:
+    """A row of each method, over the tasks that it has; differences are over the tasks that both have."""
+    made = []
+    for name in dict.fromkeys([*methods, *against]):
+        mean: dict[str, Figure] = {}
+        minus: dict[str, dict[str, Figure]] = {episode: {} for episode in EPISODES}
+        better: dict[str, Figure] = {}
+        for episode in EPISODES:
+            own = {task: at(scores, name, task, episode) for task in scores[name]}
+            found = statistics.over_tasks(statistics.iqm, {task: np.array([*of.values()]) for task, of in own.items()})
+            assert found is not None
+            mean[episode] = found
+            for other in against if name in methods else ():
+                theirs = {task: at(scores, other, task, episode) for task in own if task in scores[other]}
+                pairs = {task: sorted(set(own[task]) & set(of)) for task, of in theirs.items()}
+                pairs = {task: seeds for task, seeds in pairs.items() if seeds}
+                if other == name or not pairs:
+                    continue
+                differences = {
+                    task: np.array([own[task][seed] - theirs[task][seed] for seed in seeds])
+                    for task, seeds in pairs.items()
+                }
+                minus[episode][other] = statistics.mean_difference(differences)
+                both = [{task: np.array([*of[task].values()]) for task in pairs} for of in (own, theirs)]
+                improvement = statistics.over_tasks(statistics.improvement, *both)
+                if improvement is not None and episode == "last":
+                    lone = (
+                        min(len(runs) for of in both for runs in of.values()) == 1
+                    )  # which no bootstrap can draw anew
+                    better[other] = replace(improvement, interval=None) if lone else improvement
+        made.append(Row(name, "", len(scores[name]), mean, minus, better))
+    return made
+
+
+def signed(figure: Figure | None, sign: bool = True) -> str:
+    """A figure with its interval, as tables show it."""
+    if figure is None:
+        return ""
+    value = f"{np.round(figure.value, 2):{'+' if sign else ''}z.2f}"
+    if figure.interval is None:
+        return value
+    low, high = (f"{np.round(end, 2):{'+' if sign else ''}z.2f}" for end in figure.interval)
+    return f"{value} ({low} to {high})"
+
+
+def tables(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str]) -> dict[str, list[list[str]]]:
+    """The tables by name, of cells: a head, then rows."""
+    differences = [f"{episode} - {other}" for other in against for episode in EPISODES]
+    first = [["task", "method", "seeds", *EPISODES, *differences]]
+    for row in by_task:
+        cells = [signed(row.minus[episode].get(other)) for other in against for episode in EPISODES]
+        first.append([row.task, row.method, str(row.n), *(signed(x, False) for x in row.score.values()), *cells])
+    better = [f"P(better than {other})" for other in against]
+    second = [["method", "tasks", *(f"IQM, {episode}" for episode in EPISODES), *differences, *better]]
+    for row in over:
+        cells = [signed(row.minus[episode].get(other)) for other in against for episode in EPISODES]
+        cells += [signed(row.better.get(other), False) for other in against]
+        second.append([row.method, str(row.n), *(signed(x, False) for x in row.score.values()), *cells])
+    return {"tasks": first, "over_tasks": second}
+
+
+def notes(scores: Scores) -> str:
+    """What the figures are, and what their intervals hold."""
+    fewest = min(len(seeds) for of in scores.values() for seeds in of.values())
+    held = (
+        f", which of {fewest} seeds hold the mean in {statistics.coverage(fewest):.0%} of cases" if fewest > 1 else ""
+    )
+    return (
+        "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
+        " come with the package. Differences are paired by seed; their 95% intervals are Student's, over tasks Welch's."
+        f" IQM is the interquartile mean of all runs; its interval, and that of P, is a stratified bootstrap{held}."
+    )
+
+
+def as_csv(table: Sequence[Sequence[str]]) -> str:
+    """The cells; intervals stand in the cell of their figure."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(table)
+    return text.getvalue()
+
+
+def as_latex(table: Sequence[Sequence[str]], caption: str) -> str:
+    """A booktabs table; it needs `\\usepackage{booktabs}`."""
+    left = sum(head in ("task", "method") for head in table[0])
+    lines = [f"% {caption}", f"\\begin{{tabular}}{{{'l' * left}{'r' * (len(table[0]) - left)}}}", "\\toprule"]
+    before = ""
+    for i, row in enumerate(table):
+        cells = [_escaped(cell) for cell in row]
+        if left == 2 and i:  # a task's name once
+            lines += ["\\midrule"] * (before not in ("", row[0]))
+            cells[0], before = "" if row[0] == before else cells[0], row[0]
+        lines += [" & ".join(cells) + r" \\", *(["\\midrule"] if i == 0 else [])]
+    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", ""])
+
+
+def _escaped(cell: str) -> str:
+    for plain, escaped in (("_", r"\_"), ("%", r"\%"), ("&", r"\&")):
+        cell = cell.replace(plain, escaped)
+    return re.sub(r"(?<![\w.])([+-])(?=\d)", r"$\1$", cell)
+
+
+def picture(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str], file: Path) -> None:
+    """Differences of the last episode by task, a panel for each other method; interquartile means; .png and .pdf."""
+    hues = colours([row.method for row in over])
+    own = [row for row in by_task if any(row.minus["last"].values())]
+    names = list(dict.fromkeys(row.task for row in own))
+    methods = list(dict.fromkeys(row.method for row in own))
+    height = 1.2 + 0.28 * max(len(names) * max(len(methods), 1) ** 0.5, len(over))
+    with panels(file, 1, len(against) + 1, size=(3.4 * (len(against) + 1), height), pdf=True) as [axes]:
+        for panel, other in zip(axes, against, strict=False):
+            for row in own:
+                if (figure := row.minus["last"].get(other)) is None:
+                    continue
+                offset = 0.5 * ((methods.index(row.method) + 0.5) / len(methods) - 0.5)
+                y, hue = names.index(row.task) + offset, hues[row.method]
+                panel.plot(figure.value, y, "o", ms=4, color=hue, label=row.method)
+                if figure.interval is not None:
+                    panel.hlines(y, *figure.interval, color=hue)
+            panel.axvline(0, color="0.6", lw=0.8)
+            panel.set(title=f"last score - {other}", ylim=(len(names) - 0.5, -0.5))
+            panel.set_yticks(range(len(names)), names if panel is axes[0] else [""] * len(names))
+        for i, row in enumerate(over):
+            figure = row.score["last"]
+            axes[-1].plot(figure.value, i, "o", color=hues[row.method])
+            if figure.interval is not None:
+                axes[-1].hlines(i, *figure.interval, color=hues[row.method])
+        axes[-1].set(title="IQM of the last score", ylim=(len(over) - 0.5, -0.5))
+        axes[-1].set_yticks(range(len(over)), [row.method for row in over])
+
+
+def write(scores: Scores, methods: Sequence[str], against: Sequence[str], folder: Path) -> str:
+    """All tables and pictures of a comparison into a folder; returns what a terminal shows."""
+    by_task, over = of_tasks(scores, methods, against), over_tasks(scores, methods, against)
+    made, said = tables(by_task, over, against), notes(scores)
+    check_folder(folder)
+    shown = []
+    for name, table in made.items():
+        write_atomically(folder / f"{name}.csv", as_csv(table))
+        write_atomically(folder / f"{name}.tex", as_latex(table, said))
+        dropped = [f"first - {other}" for other in against] + ["seeds", "IQM, first", "first"]
+        shown.append((scoring.plain_table(table[0], table[1:]), scoring.plain_table(table[0], table[1:], dropped)))
+    write_atomically(folder / "comparison.txt", "\n\n".join([*(whole for whole, _ in shown), said]) + "\n")
+    picture(by_task, over, against, folder / "comparison.png")
+    return "\n\n".join([*(narrow for _, narrow in shown), said, f"-> {folder}"])

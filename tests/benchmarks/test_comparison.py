@@ -1,0 +1,247 @@
+"""From a method to a paper: several tasks, what a failing method shows, one rule for scores, and `deconf compare`."""
+
+import json
+import queue
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.__main__ import main as deconf
+from deconfounded.benchmarks import compare
+from deconfounded.benchmarks.engine import catalogue, job_files, presets, progress, published, scheduler
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
+from deconfounded.benchmarks.output import comparison, pictures, records, scoring, statistics
+from deconfounded.envs.support.errors import InputError, error_line
+from tests.tools import tiny_preset
+
+TEXT = """
+from dataclasses import dataclass
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, TensorDataset
+from deconfounded.deconf.method import uses
+from deconfounded.experts.rollout import Agent
+
+@dataclass(frozen=True)
+class Config:
+    updates: int = 7
+
+class Noisy(Agent):
+    def __init__(self, gain): self.gain = gain
+    def begin(self, n): self.n = n
+    def reset(self, rngs): self.rng = rngs[0]
+    def act(self, obs): return self.gain * self.rng.uniform(-1, 1, (len(obs), 1))
+
+@uses("demonstrations", "exploration", on_control=Config())
+def fit(given):
+    for batch in DataLoader(TensorDataset(torch.arange(8)), 4, num_workers=1):
+        pass
+    explored = given.explore(Noisy(.5))
+    return Noisy(float(np.abs(explored.action).mean()) + given.config.updates / 100)
+
+@uses("demonstrations")
+def bad(given):
+    return torch.zeros(3) @ torch.zeros(4)
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    (tmp_path / "mine.py").write_text(TEXT)
+    return tmp_path / "mine.py"
+
+
+def record(method: str, seed: int, score: float, task: str = "curling") -> records.Record:
+    """Of a method from outside on a task of the suite, with that score in each episode."""
+    like = records.of_task(published.RECORDS, task)[0]
+    zero, one = records.references(like)
+    returns = [zero + score * (one - zero)] * len(like["returns"])
+    return {**like, "method": method, "method_version": 0, "deployment": "", "seed": seed, "returns": returns}
+
+
+class TestSeveralTasks:
+    def test_certified(self) -> None:
+        names = [task.name for task in published.tasks(["certified", "hidden_goal", "bandit"])]
+        assert names[-1] == "hidden_goal"
+        assert set(envs.SUITE) - set(names) == {"forked_path"}
+        assert [task.name for task in published.tasks(["suite"])] == list(envs.SUITE)
+
+    @pytest.mark.slow
+    def test_a_run_goes_on_behind_a_failure(self, mine: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
+        """Both tasks are tried; the line is that of the user's file, and the traceback is kept."""
+        monkeypatch.chdir(mine.parent)
+        small = ["--preset", "smoke", "--set", "eval_trials=4", "expert_trials=4"]
+        command = ["deconf", "run", "--tasks", "bandit", "weak_thruster", "--methods", "mine.py:bad", *small]
+        monkeypatch.setattr(sys, "argv", list(command))
+        with pytest.raises(SystemExit) as ended:
+            deconf()
+        assert ended.value.code == 2
+        said = capfd.readouterr()
+        assert re.match(
+            r"error: 2 of 2 tasks failed; bandit: method mine_bad: .*\(RuntimeError, mine.py:28\)", said.err
+        )
+        for task in ("bandit", "weak_thruster"):
+            trace = (mine.parent / "results" / f"{task}-smoke" / "errors" / "mine_bad-0.txt").read_text()
+            assert trace.startswith("Traceback")
+            assert "torch.zeros(3) @ torch.zeros(4)" in trace
+        monkeypatch.setattr(sys, "argv", command)
+        with pytest.raises(SystemExit):
+            deconf()
+        assert "give --resume to go on" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_method_in_this_process_is_as_in_its_own(mine: Path) -> None:
+    """Same data, same random numbers; it may start processes of its own, and its amounts can be set."""
+    name = catalogue.add(f"{mine}:fit")
+    settings = presets.changed(presets.preset("smoke", envs.get("weak_thruster"), "cpu"), [f"{name}.updates=3"])
+    settings = presets.changed(settings, ["eval_trials=4", "expert_trials=4", "explore_trials=4"])
+    assert settings.configs[name]["updates"] == 3
+    found = []
+    for walled in (True, False):
+        context = Context(envs.get("weak_thruster"), settings, [0])
+        method = catalogue.METHODS[name]
+        make: Callable[[], Any] = lambda c=context, m=method: Guest(c, name, m.reference, m.uses)  # noqa: E731
+        agent = make() if walled else fit_guest(context, name, method)
+        try:
+            found.append(evaluate(context, agent, True)[0]["returns"])
+        finally:
+            if isinstance(agent, Guest):
+                agent.close()
+    assert (found[0] == found[1]).all()
+
+
+def test_tracebacks_are_kept_until_it_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("bandit", tiny_preset(), "random", (0,), tmp_path / "jobs")
+    failure = InputError("no")
+    failure.add_note("Traceback ...")
+    with pytest.raises(InputError):
+        scheduler.run_jobs([job], "one", lambda jobs, tick, say: say(jobs[0], failure), tmp_path / "errors")
+    assert (tmp_path / "errors" / "random-0.txt").read_text() == "Traceback ..."
+    scheduler.run_jobs([job], "one", lambda jobs, tick, say: say(jobs[0], "well"), tmp_path / "errors")
+    assert not list((tmp_path / "errors").iterdir())
+
+
+def test_an_error_s_line_is_of_the_user_s_file(tmp_path: Path) -> None:
+    """And a long one is cut."""
+    (tmp_path / "own.py").write_text("import json\ndef f():\n    json.loads('{')\n")
+    sys.path.insert(0, str(tmp_path))
+    try:
+        import own  # type: ignore[import-not-found]
+
+        with pytest.raises(ValueError, match="Expecting") as caught:
+            own.f()
+        assert error_line(caught.value, tmp_path).endswith("(JSONDecodeError, own.py:3)")
+        assert "decoder.py" in error_line(caught.value)
+    finally:
+        sys.path.remove(str(tmp_path))
+    assert len(str(InputError("x" * 22_000))) < 1100
+    with pytest.raises(InputError, match=r"was 0\.5, and 5 others were as wrong; each must be a whole number 0\.\.4"):
+        envs.get("bandit").check_action(np.full((6, 1), 0.5), 6)
+
+
+def test_what_differs_is_said() -> None:
+    before, now = {"torch": "2.13.0", "numpy": "2.4"}, {"torch": "2.14.0", "numpy": "2.4"}
+    assert job_files.differing("versions", before, now) == "versions (torch was 2.13.0, is 2.14.0)"
+    assert job_files.differing("salt", "", "x") == "salt (was empty, is x)"
+
+
+class TestScores:
+    def test_one_rule_for_0_and_1(self) -> None:
+        """The same records have the same score, whichever seeds of random and expert are beside them."""
+        kept = records.of_task(published.RECORDS, "curling")
+        seeds = [[0, 1, 2], [0, 1, 2, 7, 8, 9]]
+        both = [[r for r in kept if r["seed"] in (s if r["method"] in catalogue.REFERENCES else s[:3])] for s in seeds]
+        one, two = (records.gather(of)["methods"]["naive_rnn"] for of in both)
+        assert one["score"] == two["score"]
+        other = [{**r, "expert": "0" * 64} for r in both[0]]  # an expert of one's own: its run's own references
+        assert (
+            records.gather(other)["methods"]["expert"]["score"] != records.gather(both[0])["methods"]["expert"]["score"]
+        )
+
+    def test_coverage(self) -> None:
+        """Of the interval that tables show, by an independent simulation."""
+        rng = np.random.default_rng(1)
+        for n, right in ((3, 0.75), (5, 0.84), (10, 0.90)):
+            ends = [scoring.bootstrap(x) for x in rng.standard_normal((300, n))]
+            held = np.mean([e is not None and e[0] <= 0 <= e[1] for e in ends])
+            assert held == pytest.approx(scoring.coverage(n), abs=0.06)
+            assert scoring.coverage(n) == pytest.approx(right, abs=0.015)
+        assert scoring.interval([0.311, 0.422], 3) == "0.31 to 0.42 (75%)"
+        assert scoring.interval(None, 1) == "-"
+
+    def test_a_table_fits_into_the_terminal(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        head, rows = ("method", "data", "last"), [("one", "d" * 70, "0.10"), ("two", "d", "0.20")]
+        monkeypatch.setenv("COLUMNS", "80")
+        lines = scoring.plain_table(head, rows, ["data"]).splitlines()
+        assert lines[0] == "method  last"
+        assert lines[-1] == "(too wide for this terminal: data)"
+        monkeypatch.setenv("COLUMNS", "200")
+        assert "data" in scoring.plain_table(head, rows, ["data"]).splitlines()[0]
+
+    def test_colours_are_of_one_method_each(self) -> None:
+        names = [*catalogue.METHODS, *(f"mine_{i}" for i in range(40))]
+        assert len(set(pictures.colours(names).values())) == len(names)
+
+
+class TestComparison:
+    def test_differences_are_paired_by_seed(self, tmp_path: Path) -> None:
+        """Against the records of the package; intervals as of scipy, and over tasks as by hand."""
+        every = [record("mine", seed, 0.5 + 0.1 * seed, task) for task in ("curling", "bandit") for seed in range(3)]
+        scores = comparison.gathered(every, ["naive_rnn"])
+        (row,) = [
+            r for r in comparison.of_tasks(scores, ["mine"], ["naive_rnn"]) if (r.method, r.task) == ("mine", "curling")
+        ]
+        theirs = comparison.at(scores, "naive_rnn", "curling", "last")
+        expected = np.array([0.5 + 0.1 * seed - theirs[seed] for seed in range(3)])
+        assert row.minus["last"]["naive_rnn"].value == pytest.approx(expected.mean())
+        assert row.minus["last"]["naive_rnn"].n == 3
+        over = comparison.over_tasks(scores, ["mine"], ["naive_rnn"])[0]
+        assert over.score["last"].value == pytest.approx(0.6)
+        said = comparison.write(scores, ["mine"], ["naive_rnn"], tmp_path)
+        assert "last - naive_rnn" in said
+        tex = (tmp_path / "tasks.tex").read_text()
+        assert tex.count("\\toprule") == tex.count("\\bottomrule") == 1
+        assert all(line.endswith(r"\\") for line in tex.splitlines() if "&" in line)
+        assert r"naive\_rnn" in tex
+        assert "naive_rnn" not in tex.replace(r"\_", "")
+        for name in ("comparison.pdf", "comparison.png", "over_tasks.csv", "over_tasks.tex", "tasks.csv"):
+            assert (tmp_path / name).stat().st_size > 0
+
+    def test_a_mean_over_tasks(self) -> None:
+        """Welch's interval holds the mean as often as it says, of three seeds."""
+        rng, held = np.random.default_rng(0), []
+        for _ in range(600):
+            figure = statistics.mean_difference({str(i): (1 + i) * rng.standard_normal(3) for i in range(4)})
+            assert figure.interval is not None
+            held.append(figure.interval[0] <= 0 <= figure.interval[1])
+        assert np.mean(held) == pytest.approx(0.95, abs=0.025)
+
+    def test_bad_input(self, tmp_path: Path) -> None:
+        twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
+        with pytest.raises(InputError, match="two records of mine on curling with seed 0"):
+            comparison.gathered(twice, [])
+        with pytest.raises(InputError, match="--against nobody: no record is of it"):
+            comparison.gathered(twice[:1], ["nobody"])
+        with pytest.raises(InputError, match="holds no records"):
+            compare.read(tmp_path)
+
+
+def test_records_name_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), tmp_path)
+    job.run()
+    data = job.load(0)
+    assert data is not None
+    (made,) = records.of_job(data, "smoke", [], 1)
+    assert records.check(json.loads(json.dumps({**made, "sha256": "0" * 64})), "it")["package"] == "0.1.0"
