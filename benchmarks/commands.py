@@ -113,6 +113,7 @@ def run(
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
 
+    know_guests(folder / "jobs")  # whose amounts are settings too
     settings = changed(preset(args.preset, task, args.device), args.set)
     seeds = args.seeds or settings.seeds
     catalogue.check(args.preset, (), seeds, ())
@@ -120,7 +121,6 @@ def run(
     described = about(kind, task, args.preset, settings, args.set, *own)
     with locked(folder):
         prepare(folder, described, args.resume)
-        know_guests(folder / "jobs")
         track = args.track is not None
         jobs = [
             kind(

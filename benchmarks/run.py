@@ -52,14 +52,16 @@ def main() -> None:
         raise envs.InputError("--track tensorboard needs it; `pip install deconfounded-imitation[track]` brings it")
     if args.debug and (args.cluster or args.out or args.resume):
         raise envs.InputError("--debug runs in this process and keeps nothing; leave out --cluster, --out and --resume")
+    from deconfounded.benchmarks.engine.job_files import know_guests
     from deconfounded.benchmarks.engine.presets import changed, preset  # torch takes seconds
 
-    for task in tasks:
-        changed(preset(args.preset, task, args.device), args.set)
     with tempfile.TemporaryDirectory(prefix="deconfounded-debug-") as aside:
         base = Path(aside) if args.debug else args.out or Path("results")
         own = args.out is not None and args.task is not None
         folders = {task.name: base if own else base / f"{task.name}-{args.preset}" for task in tasks}
+        for task in tasks:
+            know_guests(folders[task.name] / "jobs")
+            changed(preset(args.preset, task, args.device), args.set)
         run_tasks(tasks, args, [name for name in METHODS if name in wanted], folders)
 
 

@@ -24,7 +24,8 @@ COMPARED = ("commit", "machine", "expert", "outside", "protocol", "task_version"
 def verdict(record: records.Record, again: records.Record) -> tuple[str, list[str]]:
     """What to say of a record whose seed was run again, and what differs in how they were made."""
     differs = [f"{key}: {record[key]}, now {again[key]}" for key in COMPARED if record[key] != again[key]]
-    differs += [f"package: {record.get('package', 'unknown')}, now {again['package']}"] * ("package" in again)
+    was, now = (each.get("package", "unknown") for each in (record, again))
+    differs += [f"package: {was}, now {now}"] * (was != now)
     for name in sorted({*record["versions"], *again["versions"]}):
         was, now = record["versions"].get(name, "none"), again["versions"].get(name, "none")
         differs += [f"{name}: {was}, now {now}"] * (was != now)

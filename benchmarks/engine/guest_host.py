@@ -172,7 +172,7 @@ class Guest(Agent):
 
     def keep(self, folder: Path, about: dict[str, Any]) -> str:
         """Let the guest save its agent; returns why it could not."""
-        return str(self._do("over", (folder, about)))
+        return str(self._do("over", (folder.absolute(), about)))  # it works in another folder
 
     def close(self) -> None:
         """Let it go, and all that it started."""

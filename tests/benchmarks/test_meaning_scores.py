@@ -195,10 +195,10 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     rows = scoring.rows(methods)
     assert [row[0] for row in rows] == ["best", "middle", "bad"]
     best = dict(zip(scoring.COLUMNS, rows[0], strict=True))
-    assert (best["return"], best["last"], best["95% interval"], best["Eq. (1)"]) == (
+    assert (best["return"], best["last"], best["interval"], best["Eq. (1)"]) == (
         "8.0",
         "0.80",
-        "0.70 to 0.90",
+        "0.70 to 0.90 (51%)",
         "-5",
     )
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
@@ -245,7 +245,7 @@ def test_rows_csv_is_row_by_row_what_came_of_it() -> None:
     task, returns = toys.Drift(), np.array([[5.0, 10.0], [0.0, 2.5]])
     theta, objective_ = np.array([[[0.1], [0.2]], [[0.3], [0.4]]]), np.array([[-1.0, -2.0], [-3.0, -4.0]])
     data = {"meta": {"agents": {"x": ""}}, "x/returns": returns, "x/objective": objective_, "x/theta": theta}
-    about = {"methods": {"random": {"return": [[0.0]]}, "expert": {"return": [[10.0]]}}}
+    about = {"methods": {"random": {"reference": 0.0}, "expert": {"reference": 10.0}}}
     lines = scoring.csv_rows(task, about, [("x", 7, data)]).splitlines()
     assert lines[0] == "method,seed,trial,force,episode,return,score,objective"
     assert lines[1:] == [
