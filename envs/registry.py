@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 
+from deconfounded.envs import blackbox
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.support import outside
 from deconfounded.envs.task import InputError, Task
@@ -78,8 +79,10 @@ def get(name: str) -> Task:
     if registered := [task for task in TASKS.values() if task.reference == reference]:
         return registered[0]()
     cls = outside.find("task", name)
-    if not (isinstance(cls, type) and issubclass(cls, Task)):
-        raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
+    if not isinstance(cls, type):
+        raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task, or a world")
+    if not issubclass(cls, Task):
+        cls = blackbox.task_of(cls)
     cls.reference = reference
     return register(cls)()
 
