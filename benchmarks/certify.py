@@ -116,7 +116,7 @@ def certify(
     if not task.has_likelihood:
         from deconfounded.deconf.learned_reference import LearnedGrid, learn  # sklearn takes a second
 
-        dynamics = learn(task, expert, 4 * trials, stream(EXPLORATION, SEED))
+        dynamics = learn(task, expert, 2 * trials, stream(EXPLORATION, SEED))
         thetas, learned = LearnedGrid(env, expert, grid, dynamics), {"r2": dynamics.r2, "exponent": dynamics.exponent}
 
     def returns(agent: Agent) -> Array:

@@ -18,7 +18,7 @@ from pathlib import Path
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import COMMON
-from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, EXACT, METHODS, REFERENCES
 from deconfounded.experts import policy
 
 
@@ -47,7 +47,12 @@ def main() -> None:
     if args.task is None:
         raise envs.InputError(f"--task is missing; there are {', '.join(envs.names())}")
     task = envs.get(args.task)
-    wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
+    possible = [name for name in METHODS if name not in EXACT or task.has_likelihood]
+    if refused := [name for name in args.methods or () if name in EXACT and name not in possible]:
+        right = "`deconf certify` has learned ones"
+        raise envs.InputError(f"--methods had {refused[0]}, and {task.name} has no likelihood for it; {right}")
+    default = [name for name in DEFAULT if name in possible]
+    wanted = {*commands.check(args, possible, default, guests=True), *REFERENCES}
     envs.check_task(task)
     policy.load(task, args.expert)
     if args.track and not find_spec("tensorboard"):

@@ -75,7 +75,7 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
     rows = features(task, obs, action, theta)
     inputs = StandardScaler().fit(rows)
     network = MLPRegressor(
-        hidden_layer_sizes=(128, 128), batch_size=256, early_stopping=True, n_iter_no_change=8, random_state=seed
+        hidden_layer_sizes=(128, 128), batch_size=512, max_iter=50, early_stopping=True, random_state=seed
     )
     network.fit(inputs.transform(rows), (next_obs - obs)[:, moves] / scale[moves])
     dynamics = LearnedDynamics(task, network, inputs, scale, np.eye(moves.sum()))

@@ -328,7 +328,7 @@ def made(name: str, world: World, theta: Array) -> gymnasium.Env[Any, Any]:
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise InputError(f"action_space of {name} was {acts}; it must be Discrete, or a Box of one axis")
     if not np.isfinite([space.low, space.high]).all() or (space.low >= space.high).any():
-        right = "bounded, since its bounds are scaled to -1 and 1: wrap it in gymnasium.wrappers.RescaleAction"
+        right = "bounded, as its bounds are scaled to -1 and 1"
         raise InputError(f"action_space of {name} was {acts}; it must be {right}")
     return env
 

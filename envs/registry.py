@@ -35,10 +35,11 @@ def register(cls: type[Task]) -> type[Task]:
         cls.reference = name if ours else outside.reference(cls) or name
     if outside.is_outside(cls.reference):
         copyreg.pickle(cls, _parts)
-    TASKS[name], gym_id = cls, cls().gym_id
+    gym_id, steps = cls().gym_id, cls().horizon
+    TASKS[name] = cls
     gymnasium.registry.pop(gym_id, None)
     one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}
-    gymnasium.register(gym_id, one, max_episode_steps=cls.horizon, vector_entry_point=many, kwargs=arguments)
+    gymnasium.register(gym_id, one, max_episode_steps=steps, vector_entry_point=many, kwargs=arguments)
     return cls
 
 
