@@ -77,7 +77,8 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
     network = MLPRegressor(
         hidden_layer_sizes=(128, 128), batch_size=512, max_iter=50, early_stopping=True, random_state=seed
     )
-    network.fit(inputs.transform(rows), (next_obs - obs)[:, moves] / scale[moves])
+    target = (next_obs - obs)[:, moves] / scale[moves]
+    network.fit(inputs.transform(rows), target[:, 0] if moves.sum() == 1 else target)
     dynamics = LearnedDynamics(task, network, inputs, scale, np.eye(moves.sum()))
     obs, action, next_obs, theta = steps(rollouts, held_out)
     residual = dynamics.residual(obs, action, next_obs, theta)
