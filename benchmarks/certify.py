@@ -116,8 +116,8 @@ def certify(
     if not task.has_likelihood:
         from deconfounded.deconf.learned_reference import LearnedGrid, learn  # sklearn takes a second
 
-        dynamics = learn(task, expert, 2 * trials, stream(EXPLORATION, SEED))
-        thetas, learned = LearnedGrid(env, expert, grid, dynamics), {"r2": dynamics.r2, "exponent": dynamics.exponent}
+        model = learn(task, expert, 2 * trials, stream(EXPLORATION, SEED))
+        thetas, learned = LearnedGrid(env, expert, grid, model), {"r2": model.r2, "exponent": model.exponent}
 
     def returns(agent: Agent) -> Array:
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)

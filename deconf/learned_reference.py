@@ -12,7 +12,7 @@ from sklearn.preprocessing import StandardScaler
 
 from deconfounded.deconf.exact import Grid
 from deconfounded.envs import BatchEnv, Task
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, run_trials
 
@@ -51,8 +51,8 @@ class LearnedDynamics:
     def log_grid(self, obs: Array, action: Array, next_obs: Array, thetas: Array) -> Array:
         """The same [M, K] for each of thetas [K, L]."""
         k = len(thetas)
-        rows = (np.repeat(x, k, 0) for x in (obs, action, next_obs))
-        return self.log_prob(*rows, np.tile(thetas, (len(obs), 1))).reshape(-1, k)
+        before, taken, after = (np.repeat(x, k, 0) for x in (obs, action, next_obs))
+        return self.log_prob(before, taken, after, np.tile(thetas, (len(obs), 1))).reshape(-1, k)
 
 
 def features(task: Task, obs: Array, action: Array, theta: Array) -> Array:
@@ -90,7 +90,7 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
     return dynamics
 
 
-def steps(rollouts: list[Rollout], which: Array) -> tuple[Array, Array, Array, Array]:
+def steps(rollouts: list[Rollout], which: Mask) -> tuple[Array, Array, Array, Array]:
     """Observation, action, next observation and theta of the steps that took place, of some trials, in rows."""
     parts = []
     for trials, _, hidden in rollouts:
@@ -102,7 +102,7 @@ def steps(rollouts: list[Rollout], which: Array) -> tuple[Array, Array, Array, A
     return obs, action, next_obs, theta
 
 
-def calibrated(dynamics: LearnedDynamics, rollouts: list[Rollout], which: Array) -> float:
+def calibrated(dynamics: LearnedDynamics, rollouts: list[Rollout], which: Mask) -> float:
     """The exponent under which posteriors of the true theta among decoys are best, over all beginnings of trials."""
     decoys = dynamics.task.theta_grid(DECOYS)
     score = np.zeros(len(EXPONENTS))
