@@ -4,9 +4,11 @@ They take the place of the exact ones where those cannot be: the same policies o
 likelihood that is as good as its fit. They see theta in training, so they are no imitators.
 """
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
 from sklearn.preprocessing import StandardScaler
 
@@ -78,7 +80,9 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
         hidden_layer_sizes=(128, 128), batch_size=512, max_iter=50, early_stopping=True, random_state=seed
     )
     target = (next_obs - obs)[:, moves] / scale[moves]
-    network.fit(inputs.transform(rows), target[:, 0] if moves.sum() == 1 else target)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # what the fit is worth is measured on held-out trials
+        network.fit(inputs.transform(rows), target[:, 0] if moves.sum() == 1 else target)
     dynamics = LearnedDynamics(task, network, inputs, scale, np.eye(moves.sum()))
     obs, action, next_obs, theta = steps(rollouts, held_out)
     residual = dynamics.residual(obs, action, next_obs, theta)
