@@ -10,20 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
-GUST = 0.25  # m/s a step; the motor changes the cart's speed by .2 m/s
+FORCE, GUST = 10.0, 12.0  # N, of the motor and of a gust
 
 
 class Wired(gymnasium.Wrapper):
-    """The motor pushes by a multiple of the force that it is asked for, and gusts push the cart."""
+    """The motor's force has a sign, and a gust adds to it: one step shows little of that sign."""
 
     def __init__(self, env: gymnasium.Env, sign: float) -> None:
         super().__init__(env)
-        self.unwrapped.force_mag *= sign
+        self.sign = sign
 
     def step(self, action):
         cart = self.unwrapped
-        x, speed, angle, turning = cart.state
-        cart.state = np.array([x, speed + GUST * cart.np_random.standard_normal(), angle, turning])
+        cart.force_mag = self.sign * FORCE + GUST * cart.np_random.standard_normal()
         return self.env.step(action)
 
 
