@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import identity
-from deconfounded.benchmarks.engine.context import DEMOS, stream
+from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import normalise
 from deconfounded.deconf.equations import belief_update
-from deconfounded.deconf.exact import ExactAgent, Grid, log_next
+from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -66,7 +66,7 @@ class EvidenceRecorder(ExpertAgent):
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
-        true = log_next(self.env.simulator, self._state, action, self.env.state, self.env.theta)
+        true = self.grid.log_true(self._state, action, self.env.state)
         self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
         acted = self.expert.log_prob(obs, action, self.env.theta)
         self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
@@ -78,7 +78,7 @@ def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, 
 
     Each row is scored by its own expert and its own random actions.
     """
-    levels = task.theta_grid(LEVELS)
+    levels = np.unique(task.theta_grid(LEVELS), axis=0)
     j = len(levels)
     true = np.repeat(levels, j * trials, 0)
     assumed = np.tile(np.repeat(levels, trials, 0), (j, 1))
@@ -111,21 +111,29 @@ def certify(
     done: called with the name of each stage when it is over.
     """
     env = envs.BatchEnv(task, trials)
+    learned: dict[str, Any] = {}
+    thetas: int | Grid = grid
+    if not task.has_likelihood:
+        from deconfounded.deconf.learned_reference import LearnedGrid, learn  # sklearn takes a second
+
+        model = learn(task, expert, 2 * trials, stream(EXPLORATION, SEED))
+        thetas, learned = LearnedGrid(env, expert, grid, model), {"r2": model.r2, "exponent": model.exponent}
 
     def returns(agent: Agent) -> Array:
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
 
-    recorder = EvidenceRecorder(env, expert, Grid(env, expert, grid))
+    recorder = EvidenceRecorder(env, expert, thetas if isinstance(thetas, Grid) else Grid(env, expert, thetas))
     _, best, truth = run_trials(env, recorder, EPISODES, SEED)  # thetas are the same in every run: seeds are shared
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
     if one <= zero:
-        raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; train it first")
+        remedy = "train it first" if task.has_likelihood else "it must be better"
+        raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; {remedy}")
     done(STAGES[0])
     beliefs = [*recorder.beliefs, np.exp(recorder.log_belief)]
-    policies = {"interventional": returns(ExactAgent(env, expert, False, grid))}
-    static = {"static": returns(ExactAgent(env, expert, False, grid, static=True))} if task.drifts else {}
+    policies = {"interventional": returns(ExactAgent(env, expert, False, thetas))}
+    static = {"static": returns(ExactAgent(env, expert, False, thetas, static=True))} if task.drifts else {}
     done(STAGES[1])
-    policies |= {"conditional": returns(ExactAgent(env, expert, True, grid)), **static}
+    policies |= {"conditional": returns(ExactAgent(env, expert, True, thetas)), **static}
     done(STAGES[2])
     levels, matrix, raw = stakes(task, expert, max(trials // 2, 8))
     done(STAGES[3])
@@ -152,6 +160,7 @@ def certify(
     return {
         "task": task.name,
         "task_version": task.version,
+        **({"learned_dynamics": learned} if learned else {}),  # of the references, which are exact without them
         "verdict": "passed" if all(check["passed"] for check in checks.values()) else "failed",
         "checks": checks,
         "return_random": zero,
@@ -190,12 +199,13 @@ def picture(result: dict[str, Any], file: Path) -> None:
         left.set_xticks(range(len(ticks)), ticks)
         left.set_yticks(range(len(ticks)), ticks)
         left.figure.colorbar(left.imshow(score, vmin=0, vmax=1, cmap="viridis"), ax=left)
+        kind = "learned" if "learned_dynamics" in result else "exact"
         lines = {"interventional": "tab:green", "conditional": "tab:red", "static": "tab:olive"}
         for name in (name for name in lines if name in result):
-            label = "interventional, theta taken to stand still" if name == "static" else f"exact {name}"
+            label = "interventional, theta taken to stand still" if name == "static" else f"{kind} {name}"
             middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=lines[name], label=label)
         middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
-        middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title="exact policies")
+        middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title=f"{kind} policies")
         middle.legend(frameon=False)
         evidence = result["evidence_nats_per_step"]
         right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
@@ -221,6 +231,9 @@ def main() -> None:
     picture(result, folder / f"{task.name}.png")
     for name, check in result["checks"].items():
         print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {check['measured']:.3f} (required {check['required']})")
+    if learned := result.get("learned_dynamics"):
+        fit = "R2 {r2:.3f} on held-out trials, likelihood to the power {exponent:g}".format(**learned)
+        print(f"conditional, interventional and evidence are of learned dynamics, not exact: {fit}")
     nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
     print(f"evidence a step: {nats}; theta from expert trials: {result['inferability'][-1]}")
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")

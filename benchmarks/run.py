@@ -23,7 +23,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import COMMON
 from deconfounded.benchmarks.engine import published
-from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, EXACT, METHODS, REFERENCES
 from deconfounded.experts import policy
 
 
@@ -44,7 +44,13 @@ def main() -> None:
     if (args.task is None) == (args.tasks is None):
         raise envs.InputError(f"--task is missing, or given with --tasks; there are {', '.join(envs.names())}")
     tasks = [envs.get(args.task)] if args.task is not None else published.tasks(args.tasks)
-    wanted = {*commands.check(args, list(METHODS), DEFAULT, guests=True), *REFERENCES}
+    opaque = next((task.name for task in tasks if not task.has_likelihood), None)
+    possible = [name for name in METHODS if name not in EXACT or opaque is None]
+    if refused := [name for name in args.methods or () if name in EXACT and name not in possible]:
+        right = "`deconf certify` has learned ones"
+        raise envs.InputError(f"--methods had {refused[0]}, and {opaque} has no likelihood for it; {right}")
+    default = [name for name in DEFAULT if name in possible]
+    wanted = {*commands.check(args, possible, default, guests=True), *REFERENCES}
     for task in tasks:
         envs.check_task(task)
         policy.load(task, args.expert)

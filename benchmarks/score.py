@@ -22,6 +22,10 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
 
     Raises InputError for an unknown latent, or an invalid range.
     """
+    if not ranges:
+        return task
+    if not task.has_likelihood:
+        raise envs.InputError(f"--range was {ranges[0]!r}; {task.name} draws theta by its own sample_theta alone")
     latents = {latent.name: latent for latent in task.latents}
     for text in ranges:
         name, _, bounds = text.partition("=")

@@ -86,6 +86,10 @@ class Grid:
             log_prob[pruned] = np.take_along_axis(log_prob[pruned], nearest, -1)
         return log_prob
 
+    def log_true(self, state: Array, action: Array, next_state: Array) -> Array:
+        """log p(s' | s, a, theta) [N] under the environments' own theta."""
+        return log_next(self.env.simulator, state, action, next_state, self.env.theta)
+
     def log_policy(self, obs: Array, action: Array) -> Array:
         """log pi_exp(a | s, theta) [N, K]; obs [N, O], action [N, A]."""
         n, k = len(obs), len(self.theta)
@@ -101,9 +105,12 @@ class ExactAgent(Agent):
     theta.
     """
 
-    def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, k: int = 21, static: bool = False) -> None:
+    def __init__(
+        self, env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = 21, static: bool = False
+    ) -> None:
+        """k: the grid, or how many values it has."""
         self.env, self.expert, self.conditional, self.static = env, expert, conditional, static
-        self.grid = Grid(env, expert, k)
+        self.grid = k if isinstance(k, Grid) else Grid(env, expert, k)
 
     def begin(self, n: int) -> None:
         self.log_belief, self._first = self.grid.prior(n), True

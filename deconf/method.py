@@ -29,11 +29,11 @@ class Method:
     """A method's declaration, made by `uses`.
 
     uses: of USES. version: raised by hand when the method's numbers change. cost: CPU time of training relative to
-    blind BC, for estimates of remaining time. on_control, on_bandit: its configuration where actions are continuous,
-    and where they are discrete (None: the same). smoke, smoke_bandit: changes to these in the preset `smoke`; paper:
-    its configuration on the bandit in the preset `paper`. large: changes for large observations, given the
-    configuration. deployments: further deployments of its agent, each scored. exact: an exact reference policy.
-    reference: path/file.py:function of a method from outside.
+    blind BC, for estimates of remaining time. on_control, on_bandit: its configuration on control
+    tasks, and on bandits (None: the same). smoke, smoke_bandit: changes to these in the preset `smoke`; paper: its
+    configuration on the bandit in the preset `paper`. large: changes for large observations, given the configuration.
+    deployments: further deployments of its agent, each scored. exact: an exact reference policy. reference:
+    path/file.py:function of a method from outside.
     """
 
     uses: tuple[str, ...]
@@ -65,13 +65,13 @@ class Method:
 
     def amounts(self, preset: str, task: "Task", device: str) -> dict[str, Any]:
         """The configuration on a task, in a preset, as plain values; empty if there is none."""
-        discrete = task.n_actions > 0
-        config = self.on_bandit if discrete and self.on_bandit is not None else self.on_control
+        bandit = task.is_bandit
+        config = self.on_bandit if bandit and self.on_bandit is not None else self.on_control
         if config is None:
             return {}
         if preset == "smoke":
-            config = replace(config, **(self.smoke_bandit if discrete else self.smoke))
-        if preset == "paper" and discrete and self.paper is not None:
+            config = replace(config, **(self.smoke_bandit if bandit else self.smoke))
+        if preset == "paper" and bandit and self.paper is not None:
             config = self.paper
         values = asdict(config)
         changes: dict[str, Any] = {"device": device, "drifts": task.drifts}

@@ -87,6 +87,7 @@ class BatchEnv:
             for i, row in zip(rows[which].tolist(), theta, strict=True):
                 self.simulator.set_theta(i, row)
         start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
+        start = self.simulator.start(rows, start, noise)
         if first:
             self.state, self._noise = np.zeros((self.n, start.shape[1])), np.zeros((self.n, *noise.shape[1:]))
         self.state[rows], self._noise[rows] = start, noise

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
+from deconfounded.envs import blackbox
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.support import outside
 from deconfounded.envs.task import InputError, Task
@@ -35,10 +36,11 @@ def register(cls: type[Task]) -> type[Task]:
         cls.reference = name if ours else outside.reference(cls) or name
     if outside.is_outside(cls.reference):
         copyreg.pickle(cls, _parts)
-    TASKS[name], gym_id = cls, cls().gym_id
+    gym_id, steps = cls().gym_id, cls().horizon
+    TASKS[name] = cls
     gymnasium.registry.pop(gym_id, None)
     one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}
-    gymnasium.register(gym_id, one, max_episode_steps=cls.horizon, vector_entry_point=many, kwargs=arguments)
+    gymnasium.register(gym_id, one, max_episode_steps=steps, vector_entry_point=many, kwargs=arguments)
     return cls
 
 
@@ -79,8 +81,10 @@ def get(name: str) -> Task:
     if registered := [task for task in TASKS.values() if task.reference == reference]:
         return registered[0]()
     cls = outside.find("task", name)
-    if not (isinstance(cls, type) and issubclass(cls, Task)):
-        raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task")
+    if not isinstance(cls, type):
+        raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task, or a world")
+    if not issubclass(cls, Task):
+        cls = blackbox.task_of(cls)
     cls.reference = reference
     return register(cls)()
 

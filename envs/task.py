@@ -45,6 +45,10 @@ class Simulator:
         """Give environment i the latents theta [L]."""
         self.theta[i] = theta
 
+    def start(self, rows: NDArray[np.int64], start: Array, noise: Array) -> Array:
+        """Begin episodes in the environments `rows` [M], in states [M, S], with unit noise [M, T, Z]; their states."""
+        return start
+
     def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
         """State [M, S], action [M, A] -> the noise-free outcome [M, ...], a control step later.
 
@@ -70,6 +74,7 @@ class Task(ABC):
     episodes: ClassVar[int] = 5  # of one trial
     control_dt: ClassVar[float] = 1.0  # s
     moves_state: ClassVar[bool] = True  # False: theta acts through reward and readings alone
+    has_likelihood: ClassVar[bool] = True  # False: a black box (envs/blackbox.py), of which there is no exact reference
     expert_noise: ClassVar[float] = 0.0  # std of the expert's action around its mean; the action range is [-1, 1]
     action_space: ClassVar[spaces.Box | spaces.Discrete]
     observation: ClassVar[dict[str, tuple[float, float]]]  # name -> bounds, in the order of `observe`
@@ -147,6 +152,11 @@ class Task(ABC):
         return action_sizes(self.action_space)[1]
 
     @property
+    def is_bandit(self) -> bool:
+        """Whether presets spend the bandit's amounts on it, which are many trials of few bits, or those of control."""
+        return self.n_actions > 0
+
+    @property
     def action_width(self) -> int:
         """A, the columns of an action: one if it is discrete."""
         return action_sizes(self.action_space)[0]
@@ -206,13 +216,17 @@ class Task(ABC):
         except (TypeError, ValueError):
             right = f"{len(self.latents)} number(s), or one row for each of the {n} environment(s)"
             raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
-        for column, lat in zip(array.T, self.latents, strict=True):
+        self._check_bounds(array)
+        return array
+
+    def _check_bounds(self, theta: Array) -> None:
+        """Raises InputError for a theta [N, L] that cannot be drawn."""
+        for column, lat in zip(theta.T, self.latents, strict=True):
             whole = lat.distribution == "categorical"
             bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column != np.floor(column))]
             if bad.size:
                 right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
                 raise InputError(f"{lat.name} of {self.name} was {bad[0]:g}; it must be {right}")
-        return array
 
     def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:
         """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist.

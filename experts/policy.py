@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
 from deconfounded.envs import InputError, Task
+from deconfounded.envs.blackbox import BlackBox
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS, Array, Streams
@@ -153,6 +154,8 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
         expert.mean(np.zeros((2, len(task.observation)), np.float32), lat)
         return expert
+    if source is None and isinstance(task, BlackBox):
+        return CallableExpert(task, task.expert_mean, f"of {task.name}")
     return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source)))
 
 

@@ -39,15 +39,15 @@ _SMOKE_BANDIT = Preset(seeds=1, expert_trials=2000, explore_trials=1000, eval_tr
 def preset(name: str, task: envs.Task, device: str, methods: Sequence[str] | None = None) -> Preset:
     """The amounts for a task, and the configurations of the methods (None: of all).
 
-    Tasks with discrete actions take the bandit's, all others those of control.
+    Bandits have amounts of their own (`Task.is_bandit`), all others those of control.
     """
-    discrete = task.n_actions > 0
-    amounts = _BANDIT if discrete else _CONTROL
+    bandit = task.is_bandit
+    amounts = _BANDIT if bandit else _CONTROL
     if name == "smoke":
-        amounts = _SMOKE_BANDIT if discrete else _SMOKE
+        amounts = _SMOKE_BANDIT if bandit else _SMOKE
     if name == "paper":
         amounts = replace(amounts, seeds=10)
-        if discrete:
+        if bandit:
             amounts = replace(amounts, explore_trials=100, fresh=100)
     configs = {method: METHODS[method].amounts(name, task, device) for method in methods or METHODS}
     return replace(amounts, device=device, configs={method: values for method, values in configs.items() if values})

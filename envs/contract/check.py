@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.blackbox import BlackBox
 from deconfounded.envs.contract.probe import actions, beyond_bounds, streams
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.support.errors import InputError, error_line
@@ -34,6 +35,8 @@ def _part(task: Task, name: str) -> Iterator[None]:
 def check_task(task: Task) -> None:
     """Build a task, take a step, then an episode of random actions. Raises InputError that names what does not fit."""
     _check_numbers(task)
+    if isinstance(task, BlackBox):
+        return _check_world(task)
     if isinstance(task, MujocoTask):
         _check_model(task)
     with _part(task, "action_space"):
@@ -61,6 +64,18 @@ def check_task(task: Task) -> None:
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):
         _check_episodes(task)
+
+
+def _check_world(task: BlackBox) -> None:
+    """The expert acts, and an episode of random actions runs in two environments; errors name the world's part."""
+    env = BatchEnv(task, 2)
+    obs = env.reset(0)
+    acted = task.expert_probs if task.n_actions else task.expert_mean
+    for action in actions(task, env.n, task.horizon):
+        acted(obs[env.alive], env.theta[env.alive])
+        obs = env.step(action)[0]
+        if not env.alive.any():
+            return
 
 
 def _check_numbers(task: Task) -> None:

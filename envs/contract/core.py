@@ -17,7 +17,17 @@ import numpy as np
 from deconfounded.envs.adapters import GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.contract import physics, protocols
-from deconfounded.envs.contract.probe import Skipped, actions, far_thetas, observations, refused, require, same, streams
+from deconfounded.envs.contract.probe import (
+    Skipped,
+    actions,
+    far_thetas,
+    needs_likelihood,
+    observations,
+    refused,
+    require,
+    same,
+    streams,
+)
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.task import Array, Task
 
@@ -86,6 +96,7 @@ def keep_theta(task: Task) -> None:
 
 def theta_follows_its_distribution(task: Task) -> None:
     """Thetas, drawn or drifted, follow p(theta): Kolmogorov-Smirnov distance of 2,000 draws below .04 (p = .003)."""
+    needs_likelihood(task)
     draws = task.sample_theta(streams(*range(2000)))
     if task.drifts:
         draws = task.drifted(draws, streams(*range(2000, 4000)))
@@ -115,7 +126,8 @@ def seed_streams(task: Task) -> None:
     for i in range(2):
         theta, start, _ = map(streams, np.random.SeedSequence(20 + i).spawn(3))  # type: ignore[arg-type]
         same(batch.theta[i], task.sample_theta(theta)[0], "theta and what the seed's first stream draws")
-        same(batch.state[i], task.init_state(start)[0], "the start and what the seed's second stream draws")
+        if task.has_likelihood:  # else the stream draws a seed
+            same(batch.state[i], task.init_state(start)[0], "the start and what the seed's second stream draws")
 
 
 def seed_kinds(task: Task) -> None:
@@ -142,6 +154,8 @@ def starts_vary_and_nothing_is_constant(task: Task) -> None:
     """No observation is constant over whole episodes, and MuJoCo tasks have random initial states."""
     seen = observations(task, actions(task, 8, task.horizon), 0)
     still = [name for name, ptp in zip(task.observation, np.ptp(seen, (0, 1)), strict=True) if not ptp > 0]
+    if still and not task.has_likelihood:
+        raise Skipped(f"observation {', '.join(still)} never moved; it tells nothing")
     require(not still, f"observation {', '.join(still)} of {task.name} never moved; it must tell something")
     varied = not isinstance(task, MujocoTask) or (seen[0] != seen[0, 0]).any()
     require(varied, "eight episodes started with the same observations; init_state must vary")
@@ -159,6 +173,7 @@ def observations_share_no_memory(task: Task) -> None:
 
 def theta_out_of_bounds(task: Task) -> None:
     """A theta out of bounds, NaN or of the wrong length is refused; the message gives the bounds."""
+    needs_likelihood(task)
     env, latent = GymEnv(task), task.latents[0]
     says = rf"^{re.escape(latent.name)} of {task.name} was .*must be .*{re.escape(f'{latent.high:g}')}"
     for wrong in (latent.high + 1, latent.low - 1, float("nan")):
@@ -203,6 +218,7 @@ def _density_ratio(what: str, fall: Array, pair: str) -> None:
 
 def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
+    needs_likelihood(task)
     m, (first, *rest) = 4000, task.latents
     low, high = first.grid(9)[[0, -1]]
     near = high if first.distribution == "categorical" else low + 0.03 * (high - low)
@@ -229,6 +245,7 @@ def log_sense_is_the_density_of_the_readings(task: Task) -> None:
 
     A task that states that theta moves no state must hold to it, and have readings that depend on theta.
     """
+    needs_likelihood(task)
     batch, m = BatchEnv(task, 50), 4000
     thetas = task.theta_grid(9)[[0, -1]]
     batch.reset(0)

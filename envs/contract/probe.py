@@ -18,6 +18,12 @@ class Skipped(Exception):  # noqa: N818 (nothing is wrong)
     """A check that does not apply, or cannot be made here; the message says why."""
 
 
+def needs_likelihood(task: Task) -> None:
+    """Raise Skipped for a black box."""
+    if not task.has_likelihood:
+        raise Skipped(f"{task.name} is a black box, whose distributions are not stated")
+
+
 def require(condition: object, message: str) -> None:
     """Raise AssertionError with a message unless a condition holds; under `python -O`, too."""
     if not condition:
@@ -72,6 +78,8 @@ def observations(task: Task, acts: Array, seed: int | list[int], **options: Any)
 
 def far_thetas(task: Task) -> Array:
     """Thetas [J, L] that span the range of every latent."""
+    if not task.has_likelihood:  # nor stated bounds
+        return np.unique(task.theta_grid(3), axis=0)
     grids = [lat.grid(5) for lat in task.latents]
     return np.array(list(product(*(grid[:: max(1, (len(grid) - 1) // 2)] for grid in grids))))
 

@@ -1,0 +1,229 @@
+"""Black-box tasks: other people's environments as tasks; the examples of docs/worlds.md, and a small world."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.deconf.learned_reference import LearnedGrid, learn
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.blackbox import BlackBox, task_of
+from deconfounded.envs.contract.core import CONTRACT
+from deconfounded.envs.contract.probe import Skipped
+from deconfounded.experts import policy
+from deconfounded.experts.rollout import ExpertAgent, run_trials
+
+WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
+EXAMPLES = ("context_pendulum.py:ContextPendulum", "reversed_cart.py:ReversedCart")
+
+
+class Slide(gymnasium.Env[Any, Any]):
+    """A point x, moved by action + theta + noise; `draws` numbers are drawn by reset; it ends beyond 4."""
+
+    observation_space = spaces.Box(-9, 9, (1,))
+    action_space: spaces.Space[Any] = spaces.Box(np.array([0.0], "f4"), np.array([4.0], "f4"))
+
+    def __init__(self, theta: float, draws: int = 1) -> None:
+        self.theta, self.draws = theta, draws
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.x = self.np_random.normal(size=self.draws)[:1]
+        return self.x.astype("f4"), {"theta": self.theta}
+
+    def step(self, action: Any) -> Any:
+        self.action = action
+        self.x = self.x + 0.2 * (np.asarray(action).reshape(1) - 2 + self.theta) + 0.3 * self.np_random.normal(size=1)
+        return self.x.astype("f4"), float(-(self.x[0] ** 2)), bool(abs(self.x[0]) > 4), False, {}
+
+
+class Sliding:
+    """The expert pushes to 0, in the units of the environment: 2 is no push."""
+
+    episodes, steps, noise = 2, 12, 0.1
+
+    def make(self, theta: Any) -> Any:
+        return Slide(theta[0])
+
+    def sample_theta(self, rng: np.random.Generator) -> Any:
+        return rng.uniform(-1, 1, 1)
+
+    def expert(self, obs: Any, theta: Any) -> Any:
+        return 2 - obs - theta
+
+
+def task_with(**parts: Any) -> BlackBox:
+    """The task of Sliding with other parts."""
+    return task_of(type("Sliding", (Sliding,), parts))()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("check", CONTRACT)
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_contract(example: str, check: str) -> None:
+    """What of the contract needs no likelihood."""
+    try:
+        CONTRACT[check](envs.get(f"{WORLDS}/{example}"))
+    except Skipped as why:
+        pytest.skip(str(why))
+
+
+def test_it_is_a_task() -> None:
+    """By its name, as other tasks are; its amounts are those of control, and its theta is in no info."""
+    task = envs.get(f"{WORLDS}/{EXAMPLES[1]}")
+    assert (task.name, task.gym_id, task.n_actions) == ("reversed_cart", "deconf/ReversedCart-v0", 2)
+    assert type(envs.get("reversed_cart")) is type(task)
+    assert gymnasium.make("deconf/ReversedCart-v0").reset(seed=0)[1] == {}
+    assert preset("default", task, "cpu", []) == preset("default", envs.get("tilted_cartpole"), "cpu", [])
+    assert not isinstance(envs.get(f"{WORLDS}/{EXAMPLES[0]}"), type(task))
+
+
+def test_actions_are_in_the_world_s_units() -> None:
+    task = task_with()
+    env = BatchEnv(task, 3)
+    obs = env.reset(0, {"theta": [0.5]})
+    expert = policy.load(task)
+    assert task.expert_noise == pytest.approx(0.05)  # of half the range, which is 2
+    np.testing.assert_allclose(task.expert_mean(obs, env.theta), np.clip((-obs - 0.5) / 2, -1, 1), atol=1e-6)
+    env.step(np.array([[-1.0], [0.0], [1.0]]))
+    simulator: Any = env.simulator
+    assert [each.action.item() for each in simulator._envs] == [0.0, 2.0, 4.0]
+    assert np.isfinite(expert.log_prob(obs, expert.act(obs, env.theta, np.random.default_rng(0)), env.theta)).all()
+    with pytest.raises(envs.InputError, match="black box"):
+        task.log_prob(obs, obs)
+
+
+def test_discrete_actions_start_anywhere() -> None:
+    """Actions 5 and 6 are 0 and 1 here; an expert's noise is the share of random ones."""
+
+    class Two(Slide):
+        action_space = spaces.Discrete(2, start=5)
+
+    task = task_with(make=lambda self, theta: Two(theta[0]), expert=lambda self, obs, theta: 6, noise=0.2)
+    env = BatchEnv(task, 2)
+    obs = env.reset(0)
+    np.testing.assert_allclose(task.expert_probs(obs, env.theta), [[0.1, 0.9]] * 2)
+    env.step(np.array([[0], [1]]))
+    simulator: Any = env.simulator
+    assert [each.action for each in simulator._envs] == [5, 6]
+
+
+def test_streams_are_separate() -> None:
+    """Theta, start and noise come from generators of their own, however many numbers reset draws."""
+    first_streams = [np.random.default_rng(np.random.SeedSequence(5 + i).spawn(3)[0]) for i in range(2)]
+    drawn = np.stack([Sliding().sample_theta(rng) for rng in first_streams])
+    paths = []
+    for draws, theta in ((1, None), (7, None), (1, 0.7)):
+        env = BatchEnv(task_with(make=lambda self, theta, draws=draws: Slide(theta[0], draws)), 2)
+        first = env.reset(5, None if theta is None else {"theta": [theta]})
+        forced = np.zeros((2, 1)) if theta is None else 0.2 * (theta - drawn)
+        paths.append(np.array([first, *(env.step(np.zeros((2, 1)))[0] for _ in range(3))]))
+        np.testing.assert_array_equal(env.theta, drawn if theta is None else [[theta]] * 2)
+        paths[-1][1:] -= (np.arange(1, 4)[:, None, None] * forced).astype("f4")
+    for other in paths[1:]:
+        np.testing.assert_allclose(other, paths[0], atol=1e-5)
+
+
+def test_episodes_that_end_early() -> None:
+    """They are masked, and the next episode starts, under the same theta."""
+    task = task_with(sample_theta=lambda self, rng: rng.choice([-8.0, 0.0], 1))
+    env = BatchEnv(task, 16)
+    trials, returns, theta = run_trials(env, ExpertAgent(env, policy.load(task), np.zeros((16, 1))), 2, 0)
+    ended = ~trials.mask.all(-1)
+    np.testing.assert_array_equal(ended, theta[..., 0] == -8)
+    assert ended.any()
+    assert not ended.all()
+    assert trials.mask[:, :, 0].all()
+    assert (returns < 0).all()
+
+
+def test_thetas_of_a_grid_can_occur() -> None:
+    """On a circle, a product of quantiles would leave it."""
+
+    def circle(self: Any, rng: np.random.Generator) -> Any:
+        angle = rng.uniform(0, 2 * np.pi)
+        return np.array([np.cos(angle), np.sin(angle)])
+
+    task = task_with(sample_theta=circle, names=("east", "north"))
+    grid = task.theta_grid(21)
+    assert grid.shape == (49, 2)
+    np.testing.assert_allclose((grid**2).sum(-1), 1)
+    assert [latent.name for latent in task.latents] == ["east", "north"]
+    east = task.latents[0]
+    np.testing.assert_allclose(east.cdf(east.ppf(np.linspace(0.1, 0.9, 9))), np.linspace(0.1, 0.9, 9), atol=0.01)
+
+
+def dict_obs(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"observation_space": spaces.Dict(x=spaces.Box(-1, 1, (1,)))})(0.0)
+
+
+def unbounded(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"action_space": spaces.Box(-np.inf, np.inf, (1,))})(0.0)
+
+
+def four(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"step": lambda self, action: Slide.step(self, action)[:4]})(0.0)
+
+
+def wide(self: Any, theta: Any) -> Any:
+    def step(self: Slide, action: Any) -> Any:
+        obs, *rest = Slide.step(self, action)
+        return np.append(obs, 1.0), *rest
+
+    return type("Odd", (Slide,), {"step": step})(0.0)
+
+
+class TestErrors:
+    """Each is one line, which says what was given."""
+
+    CASES: ClassVar[list[tuple[str, Callable[..., Any] | int | tuple[str, ...], str]]] = [
+        ("make", lambda self, theta: 3, "make of Sliding gave 3; it must be a gymnasium.Env"),
+        ("make", lambda self, theta: 1 / 0, r"make of Sliding: division by zero \(ZeroDivisionError, test_bl"),
+        ("make", dict_obs, "observation_space of Sliding was Dict.*; it must be a Box of one axis: wrap"),
+        ("make", unbounded, r"action_space of Sliding was Box\(-inf.*; it must be bounded"),
+        ("make", four, "step of sliding: not enough values to unpack"),
+        ("make", wide, r"step of sliding gave an observation of shape \(2,\); it must be 1 finite numbers"),
+        ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),
+        ("sample_theta", lambda self, rng: [np.nan], "sample_theta of Sliding gave .nan.; it must be"),
+        ("sample_theta", lambda self, rng: [1] * rng.integers(1, 3), "it must be . finite numbers, as at first"),
+        ("expert", lambda self, obs, theta: np.zeros(3), r"expert of sliding gave .* must be of shape \(1,\)"),
+        ("expert", lambda self, obs, theta: None, "expert of sliding"),
+        ("steps", 0, "the number of steps of Sliding was 0"),
+        ("noise", -1, "noise of Sliding was -1; it must be a number from 0 up"),
+        ("names", ("a", "b"), "names of Sliding were .*; they must be 1 different texts"),
+    ]
+
+    @pytest.mark.parametrize(("part", "value", "says"), CASES)
+    def test_parts(self, part: str, value: Any, says: str) -> None:
+        with pytest.raises(envs.InputError, match=says) as raised:
+            envs.check_task(task_with(**{part: value}))
+        assert "\n" not in str(raised.value)
+
+    def test_what_is_missing(self, tmp_path: Path) -> None:
+        (tmp_path / "mine.py").write_text("class Mine:\n    steps = 3\n    def make(self, theta): pass\n")
+        with pytest.raises(envs.InputError, match="world Mine lacks sample_theta, expert, episodes; a world has make"):
+            envs.get(f"{tmp_path}/mine.py:Mine")
+
+
+@pytest.mark.slow
+def test_learned_dynamics_give_the_posterior() -> None:
+    """On Sliding the likelihood is Gaussian: x' - x - .2 (a + theta) has standard deviation .3."""
+    task = task_with(steps=30)
+    expert, env = policy.load(task), BatchEnv(task, 32)
+    grid = LearnedGrid(env, expert, 15, learn(task, expert, 96, 0))
+    trials, _, theta = run_trials(env, ExpertAgent(env, expert), 1, [7])
+    total, exact = np.zeros((2, 32, 15))
+    for t in range(30):
+        obs, action, then = trials.obs[:, 0, t], trials.action[:, 0, t], trials.obs[:, 0, t + 1]
+        state, following = (np.append(x, np.zeros((32, 2)), 1) for x in (obs, then))
+        total += grid.log_dynamics(state, action, following)
+        exact -= 0.5 * ((then - obs - 0.2 * (2 * action + grid.theta.T)) / 0.3) ** 2
+    means = [(w := np.exp(x - x.max(1, keepdims=True))) @ grid.theta[:, 0] / w.sum(1) for x in (total, exact)]
+    assert np.abs(means[0] - means[1]).mean() < 0.1
+    assert np.corrcoef(means[0], theta[:, 0, 0])[0, 1] > 0.8
