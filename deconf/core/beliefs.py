@@ -14,6 +14,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.gru import GruScan
 from deconfounded.deconf.core.layers import Linear, Mlp
 from deconfounded.deconf.core.nets import Embedding, Inputs, Scaler, Whitener, per_seed
+from deconfounded.deconf.equations import masked_mean
 
 MAX_PRODUCTS = 16  # of actions and changes, as inputs of the evidence network
 
@@ -54,6 +55,10 @@ class Belief(nn.Module, ABC):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
 
+    def innovation_loss(self, steps: Batch) -> Tensor:
+        """The loss [S] on steps [S, K] of what the belief needs beside its objective; 0 unless it reads innovations."""
+        return self.prior_mean.new_zeros(len(self.prior_mean))
+
     @abstractmethod
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std [..., D] of q_phi given memories [..., M]."""
@@ -72,6 +77,10 @@ class EvidenceBelief(Belief):
     its common part grows with the count, and Eq. (6) stays for long on the plateau where the latent is ignored. It
     stays there too where theta shows only in the product of action and change (a motor that turns the other way). Where
     these products are few, they are inputs of the network.
+
+    The network reads *innovations*: changes of the observation, less those that a theta-blind model of the dynamics
+    expects (`innovation_loss`). What theta does to a step is often small beside what the state and the action do; the
+    network would have to subtract these before it sees theta.
     """
 
     longest: Tensor
@@ -83,19 +92,29 @@ class EvidenceBelief(Belief):
         self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
         products = signature.obs * signature.action_features
         self.products = products if products <= MAX_PRODUCTS else 0
+        self.expected = Mlp(signature.obs + signature.action_features, width, signature.obs, draws)
         inputs = 2 * signature.obs + signature.action_features + self.products
         self.evidence = Mlp(inputs, width, self.width, draws)
         self.whiten = Whitener(self.width, draws)
         self.out = Mlp(2 * self.width + 1, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
 
+    def _innovation(self, batch: Batch) -> Tensor:
+        """The scaled change [..., O] of transitions, less its expectation."""
+        inputs = [self.inputs.obs(batch.obs), self.inputs.action(batch.action)]
+        return self.change(batch.next_obs - batch.obs) - self.expected(torch.cat(inputs, -1))
+
+    def innovation_loss(self, steps: Batch) -> Tensor:
+        return masked_mean(self._innovation(steps).square().sum(-1), steps.mask)
+
     def _terms(self, batch: Batch) -> Tensor:
         """Increments of the memory [..., M], one a transition: its evidence and a count of 1; 0 where the mask is 0."""
-        change = self.change(batch.next_obs - batch.obs)
-        action = self.inputs.action(batch.action)
-        inputs = [self.inputs.obs(batch.obs), action, change]
-        if self.products:
-            inputs.append((action[..., None] * change[..., None, :]).flatten(-2))
+        with torch.no_grad():
+            innovation = self._innovation(batch)
+            action = self.inputs.action(batch.action)
+            inputs = [self.inputs.obs(batch.obs), action, innovation]
+            if self.products:
+                inputs.append((action[..., None] * innovation[..., None, :]).flatten(-2))
         evidence = self.whiten(self.evidence(torch.cat(inputs, -1)), batch.mask)
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)

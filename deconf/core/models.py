@@ -123,7 +123,9 @@ class VariationalModel(LatentModel):
         transitions = batch.steps(index)
         memories = self.encoder(batch)[:, :, :-1].flatten(1, 2)
         mean, std = self.encoder.posterior(take(memories, index))
-        return self.negative_elbo(transitions, mean, std, reparametrise(mean, std, draws.normal(*mean.shape[1:])), beta)
+        theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
+        bound = self.negative_elbo(transitions, mean, std, theta_hat, beta)
+        return bound + self.encoder.innovation_loss(transitions)
 
     def negative_elbo(self, steps: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
         """The negative of the bound of Eq. (6) [S], of steps [S, K], beliefs N(mean, std^2) and latents from these."""
