@@ -70,7 +70,7 @@ def by_steps(steps: int) -> dict[str, float]:
     from deconfounded.deconf.core.data import Batch, Draws, Signature
     from deconfounded.deconf.core.models import VariationalModel
     from deconfounded.deconf.core.monitor import Monitor
-    from deconfounded.deconf.core.nets import scalers
+    from deconfounded.deconf.core.nets import Scales
     from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
     from deconfounded.experts.rollout import Trials
 
@@ -79,9 +79,9 @@ def by_steps(steps: int) -> dict[str, float]:
     action = 2 * rng.random((16, 1, steps, 1), np.float32) - 1
     trials = Trials(obs, action, np.ones((16, 1, steps), bool))
     data, draws, signature = Batch.of(trials, 1), Draws([rng], "cpu"), Signature.of(trials)
-    scaled = scalers(data)
-    model, config = VariationalModel("evidence", 4, 64, signature, *scaled, draws), RecurrentConfig()
-    optimizer, agent = Adam([model], 1e-3), RecurrentAgent.new(config.width, signature, scaled[0], draws)
+    scales = Scales.of(signature, data)
+    model, config = VariationalModel("evidence", 4, 64, scales, draws), RecurrentConfig()
+    optimizer, agent = Adam([model], 1e-3), RecurrentAgent.new(config.width, scales, draws)
     trainer = RecurrentTrainer(agent, config, steps, Monitor())
     timed = {
         "an update of the belief": lambda: model.learn(optimizer, data, 1024, 1e-3, draws),

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature, as_generators
 from deconfounded.deconf.core.monitor import Monitor, Training
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import saved_agents
@@ -124,7 +124,7 @@ class LearnedAgent(Agent):
 
     @classmethod
     @abstractmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "LearnedAgent":
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "LearnedAgent":
         """An untrained agent with networks of that shape."""
 
     def state(self) -> State:
@@ -135,9 +135,8 @@ class LearnedAgent(Agent):
     @classmethod
     def from_state(cls, settings: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> "LearnedAgent":
         signature, seeds = Signature(**settings["signature"]), settings["seeds"]
-        zeros = torch.zeros(seeds, 2, signature.obs)
         draws = Draws([np.random.default_rng(0) for _ in range(seeds)], "cpu")
-        agent = cls.blank(settings["shape"], signature, Scaler(zeros, zeros[..., 0] + 1), draws)
+        agent = cls.blank(settings["shape"], Scales.plain(signature, seeds), draws)
         for name, part in agent.parts().items():
             own = {key.removeprefix(f"{name}."): x for key, x in arrays.items() if key.startswith(f"{name}.")}
             part.load_state_dict({key: torch.tensor(x) for key, x in own.items()})

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.gru import GruScan
 from deconfounded.deconf.core.layers import Linear, Mlp
-from deconfounded.deconf.core.nets import Embedding, Inputs, Scaler, Whitener, per_seed
+from deconfounded.deconf.core.nets import Embedding, Inputs, Scales, Whitener, per_seed
 from deconfounded.deconf.equations import masked_mean
 
 MAX_PRODUCTS = 16  # of actions and changes, as inputs of the evidence network
@@ -85,11 +85,10 @@ class EvidenceBelief(Belief):
 
     longest: Tensor
 
-    def __init__(
-        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> None:
+    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(latent, draws)
-        self.inputs, self.change, self.width = Inputs(signature, obs), change, width // 4
+        self.inputs, self.change, self.width = Inputs(scales), scales.change, width // 4
+        signature = scales.signature
         products = signature.obs * signature.action_features
         self.products = products if products <= MAX_PRODUCTS else 0
         self.expected = Mlp(signature.obs + signature.action_features, width, signature.obs, draws)
@@ -148,10 +147,10 @@ class GruMemory(nn.Module):
     a memory lasts two steps, and one seed of five of `dagger` never learns to infer theta.
     """
 
-    def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
+    def __init__(self, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__()
         self.width, self.seeds = width, len(draws)
-        self.inputs = Embedding(width, signature, obs, draws)
+        self.inputs = Embedding(width, scales, draws)
         self.input, self.recurrent = Linear(3 * 32, 3 * width, draws), Linear(width, 3 * width, draws)
         with torch.no_grad():
             keep = slice(width, 2 * width)
@@ -183,11 +182,9 @@ class GruBelief(Belief):
     where the latent is ignored. (Not so for the memories of policies: with it, dagger is worse on `forked_path`.)
     """
 
-    def __init__(
-        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> None:
+    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(latent, draws)
-        self.memory = GruMemory(width, signature, obs, draws)
+        self.memory = GruMemory(width, scales, draws)
         self.inputs = self.memory.inputs
         self.out = Linear(width, 2 * latent, draws)
         with torch.no_grad():

@@ -156,6 +156,10 @@ class Batch:
         action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
         return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
 
+    def flat(self) -> "Batch":
+        """All steps [S, B T] without a time axis, padding too."""
+        return Batch(*(x.flatten(1, 2) for x in self.tensors))
+
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """obs, action, next_obs and mask."""

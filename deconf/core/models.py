@@ -13,8 +13,8 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief
-from deconfounded.deconf.core.data import Batch, Draws, Signature, take
-from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scaler, per_seed, sample_index
+from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
@@ -86,14 +86,12 @@ class LatentModel(nn.Module, ABC):
 class VariationalModel(LatentModel):
     """The paper's model: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
 
-    def __init__(
-        self, kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> None:
+    def __init__(self, kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(draws)
         self.kind, self.latent, self.width = kind, latent, width
-        self.encoder: Belief = BELIEFS[kind](latent, width, signature, obs, change, draws)  # type: ignore[abstract]
+        self.encoder: Belief = BELIEFS[kind](latent, width, scales, draws)  # type: ignore[abstract]
         self.inputs = self.encoder.inputs
-        self.dynamics = DynamicsHead(latent, width, self.inputs, change, draws)
+        self.dynamics = DynamicsHead(latent, width, self.inputs, draws)
 
     def start(self, n: int) -> Tensor:
         return self.encoder.start(n)
@@ -146,12 +144,10 @@ class DiscreteModel(LatentModel):
 
     kind = "discrete"
 
-    def __init__(
-        self, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> None:
+    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(draws)
-        self.latent, self.width, self.inputs = latent, width, Inputs(signature, obs)
-        self.dynamics = DynamicsHead(0, width, self.inputs, change, draws, copies=latent)
+        self.latent, self.width, self.inputs = latent, width, Inputs(scales)
+        self.dynamics = DynamicsHead(0, width, self.inputs, draws, copies=latent)
 
     def _evidence(self, batch: Batch) -> Tensor:
         log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
@@ -200,15 +196,13 @@ class DiscreteModel(LatentModel):
         return torch.stack(losses).mean(0)
 
 
-def new_model(
-    kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-) -> LatentModel:
+def new_model(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> LatentModel:
     """An untrained model: `evidence`, `gru` or `discrete`. Raises InputError for another kind."""
     if kind == "discrete":
-        return DiscreteModel(latent, width, signature, obs, change, draws)
+        return DiscreteModel(latent, width, scales, draws)
     if kind not in BELIEFS:
         raise InputError(f"model was {kind!r}; it must be one of {', '.join(BELIEFS)}, discrete")
-    return VariationalModel(kind, latent, width, signature, obs, change, draws)
+    return VariationalModel(kind, latent, width, scales, draws)
 
 
 @torch.no_grad()

@@ -44,46 +44,77 @@ class Scaler(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
 
+    def inverse(self, x: Tensor) -> Tensor:
+        """The reverse of `forward`."""
+        return x * per_seed(self.std, x) + per_seed(self.mean, x)
 
-def scalers(data: Batch) -> tuple[Scaler, Scaler]:
-    """Scalers of the observations, and of their changes in a step."""
-    return Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+
+class Scales(nn.Module):
+    """The kind of data, and how networks standardise it: observations, their changes in a step, actions and labels.
+
+    `action` is for actions that a network reads, `label` for those that it imitates: an expert's are often a small part
+    of the range that exploration covers.
+    """
+
+    def __init__(self, signature: Signature, data: Batch, label: Tensor, label_mask: Tensor) -> None:
+        super().__init__()
+        self.signature = signature
+        self.obs, self.change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
+        self.action, self.label = Scaler(data.action, data.mask), Scaler(label, label_mask)
+
+    @staticmethod
+    def of(signature: Signature, expert: Batch, explored: Batch | None = None) -> "Scales":
+        """Those of expert trials, and of exploration: changes of random actions alone can be far smaller, and theta is
+        then learned poorly."""
+        return Scales(signature, explored.joined(expert) if explored else expert, expert.action, expert.mask)
+
+    @staticmethod
+    def plain(signature: Signature, seeds: int) -> "Scales":
+        """Those that change nothing."""
+        obs, action = (torch.zeros(seeds, 1, 2, n) for n in (signature.obs, signature.action))
+        mask = torch.ones(seeds, 1, 2)
+        return Scales(signature, Batch(obs, action, obs, mask), action, mask)
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Actions [S, ..., A] as a network's input [S, ..., action_features]: standardised, or one-hot if discrete."""
+        return self.signature.encode_action(action if self.signature.actions else self.action(action))
 
 
 class Inputs(nn.Module):
-    """Preprocessing of networks' inputs: observations standardised, discrete actions one-hot."""
+    """Preprocessing of networks' inputs: observations and actions standardised, discrete actions one-hot."""
 
-    def __init__(self, signature: Signature, obs: Scaler) -> None:
+    def __init__(self, scales: Scales) -> None:
         super().__init__()
-        self.signature, self.scaler = signature, obs
-        self.obs_width, self.action_width = signature.obs, signature.action_features
+        self.signature, self.scales = scales.signature, scales
+        self.obs_width, self.action_width = self.signature.obs, self.signature.action_features
 
     def obs(self, obs: Tensor) -> Tensor:
         """[S, ..., O] -> [S, ..., obs_width]."""
-        return self.scaler(obs)
+        return self.scales.obs(obs)
 
     def action(self, action: Tensor) -> Tensor:
         """[S, ..., A] -> [S, ..., action_width]."""
-        return self.signature.encode_action(action)
+        return self.scales.encode(action)
 
 
 class Embedding(Inputs):
     """The paper's preprocessing (appendix D): an MLP for observations and a linear map for actions, to 32 each."""
 
-    def __init__(self, width: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
-        super().__init__(signature, obs)
+    def __init__(self, width: int, scales: Scales, draws: Draws) -> None:
+        super().__init__(scales)
+        signature = scales.signature
         self.obs_width = self.action_width = 32
         self.embed_obs = Mlp(signature.obs, width, 32, draws)
         self.embed_action = Linear(signature.action_features, 32, draws)
 
     def obs(self, obs: Tensor) -> Tensor:
         if self.signature.binary and self.signature.obs == 1:  # of one bit there are two embeddings: computed once
-            zero, one = self.embed_obs(self.scaler(obs.new_tensor([[0.0], [1.0]]).expand(len(obs), 2, 1))).unbind(1)
+            zero, one = self.embed_obs(self.scales.obs(obs.new_tensor([[0.0], [1.0]]).expand(len(obs), 2, 1))).unbind(1)
             return torch.lerp(per_seed(zero, obs), per_seed(one, obs), obs)
-        return self.embed_obs(self.scaler(obs))
+        return self.embed_obs(self.scales.obs(obs))
 
     def action(self, action: Tensor) -> Tensor:
-        return self.embed_action(self.signature.encode_action(action))
+        return self.embed_action(self.scales.encode(action))
 
 
 class Whitener(nn.Module):
@@ -142,11 +173,15 @@ def gaussian_log_prob(x: Tensor, mean: Tensor, std: Tensor) -> Tensor:
 
 
 class ActionHead(nn.Module):
-    """A distribution over actions given features: categorical, or Gaussian with mean and std from the network."""
+    """A distribution over actions given features: categorical, or Gaussian with mean and std from the network.
 
-    def __init__(self, features: int, width: int, signature: Signature, draws: Draws) -> None:
+    Gaussians are of standardised labels, and so are their log-densities, so that units of actions do not matter.
+    """
+
+    def __init__(self, features: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__()
-        self.signature = signature
+        self.signature, self.scaler = scales.signature, scales.label
+        signature = scales.signature
         self.net = Mlp(features, width, signature.actions or 2 * signature.action, draws)
 
     def _gaussian(self, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -157,14 +192,14 @@ class ActionHead(nn.Module):
         """log pi(a | features) [S, ...] of actions [S, ..., A]."""
         if self.signature.actions:
             return F.log_softmax(self.net(features), -1).gather(-1, action[..., :1].long())[..., 0]
-        return gaussian_log_prob(action, *self._gaussian(features))
+        return gaussian_log_prob(self.scaler(action), *self._gaussian(features))
 
     def sample(self, features: Tensor, draws: Draws) -> Tensor:
         """Draw actions [S, N, A]; continuous actions are clipped to [-1, 1]."""
         if self.signature.actions:
             return sample_index(F.softmax(self.net(features), -1), draws)[..., None].float()
         mean, std = self._gaussian(features)
-        return (mean + std * draws.normal(*mean.shape[1:])).clamp(-1, 1)
+        return self.scaler.inverse(mean + std * draws.normal(*mean.shape[1:])).clamp(-1, 1)
 
 
 def sample_index(probs: Tensor, draws: Draws) -> Tensor:
@@ -180,9 +215,9 @@ class DynamicsHead(nn.Module):
     `inputs` may be shared with other networks. copies: the number of models of the dynamics, in one network.
     """
 
-    def __init__(self, latent: int, width: int, inputs: Inputs, change: Scaler, draws: Draws, copies: int = 1) -> None:
+    def __init__(self, latent: int, width: int, inputs: Inputs, draws: Draws, copies: int = 1) -> None:
         super().__init__()
-        self.inputs, self.change, self.copies = inputs, change, copies
+        self.inputs, self.change, self.copies = inputs, inputs.scales.change, copies
         self.signature = inputs.signature
         self.net = Mlp(inputs.obs_width + inputs.action_width + latent, width, copies * self.signature.obs, draws)
         self.log_std = nn.Parameter(torch.zeros(len(draws), self.signature.obs, device=draws.device))
@@ -208,4 +243,4 @@ class DynamicsHead(nn.Module):
         if self.signature.binary:
             return (draws.uniform(*out.shape[1:]) < torch.sigmoid(out)).float()
         change = out + torch.exp(per_seed(self.log_std, out)) * draws.normal(*out.shape[1:])
-        return obs + change * per_seed(self.change.std, out) + per_seed(self.change.mean, out)
+        return obs + self.change.inverse(change)

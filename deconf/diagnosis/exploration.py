@@ -20,4 +20,4 @@ class ExplorationPolicy(MemorylessAgent):
 def fit(trials: Trials, config: MemorylessConfig, rng: Rngs) -> ExplorationPolicy:
     """Clone the expert without memory, as an exploration policy."""
     clone = memoryless_bc.train(trials, config, rng)
-    return ExplorationPolicy(clone.policy, clone.scaler, None)
+    return ExplorationPolicy(clone.policy, clone.scales, None)

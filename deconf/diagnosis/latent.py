@@ -12,7 +12,7 @@ from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.diagnosis.learned_env import valid_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
@@ -67,7 +67,8 @@ def from_dynamics(
     """
     train, held_out, explored, explored_held_out = (Batch.of(x, 1) for x in (*expert, *exploration))
     explored, explored_held_out = (in_range(train, x) for x in (explored, explored_held_out))
-    model = _train_dynamics(explored, Signature.of(expert[0]), exploring, draws, monitor)
+    scales = Scales(Signature.of(expert[0]), explored, train.action, train.mask)
+    model = _train_dynamics(explored, scales, exploring, draws, monitor)
     _refit_noise(model, explored, draws)
 
     def log_next(batch: Batch, latent: Tensor) -> Tensor:
@@ -106,14 +107,14 @@ def _per_step(batch: Batch, latents: Tensor) -> Tensor:
 
 
 def _train_dynamics(
-    explored: Batch, signature: Signature, config: DeconfoundedConfig, draws: Draws, monitor: Monitor
+    explored: Batch, scales: Scales, config: DeconfoundedConfig, draws: Draws, monitor: Monitor
 ) -> VariationalModel:
     """Eq. (6) on sets: the latent inferred from a random half of a trial's steps predicts the other half.
 
     The beginning of a trial and the steps after it, as in deployment, are no such halves: a latent of single episodes
     then encodes the time in the episode, and rollouts that start with it are of no use.
     """
-    model = VariationalModel("evidence", config.latent, config.width, signature, *scalers(explored), draws)
+    model = VariationalModel("evidence", config.latent, config.width, scales, draws)
     optimizer = Adam([model], config.inference_rate, config.inference_updates)
     for update in range(config.inference_updates):
         batch = explored.draw_trials(config.inference_batch, draws)
@@ -125,7 +126,7 @@ def _train_dynamics(
         steps, trial = rest.steps(index), index // batch.mask.shape[2]
         theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
-        loss = model.negative_elbo(steps, mean, std, theta_hat, beta)
+        loss = model.negative_elbo(steps, mean, std, theta_hat, beta) + model.encoder.innovation_loss(steps)
         optimizer.step(loss)
         monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model
@@ -169,7 +170,7 @@ def _evidence(
 
 def _train_policy(model: VariationalModel, data: Batch, config: MemorylessConfig, draws: Draws) -> ActionHead:
     """A policy, cloned given the latents that a model infers from the trials."""
-    policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.signature, draws)
+    policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)
     agent, belief = DeconfoundedAgent(model, policy), _belief(model, data)
     optimizer = Adam([policy], config.learning_rate, config.updates)
     for _ in range(config.updates):

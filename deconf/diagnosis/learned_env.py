@@ -47,7 +47,9 @@ class LatentPolicy:
     def point(self, obs: Tensor, latent: Tensor) -> Tensor:
         """The mean action [..., A], or log-probabilities of discrete actions."""
         out = self.policy.net(self.features(obs, latent))
-        return torch.log_softmax(out, -1) if self.policy.signature.actions else out.chunk(2, -1)[0].clamp(-1, 1)
+        if self.policy.signature.actions:
+            return torch.log_softmax(out, -1)
+        return self.policy.scaler.inverse(out.chunk(2, -1)[0]).clamp(-1, 1)
 
 
 class PosteriorSampler(LatentPolicy):

@@ -131,10 +131,10 @@ def measure(
     else:
         explanation = _explain(expert, split(explore, amounts.held_out, rng), amounts, draws, report)
     data = [train] if explore is None else [train, explore]
-    ends = termination.fit(data, blind.scaler, draws)
+    ends = termination.fit(data, blind.scales.obs, draws)
     with torch.no_grad():
         held_out, episodes = Batch.of(expert[1], 1), Batch.of(split_episodes(train), 1)
-        present = blind.policy.log_prob(blind.scaler(held_out.obs), held_out.action)
+        present = blind.policy.log_prob(blind.scales.obs(held_out.obs), held_out.action)
         memory = -float(recurrent.held_out_loss(held_out)) - step_mean(present, held_out)
         episodes = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # trials may have fewer than others
         batches, (_, per_trial, horizon) = [Batch.of(trials, 1) for trials in data], trials.mask.shape

@@ -11,7 +11,6 @@ The memory is a sum of evidence over transitions, in any order (see EvidenceBeli
 as long, and scored .11 on `swapped_lander`, not .9.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +26,7 @@ from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, take_steps
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -64,18 +63,16 @@ class DaggerAgent(LearnedAgent):
         self.memory, self.latent, self.forgets = memory, latent, forgets
 
     @staticmethod
-    def new(
-        width: int, latent: int, forgets: bool, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> "DaggerAgent":
+    def new(width: int, latent: int, forgets: bool, scales: Scales, draws: Draws) -> "DaggerAgent":
         """An untrained agent. forgets: its memory is reset at each episode."""
-        memory = EvidenceBelief(latent, width, signature, obs, change, draws)
-        policy = ActionHead(memory.inputs.obs_width + latent, width, signature, draws)
+        memory = EvidenceBelief(latent, width, scales, draws)
+        policy = ActionHead(memory.inputs.obs_width + latent, width, scales, draws)
         return DaggerAgent(memory, policy, latent, forgets)
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DaggerAgent":
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "DaggerAgent":
         sizes = (shape["width"], shape["latent"], shape["forgets"])
-        return cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
+        return cls.new(*sizes, scales, draws)
 
     def shape(self) -> dict[str, Any]:
         return {"width": 4 * self.memory.width, "latent": self.latent, "forgets": self.forgets}
@@ -133,7 +130,9 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
         return Signature.of(trials), batch, label.action
 
     signature, data, label = labelled(None)
-    agent = DaggerAgent.new(config.width, config.latent, config.drifts, signature, *scalers(data), draws)
+    agent = DaggerAgent.new(
+        config.width, config.latent, config.drifts, Scales(signature, data, label, data.mask), draws
+    )
     share = config.updates / (config.rounds * (config.rounds + 1) / 2)
     updates = [max(1, round(share * i)) for i in range(1, config.rounds + 1)]
     optimizer, done = Adam([agent.memory, agent.policy], config.learning_rate, sum(updates)), 0

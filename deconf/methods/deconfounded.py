@@ -5,7 +5,6 @@ trials, given which a latent-conditional policy pi_eta(a | s, theta_hat) is clon
 theta_hat from its belief (posterior sampling), acts, and updates the belief on the transition.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -21,7 +20,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source,
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -71,17 +70,15 @@ class DeconfoundedAgent(LearnedAgent):
         self.model, self.resample = model, resample
 
     @staticmethod
-    def new(
-        kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> "DeconfoundedAgent":
+    def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         """An untrained agent. Raises InputError for an unknown kind of model."""
-        model = new_model(kind, latent, width, signature, obs, change, draws)
-        return DeconfoundedAgent(model, ActionHead(model.inputs.obs_width + latent, width, signature, draws))
+        model = new_model(kind, latent, width, scales, draws)
+        return DeconfoundedAgent(model, ActionHead(model.inputs.obs_width + latent, width, scales, draws))
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "DeconfoundedAgent":
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         sizes = (shape["model"], shape["latent"], shape["width"])
-        agent = cls.new(*sizes, signature, obs, copy.deepcopy(obs), draws)
+        agent = cls.new(*sizes, scales, draws)
         agent.resample = shape["resample"]
         return agent
 
@@ -175,9 +172,8 @@ def train(
         raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
     expert, explored = (Batch.of(x, seeds, device) for x in (demonstrations, first))
     draws = Draws(rngs, device)
-    # Changes are scaled by both: those of random actions alone can be far smaller, and theta is then learned poorly.
-    obs, change = scalers(explored.joined(expert))
-    agent = DeconfoundedAgent.new(config.model, config.latent, config.width, signature, obs, change, draws)
+    scales = Scales.of(signature, expert, explored)
+    agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
     model, policy = agent.model, agent.policy
     inference_batch = config.inference_batch
     if config.drifts:

@@ -17,7 +17,7 @@ from deconfounded.deconf.core.agents import Checkpoint
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scaler, Scales
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
@@ -55,14 +55,12 @@ class MeanAgent(DeconfoundedAgent):
     model: VariationalModel
 
     @staticmethod
-    def new(
-        kind: str, latent: int, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws
-    ) -> "MeanAgent":
+    def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "MeanAgent":
         """An untrained agent. Raises InputError for a model without a mean."""
         if kind not in ("evidence", "gru"):
             raise InputError(f"model was {kind!r}; it must be evidence or gru")
-        model = VariationalModel(kind, latent, width, signature, obs, change, draws)
-        return MeanAgent(model, ActionHead(signature.obs + latent, width, signature, draws))
+        model = VariationalModel(kind, latent, width, scales, draws)
+        return MeanAgent(model, ActionHead(scales.signature.obs + latent, width, scales, draws))
 
     def latent(self) -> Tensor:
         return self.model.point(self.model.belief(self._memory))
@@ -85,7 +83,7 @@ class MeanAgent(DeconfoundedAgent):
 
 def _scaler(model: VariationalModel) -> Scaler:
     """The scaler of observations: the policy shares no embedding with the encoder, as in the released code."""
-    return model.inputs.scaler
+    return model.inputs.scales.obs
 
 
 def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, draws: Draws) -> Tensor:
@@ -111,7 +109,7 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
         error = (torch.sigmoid(out) - target.next_obs).square().mean(-1)
     else:
         error = (out - model.dynamics.change(target.next_obs - target.obs)).square().mean(-1)
-    return ahead * masked_mean(error, mask) + config.beta * kl
+    return ahead * masked_mean(error, mask) + config.beta * kl + model.encoder.innovation_loss(target)
 
 
 @torch.no_grad()
@@ -129,8 +127,8 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
     first, draws = explore(None), Draws(rngs, device)
     expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, first))
-    obs, change = scalers(explored.joined(expert))
-    agent = MeanAgent.new(config.model, config.latent, config.width, Signature.of(trials), obs, change, draws)
+    scales = Scales.of(Signature.of(trials), expert, explored)
+    agent = MeanAgent.new(config.model, config.latent, config.width, scales, draws)
     model, policy = agent.model, agent.policy
     assert isinstance(model, VariationalModel)
     inferences = config.rounds * config.inference_updates

@@ -17,7 +17,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_gene
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
@@ -57,11 +57,11 @@ def explain(
 
     The two models share their dynamics. Batches are `times` as large.
     """
-    obs, change = scalers(data)
-    sizes = ("evidence", config.latent, config.width, signature, obs, change, draws)
+    scales = Scales.of(signature, data)
+    sizes = ("evidence", config.latent, config.width, scales, draws)
     offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
     online.dynamics = offline.dynamics
-    policy = ActionHead(online.inputs.obs_width + config.latent, config.width, signature, draws)
+    policy = ActionHead(online.inputs.obs_width + config.latent, config.width, scales, draws)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
@@ -77,6 +77,7 @@ def explain(
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
         weight = subset.mask * (steps / index.shape[1])  # an unbiased estimate of the sum over all steps
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
+        loss = loss + offline.encoder.innovation_loss(subset.flat())
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
     return offline, online, policy

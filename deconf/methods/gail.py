@@ -27,7 +27,7 @@ from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators
 from deconfounded.deconf.core.layers import Linear, Mlp
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
@@ -80,7 +80,7 @@ class PpoHead(ActionHead):
     """Stable-Baselines3's distribution: categorical, or Gaussian with a std that does not depend on features."""
 
     def __init__(self, width: int, signature: Signature, draws: Draws) -> None:
-        super().__init__(width, width, signature, draws)
+        super().__init__(width, width, Scales.plain(signature, len(draws)).to(draws.device), draws)
         self.net = Mlp(width, width, signature.actions or signature.action, draws)
         self.log_std = nn.Parameter(torch.zeros(len(draws), 1, signature.action, device=draws.device))
 
@@ -94,21 +94,21 @@ class GailAgent(LearnedAgent):
 
     policy: PpoHead
 
-    def __init__(self, lstm: Lstm, policy: PpoHead, obs: Scaler) -> None:
+    def __init__(self, lstm: Lstm, policy: PpoHead, scales: Scales) -> None:
         super().__init__(policy)
-        self.lstm, self.obs, self.width = lstm, obs, lstm.width
+        self.lstm, self.scales, self.width = lstm, scales, lstm.width
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "GailAgent":
-        width = shape["width"]
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "GailAgent":
+        width, signature = shape["width"], scales.signature
         lstm = Lstm(signature.obs + signature.action_features + 1, width, draws)
-        return cls(lstm, PpoHead(width, signature, draws), obs)
+        return cls(lstm, PpoHead(width, signature, draws), scales)
 
     def shape(self) -> dict[str, Any]:
         return {"width": self.width}
 
     def parts(self) -> dict[str, nn.Module]:
-        return {"lstm": self.lstm, "policy": self.policy, "obs": self.obs}
+        return {"lstm": self.lstm, "policy": self.policy, "scales": self.scales}
 
     def begin(self, n: int) -> None:
         super().begin(n)
@@ -122,7 +122,7 @@ class GailAgent(LearnedAgent):
         self._before[..., -1] = 1  # flags the start of an episode
 
     def choose(self, obs: Tensor) -> Tensor:
-        self._next = self.lstm(torch.cat([self.obs(obs), self._before], -1), self._state)
+        self._next = self.lstm(torch.cat([self.scales.obs(obs), self._before], -1), self._state)
         return self.policy.sample(self._next[..., : self.width], self._draws)
 
     def remember(self, step: Batch) -> None:
@@ -155,15 +155,15 @@ class GailAgent(LearnedAgent):
 class Discriminator(nn.Module):
     """Logits that a transition is the expert's."""
 
-    def __init__(self, width: int, signature: Signature, obs: Scaler, change: Scaler, draws: Draws) -> None:
+    def __init__(self, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__()
-        self.signature, self.obs, self.change = signature, obs, change
+        self.scales, signature = scales, scales.signature
         self.net = Mlp(2 * signature.obs + signature.action_features, width, 1, draws)
 
     def forward(self, batch: Batch) -> Tensor:
         """Steps [S, N] without a time axis -> [S, N]."""
-        inputs = [self.obs(batch.obs), self.signature.encode_action(batch.action)]
-        return self.net(torch.cat([*inputs, self.change(batch.next_obs - batch.obs)], -1))[..., 0]
+        inputs = [self.scales.obs(batch.obs), self.scales.encode(batch.action)]
+        return self.net(torch.cat([*inputs, self.scales.change(batch.next_obs - batch.obs)], -1))[..., 0]
 
     def loss(self, expert: Batch, own: Batch) -> Tensor:
         """The binary cross-entropy [S] of the expert's steps against the policy's own."""
@@ -172,7 +172,7 @@ class Discriminator(nn.Module):
     @torch.no_grad()
     def reward(self, *step: NDArray[np.float32]) -> NDArray[np.float32]:
         """The logits [N] of transitions (observation, action, next observation); for a discriminator of one seed."""
-        obs, action, next_obs = (torch.as_tensor(x, device=self.obs.mean.device)[None] for x in step)
+        obs, action, next_obs = (torch.as_tensor(x, device=self.scales.obs.mean.device)[None] for x in step)
         return self(Batch(obs, action, next_obs, obs[..., 0]))[0].cpu().numpy()
 
     def of_seed(self, i: int) -> "Discriminator":
@@ -198,11 +198,11 @@ def train(
     rngs, monitor, signature = as_generators(rng), monitor or Monitor(), Signature.of(trials)
     seeds, draws = len(rngs), Draws(rngs, config.device)
     expert = Batch.of(trials, seeds, config.device)
-    obs, change = scalers(expert)
-    discriminator = Discriminator(config.width, signature, obs, change, draws)
+    scales = Scales.of(signature, expert)
+    discriminator = Discriminator(config.width, scales, draws)
     optimizer = Adam([discriminator], config.discriminator_rate)
-    agent = GailAgent.blank({"width": config.width}, signature, obs, draws)
-    mean, std = (x.cpu().numpy() for x in (obs.mean, obs.std))
+    agent = GailAgent.blank({"width": config.width}, scales, draws)
+    mean, std = (x.cpu().numpy() for x in (scales.obs.mean, scales.obs.std))
 
     def vector(i: int) -> "TrialVecEnv":
         reward = discriminator.of_seed(i).reward

@@ -11,7 +11,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.streams import Array
@@ -33,24 +33,24 @@ class MemorylessConfig(Configuration):
 class MemorylessAgent(LearnedAgent):
     """A policy of the observation and, for the oracle, of the encoded theta that `side` returns."""
 
-    def __init__(self, policy: ActionHead, scaler: Scaler, side: Callable[[], Array] | None) -> None:
+    def __init__(self, policy: ActionHead, scales: Scales, side: Callable[[], Array] | None) -> None:
         super().__init__(policy)
-        self.scaler, self.side = scaler, side
+        self.scales, self.side = scales, side
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "MemorylessAgent":
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "MemorylessAgent":
         """An untrained agent. An oracle's `side` has to be set before it is deployed."""
-        return cls(ActionHead(signature.obs + shape["theta"], shape["width"], signature, draws), obs, None)
+        return cls(ActionHead(scales.signature.obs + shape["theta"], shape["width"], scales, draws), scales, None)
 
     def shape(self) -> dict[str, Any]:
         _, inputs, width = next(self.policy.parameters()).shape
         return {"width": width, "theta": inputs - self.policy.signature.obs}
 
     def parts(self) -> dict[str, nn.Module]:
-        return {"policy": self.policy, "scaler": self.scaler}
+        return {"policy": self.policy, "scales": self.scales}
 
     def choose(self, obs: Tensor) -> Tensor:
-        features = self.scaler(obs)
+        features = self.scales.obs(obs)
         if self.shape()["theta"] and self.side is None:
             raise InputError("an oracle acts on theta, and had none; set its `side`")
         if self.side is not None:
@@ -74,13 +74,13 @@ def train(
     """
     rngs, signature, monitor = as_generators(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
-    scaler = Scaler(data.obs, data.mask)
-    features = scaler(data.obs)
+    scales = Scales.of(signature, data)
+    features = scales.obs(data.obs)
     if theta is not None:
         by_episode = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], *theta.shape[1:])
         features = torch.cat([features, by_episode.repeat_interleave(trials.mask.shape[2], 2)], -1)
-    policy = ActionHead(features.shape[-1], config.width, signature, draws)
-    agent = MemorylessAgent(policy, scaler, side)
+    policy = ActionHead(features.shape[-1], config.width, scales, draws)
+    agent = MemorylessAgent(policy, scales, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)
     for update in range(config.updates):
         index = data.draw_steps(config.batch, draws)

@@ -22,7 +22,7 @@ class ActionDropoutMemory(GruMemory):
     action_mask: Tensor | None = None
 
     def _embed(self, batch: Batch) -> Tensor:
-        inputs, action = self.inputs, self.inputs.signature.encode_action(batch.action)
+        inputs, action = self.inputs, self.inputs.scales.encode(batch.action)
         if self.action_mask is not None:
             action = action * self.action_mask
         embedded = [inputs.obs(batch.obs), inputs.embed_action(action), inputs.obs(batch.next_obs)]

@@ -17,10 +17,10 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -145,37 +145,38 @@ class Transformer(nn.Module):
 class TransformerAgent(LearnedAgent):
     """A policy of the latest `window` tokens of the trial, across resets."""
 
-    def __init__(self, net: Transformer, policy: ActionHead, obs: Scaler) -> None:
+    def __init__(self, net: Transformer, policy: ActionHead, scales: Scales) -> None:
         super().__init__(policy)
-        self.net, self.obs = net, obs
+        self.net, self.scales = net, scales
 
     @staticmethod
-    def new(shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "TransformerAgent":
+    def new(shape: dict[str, Any], scales: Scales, draws: Draws) -> "TransformerAgent":
         """An untrained agent."""
+        signature, width = scales.signature, shape["width"]
         inputs = 2 * signature.obs + signature.action_features + 1
-        net = Transformer(inputs, shape["width"], shape["layers"], shape["heads"], shape["window"], draws)
-        return TransformerAgent(net, ActionHead(shape["width"] + signature.obs, shape["width"], signature, draws), obs)
+        net = Transformer(inputs, width, shape["layers"], shape["heads"], shape["window"], draws)
+        return TransformerAgent(net, ActionHead(width + signature.obs, width, scales, draws), scales)
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "TransformerAgent":
-        return cls.new(shape, signature, obs, draws)
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "TransformerAgent":
+        return cls.new(shape, scales, draws)
 
     def shape(self) -> dict[str, Any]:
         net = self.net
         return {"width": net.width, "layers": net.depth, "heads": net.heads, "window": net.window}
 
     def parts(self) -> dict[str, nn.Module]:
-        return {"net": self.net, "policy": self.policy, "obs": self.obs}
+        return {"net": self.net, "policy": self.policy, "scales": self.scales}
 
     def before(self, step: Batch) -> Tensor:
         """The part of a token on the step before it [..., O + F + 1]: zeros where there was none."""
-        parts = [self.policy.signature.encode_action(step.action), self.obs(step.next_obs), step.mask[..., None]]
+        parts = [self.scales.encode(step.action), self.scales.obs(step.next_obs), step.mask[..., None]]
         return torch.cat(parts, -1) * step.mask[..., None]
 
     def tokens(self, batch: Batch) -> Tensor:
         """Tokens [S, B, T, I] of trials."""
         before = F.pad(self.before(batch)[:, :, :-1], (0, 0, 1, 0))
-        return torch.cat([self.obs(batch.obs), before], -1)
+        return torch.cat([self.scales.obs(batch.obs), before], -1)
 
     def begin(self, n: int) -> None:
         super().begin(n)
@@ -190,7 +191,7 @@ class TransformerAgent(LearnedAgent):
 
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the next token. It stays in the cache if the step takes place, and is overwritten otherwise."""
-        scaled = self.obs(obs)
+        scaled = self.scales.obs(obs)
         tokens = torch.cat([scaled, self._before], -1)
         steps = zip(tokens, self._layers, self._caches, strict=True)
         self._features = torch.stack([self.net.step(*of_seed) for of_seed in steps])
@@ -206,7 +207,7 @@ class TransformerAgent(LearnedAgent):
 
     def loss(self, batch: Batch, label: Tensor) -> Tensor:
         """The imitation loss [S] of labels [S, B, T, A] on whole trials; no step attends to the padding at the end."""
-        features = torch.cat([self.net(self.tokens(batch)), self.obs(batch.obs)], -1)
+        features = torch.cat([self.net(self.tokens(batch)), self.scales.obs(batch.obs)], -1)
         return imitation_loss(self.policy.log_prob(features, label).flatten(1), batch.mask.flatten(1))
 
     @torch.no_grad()
@@ -238,9 +239,9 @@ class TransformerTrainer:
 def train(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor | None = None) -> TransformerAgent:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
 
-    def new_agent(signature: Signature, obs: Scaler, draws: Draws) -> TransformerAgent:
+    def new_agent(scales: Scales, draws: Draws) -> TransformerAgent:
         shape = {"width": config.width, "layers": config.layers, "heads": config.heads, "window": 1}
-        return TransformerAgent.new(shape, signature, obs, draws)
+        return TransformerAgent.new(shape, scales, draws)
 
     def new_trainer(agent: TransformerAgent, steps: int, monitor: Monitor) -> TransformerTrainer:
         agent.net.window = steps

@@ -57,7 +57,7 @@ class PalrAgent(RecurrentAgent):
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         states = self.memory(batch, state)
-        features = torch.cat([states[:, :, :-1], self.memory.inputs.scaler(batch.obs)], -1)
+        features = torch.cat([states[:, :, :-1], self.memory.inputs.scales.obs(batch.obs)], -1)
         log_policy = self.policy.log_prob(features, label)
         loss = imitation_loss(log_policy.flatten(1), batch.mask.flatten(1))
         if self.config is not None:
@@ -69,7 +69,7 @@ class PalrAgent(RecurrentAgent):
         assert self.config is not None
         if batch.mask.shape[2] < 2:
             return memories.new_zeros(len(memories))
-        encode, later = self.policy.signature.encode_action, batch[:, :, 1:]
+        encode, later = self.memory.inputs.scales.encode, batch[:, :, 1:]
         index = later.draw_steps(self.config.samples, self.noise)
         columns = (memories[:, :, 1:], encode(batch.action[:, :, :-1]), encode(label[:, :, 1:]))
         samples = (take_steps(column, index) for column in columns)

@@ -17,10 +17,10 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, take
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
@@ -58,37 +58,38 @@ class RmaConfig(Configuration):
 class Adapter(GruMemory):
     """The adaptation module: regresses theta on the history of transitions."""
 
-    def __init__(self, width: int, theta: int, signature: Signature, obs: Scaler, draws: Draws) -> None:
-        super().__init__(width, signature, obs, draws)
+    def __init__(self, width: int, theta: int, scales: Scales, draws: Draws) -> None:
+        super().__init__(width, scales, draws)
         self.theta, self.out = theta, Mlp(width, width, theta, draws)
 
 
 class RmaAgent(LearnedAgent):
     """A policy of the observation and of the estimate of theta, with a memory that outlives resets."""
 
-    def __init__(self, adapter: Adapter, policy: ActionHead, obs: Scaler) -> None:
+    def __init__(self, adapter: Adapter, policy: ActionHead) -> None:
         super().__init__(policy)
-        self.adapter, self.obs = adapter, obs
+        self.adapter = adapter
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "RmaAgent":
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "RmaAgent":
         width, theta = shape["width"], shape["theta"]
-        policy = ActionHead(signature.obs + theta, shape["teacher"], signature, draws)
-        return cls(Adapter(width, theta, signature, obs, draws), policy, obs)
+        policy = ActionHead(scales.signature.obs + theta, shape["teacher"], scales, draws)
+        return cls(Adapter(width, theta, scales, draws), policy)
 
     def shape(self) -> dict[str, Any]:
         teacher = next(self.policy.parameters()).shape[-1]
         return {"width": self.adapter.width, "theta": self.adapter.theta, "teacher": teacher}
 
     def parts(self) -> dict[str, nn.Module]:
-        return {"adapter": self.adapter, "policy": self.policy, "obs": self.obs}
+        return {"adapter": self.adapter, "policy": self.policy}
 
     def begin(self, n: int) -> None:
         super().begin(n)
         self._state = self.adapter.start(self._n)
 
     def choose(self, obs: Tensor) -> Tensor:
-        return self.policy.sample(torch.cat([self.obs(obs), self.adapter.out(self._state)], -1), self._draws)
+        features = [self.adapter.inputs.scales.obs(obs), self.adapter.out(self._state)]
+        return self.policy.sample(torch.cat(features, -1), self._draws)
 
     def remember(self, step: Batch) -> None:
         self._state = self.adapter.update(self._state, step)
@@ -114,9 +115,8 @@ def train(
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
     teacher = memoryless_bc.train(trials, _teacher(config), rngs, theta)
-    signature, width = Signature.of(trials), config.width
-    adapter = Adapter(width, theta.shape[-1], signature, teacher.scaler, draws)
-    agent = RmaAgent(adapter, teacher.policy, teacher.scaler)
+    adapter = Adapter(config.width, theta.shape[-1], teacher.scales, draws)
+    agent = RmaAgent(adapter, teacher.policy)
     chunks = -(-trials.mask[0].size // config.chunk)
     share = config.updates / (chunks * config.rounds * (config.rounds + 1) / 2)
     passes = [max(1, round(share * (i + 1))) for i in range(config.rounds)]

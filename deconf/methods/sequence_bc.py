@@ -17,7 +17,7 @@ from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, trials_of
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Scaler
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 
@@ -40,20 +40,20 @@ def train_sequence(
     trials: Source,
     config: Any,
     rng: Rngs,
-    new_agent: Callable[[Signature, Scaler, Draws], Kind],
+    new_agent: Callable[[Scales, Draws], Kind],
     new_trainer: Callable[[Kind, int, Monitor], Trainer],
     monitor: Monitor | None = None,
 ) -> Kind:
     """Clone the expert's trials, which are in as many equal groups as there are generators in rng.
 
     Of a function that draws trials, each batch is fresh trials. config: has `batch`, in trials, and `device`.
-    new_agent: makes the untrained agent, given a scaler of the expert's observations. new_trainer: makes its trainer,
+    new_agent: makes the untrained agent, given scales of the expert's trials. new_trainer: makes its trainer,
     given the number of steps of a trial.
     """
     rngs, monitor = as_generators(rng), monitor or Monitor()
     first = trials_of(trials)
     data, draws = Batch.of(first, len(rngs), config.device), Draws(rngs, config.device)
-    agent = new_agent(Signature.of(first), Scaler(data.obs, data.mask), draws)
+    agent = new_agent(Scales.of(Signature.of(first), data), draws)
     trainer = new_trainer(agent, data.mask.shape[2], monitor)
     checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=trainer.optimizer, draws=draws)
     if before := checkpoint.load():
@@ -96,10 +96,10 @@ class RecurrentAgent(LearnedAgent):
         self.memory = memory
 
     @classmethod
-    def new(cls, width: int, signature: Signature, obs: Scaler, draws: Draws) -> Self:
+    def new(cls, width: int, scales: Scales, draws: Draws) -> Self:
         """An untrained agent; `noise` is for training."""
-        memory = cls.memory_kind(width, signature, obs, draws)
-        agent = cls(memory, ActionHead(width + signature.obs, width, signature, draws))
+        memory = cls.memory_kind(width, scales, draws)
+        agent = cls(memory, ActionHead(width + scales.signature.obs, width, scales, draws))
         agent.noise = draws
         return agent
 
@@ -107,8 +107,8 @@ class RecurrentAgent(LearnedAgent):
         """Take over further settings that the loss needs."""
 
     @classmethod
-    def blank(cls, shape: dict[str, Any], signature: Signature, obs: Scaler, draws: Draws) -> "RecurrentAgent":
-        return cls.new(shape["width"], signature, obs, draws)
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "RecurrentAgent":
+        return cls.new(shape["width"], scales, draws)
 
     def shape(self) -> dict[str, Any]:
         return {"width": self.memory.width}
@@ -121,7 +121,7 @@ class RecurrentAgent(LearnedAgent):
         self._state = self.memory.start(self._n)
 
     def choose(self, obs: Tensor) -> Tensor:
-        return self.policy.sample(torch.cat([self._state, self.memory.inputs.scaler(obs)], -1), self._draws)
+        return self.policy.sample(torch.cat([self._state, self.memory.inputs.scales.obs(obs)], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
         self._state = self.memory.update(self._state, step)
@@ -132,7 +132,7 @@ class RecurrentAgent(LearnedAgent):
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """The imitation loss [S] of labels [S, B, T, A] after a memory [S, B, W], and the memory after the batch."""
         states = self.memory(batch, state)
-        features = torch.cat([states[:, :, :-1], self.memory.inputs.scaler(batch.obs)], -1)
+        features = torch.cat([states[:, :, :-1], self.memory.inputs.scales.obs(batch.obs)], -1)
         log_policy = self.policy.log_prob(features, label)
         return imitation_loss(log_policy.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
 
@@ -172,8 +172,8 @@ def train_recurrent(
 ) -> Recurrent:
     """Clone the expert's trials with an agent of that kind: see `train_sequence`."""
 
-    def new_agent(signature: Signature, obs: Scaler, draws: Draws) -> Recurrent:
-        agent = kind.new(config.width, signature, obs, draws)
+    def new_agent(scales: Scales, draws: Draws) -> Recurrent:
+        agent = kind.new(config.width, scales, draws)
         agent.configure(config)
         return agent
 
