@@ -48,6 +48,32 @@ class Push(Task):
         raise NotImplementedError
 
 
+class OtherUnits(Push):
+    """Push, whose observation comes in other units: one column large, one small, and both with an offset."""
+
+    observation = {"x": (-450.0, 450.0), "velocity": (-0.1, 0.1)}
+
+    def observe(self, state: Array) -> Array:
+        return state * [100, 0.02] + [50, 0.01]
+
+
+class StrongMotor(Push):
+    """Push with a motor that is ten times as strong, so that experts use a small part of its range."""
+
+    gain, rest = 10.0, 0.0
+    expert_noise = 0.01
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        return super().outcome(state, self.gain * (action - self.rest), theta)
+
+
+class StrongerMotor(StrongMotor):
+    """One that is five times as strong again, and rests at .3."""
+
+    gain, rest = 50.0, 0.3
+    expert_noise = 0.002
+
+
 class Drift(Push):
     """The same, under a force that drifts from episode to episode."""
 
@@ -95,3 +121,18 @@ class Arms(Task):
 def control(obs: Array, theta: Array) -> Array:
     """The expert of Push and Drift: brakes, and leans against the force."""
     return np.clip(-obs[:, :1] - 0.5 * obs[:, 1:] - theta, -1, 1)
+
+
+def other_control(obs: Array, theta: Array) -> Array:
+    """The expert of OtherUnits."""
+    return control((obs - [50, 0.01]) / [100, 0.02], theta)
+
+
+def strong_control(obs: Array, theta: Array) -> Array:
+    """The expert of StrongMotor."""
+    return control(obs, theta) / 10
+
+
+def stronger_control(obs: Array, theta: Array) -> Array:
+    """The expert of StrongerMotor."""
+    return 0.3 + control(obs, theta) / 50

@@ -4,11 +4,11 @@ Without past actions the imitator cannot take its own for evidence of theta, but
 where theta shows only there, as on the bandit, nothing is learned of it. All else is naive_rnn's.
 """
 
-import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.nets import per_seed
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent
@@ -18,7 +18,8 @@ class ObsMemory(GruMemory):
     """A GRU over pairs (s, s'), without actions."""
 
     def _embed(self, batch: Batch) -> Tensor:
-        return super()._embed(Batch(batch.obs, torch.zeros_like(batch.action), batch.next_obs, batch.mask))
+        constant = per_seed(self.inputs.scales.action.mean, batch.action).expand_as(batch.action)
+        return super()._embed(Batch(batch.obs, constant, batch.next_obs, batch.mask))
 
 
 class ObsAgent(RecurrentAgent):

@@ -21,7 +21,7 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.monitor import Monitor, Training
-from deconfounded.deconf.core.nets import Scaler, scalers
+from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
@@ -56,8 +56,8 @@ def other_actions(batch: Batch) -> Batch:
     return Batch(batch.obs, -batch.action, batch.next_obs, batch.mask)
 
 
-def scaler(batch: Batch) -> Scaler:
-    return Scaler(batch.obs, batch.mask)
+def scales(batch: Batch) -> Scales:
+    return Scales.of(FLAT, batch)
 
 
 def test_tiers() -> None:
@@ -77,7 +77,7 @@ class TestPastActions:
         draws = streams(2)
         batch = random_batch(draws)
         for kind, same in ((ObsMemory, True), (GruMemory, False)):
-            memory = kind(8, FLAT, scaler(batch), draws)
+            memory = kind(8, scales(batch), draws)
             first, second = (memory(b, memory.start(3))[:, :, -1] for b in (batch, other_actions(batch)))
             assert torch.equal(first, second) == same
 
@@ -86,7 +86,7 @@ class TestPastActions:
         batch = random_batch(draws)
         chosen = []
         for seen in (batch, other_actions(batch)):
-            agent = ObsAgent.new(8, FLAT, scaler(batch), streams())
+            agent = ObsAgent.new(8, scales(batch), streams())
             agent.begin(3)
             agent.reset([np.random.default_rng(5)])
             for t in range(7):
@@ -98,7 +98,7 @@ class TestPastActions:
         """In training losses are random, and actions are multiplied by 0 or 2; elsewhere none is dropped."""
         draws = streams()
         batch = random_batch(draws, 50, 40)
-        agent = ActionDropoutAgent.new(8, FLAT, scaler(batch), draws)
+        agent = ActionDropoutAgent.new(8, scales(batch), draws)
         agent.dropout, state, seen = 0.5, agent.memory.start(50), []
         embed = agent.memory._embed
 
@@ -138,7 +138,7 @@ class TestPalr:
         for penalty in (0.0, 30.0):
             draws = streams()
             batch = random_batch(draws, 8, 20)
-            agent = PalrAgent.new(8, FLAT, scaler(batch), draws)
+            agent = PalrAgent.new(8, scales(batch), draws)
             agent.config = PalrConfig(penalty=penalty, samples=100)
             optimizer = Adam([agent.memory, agent.policy], 1e-2)
             for _ in range(30):
@@ -151,7 +151,7 @@ class TestPalr:
     def test_no_penalty_in_the_reported_loss(self) -> None:
         draws = streams()
         batch = random_batch(draws)
-        agent = PalrAgent.new(8, FLAT, scaler(batch), draws)
+        agent = PalrAgent.new(8, scales(batch), draws)
         plain = agent.held_out_loss(batch)
         agent.config = PalrConfig(penalty=1e3, samples=20)
         assert torch.equal(agent.held_out_loss(batch), plain)
@@ -160,7 +160,7 @@ class TestPalr:
 
 def transformer(batch: Batch, window: int, layers: int = 2) -> TransformerAgent:
     shape = {"width": 16, "layers": layers, "heads": 2, "window": window}
-    return TransformerAgent.new(shape, FLAT, scaler(batch), streams(len(batch.mask)))
+    return TransformerAgent.new(shape, scales(batch), streams(len(batch.mask)))
 
 
 class TestTransformer:
@@ -226,7 +226,7 @@ class TestTransformer:
 class TestMean:
     @staticmethod
     def agent(draws: Draws, batch: Batch, kind: str = "gru") -> MeanAgent:
-        return MeanAgent.new(kind, 3, 16, FLAT, *scalers(batch), draws)
+        return MeanAgent.new(kind, 3, 16, scales(batch), draws)
 
     @pytest.mark.parametrize("kind", ["gru", "evidence"])
     def test_acts_on_the_mean(self, kind: str) -> None:
@@ -350,9 +350,7 @@ class TestGail:
             ppo = new_ppo(env, config, 0)
             trials = run_trials(envs.BatchEnv(envs.get(task), 4), RandomAgent(envs.get(task).action_space), 1, 0).trials
             signature = Signature.of(trials)
-            obs = Scaler(torch.zeros(1, 2, signature.obs), torch.ones(1, 2))
-            obs.std.fill_(1)
-            agent = GailAgent.blank({"width": 8}, signature, obs, streams())
+            agent = GailAgent.blank({"width": 8}, Scales.plain(signature, 1), streams())
             agent.load_policy(0, ppo.policy)
             agent.begin(4)
             agent.reset([np.random.default_rng(0)])
@@ -396,7 +394,7 @@ class TestGail:
         draws = streams(2)
         own = random_batch(draws, 64, 4)[:, :, 0]
         expert = Batch(own.obs, torch.full_like(own.action, 0.5), own.next_obs, own.mask)
-        net = Discriminator(16, FLAT, *scalers(own), draws)
+        net = Discriminator(16, scales(own), draws)
         optimizer = Adam([net], 1e-2)
         for _ in range(150):
             optimizer.step(net.loss(expert, own))

@@ -21,7 +21,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.core.nets import ActionHead, Embedding, Scaler, scalers
+from deconfounded.deconf.core.nets import ActionHead, Embedding, Scales
 from deconfounded.deconf.equations import (
     belief_update,
     gaussian_kl,
@@ -119,10 +119,9 @@ class TestEquations:
 class TestBeliefs:
     def make(self, kind: type[Belief], name: str) -> tuple[Belief, Batch, Trials]:
         trials, _ = demonstrations(name, 6)
-        data, signature = Batch.of(trials, 2), Signature.of(trials)
-        change = Scaler(data.next_obs - data.obs, data.mask)
+        data = Batch.of(trials, 2)
         draws = Draws([np.random.default_rng(i) for i in range(2)], "cpu")
-        belief = kind(3, 32, signature, Scaler(data.obs, data.mask), change, draws)  # type: ignore[call-arg, arg-type]
+        belief = kind(3, 32, Scales.of(Signature.of(trials), data), draws)  # type: ignore[call-arg, arg-type]
         belief(data)  # as in training, for running means that are not those of the start
         return belief.eval(), data, trials
 
@@ -153,10 +152,10 @@ class TestBeliefs:
         assert same == (kind is EvidenceBelief)
 
 
-def _bandit_batch(n: int) -> tuple[Batch, Signature, Scaler, Draws]:
+def _bandit_batch(n: int) -> tuple[Batch, Scales, Draws]:
     trials, _ = demonstrations("bandit", n, episodes=1)
     batch, draws = Batch.of(trials, 1), Draws([np.random.default_rng(0)], "cpu")
-    return batch, Signature.of(trials), Scaler(batch.obs, batch.mask), draws
+    return batch, Scales.of(Signature.of(trials), batch), draws
 
 
 def test_products_keep_float32() -> None:
@@ -168,18 +167,20 @@ def test_products_keep_float32() -> None:
 
 def test_one_bit_is_embedded_as_any_observation() -> None:
     """The two embeddings of a binary observation are those that the network gives row by row."""
-    batch, signature, scaler, draws = _bandit_batch(8)
-    embedding = Embedding(16, signature, scaler, draws)
-    torch.testing.assert_close(embedding.obs(batch.obs), embedding.embed_obs(scaler(batch.obs)), rtol=1e-5, atol=1e-6)
+    batch, scales, draws = _bandit_batch(8)
+    embedding = Embedding(16, scales, draws)
+    torch.testing.assert_close(
+        embedding.obs(batch.obs), embedding.embed_obs(scales.obs(batch.obs)), rtol=1e-5, atol=1e-6
+    )
 
 
 def test_gru_remembers_before_training() -> None:
     """Memories of histories that differ in the first 10 steps differ after 30 more; with torch's gates they do not."""
-    batch, signature, scaler, draws = _bandit_batch(8)
+    batch, scales, draws = _bandit_batch(8)
     other = Batch(*(x.clone() for x in batch.tensors))
     other.action[:, :, :10] = (other.action[:, :, :10] + 1) % 5
     remaining = {}
-    ours, torchs = (GruMemory(64, signature, scaler, draws) for _ in range(2))
+    ours, torchs = (GruMemory(64, scales, draws) for _ in range(2))
     for layer in (module for module in torchs.modules() if isinstance(module, Linear)):
         bound = layer.weight.shape[1] ** -0.5
         for parameter in layer.parameters():
@@ -196,9 +197,9 @@ def test_gru_remembers_before_training() -> None:
 def test_discrete_belief_one_step_at_a_time(name: str) -> None:
     """Bayes' rule step by step gives the posterior of the whole trial, which is not the prior."""
     trials, _ = demonstrations(name, 6)
-    data, signature = Batch.of(trials, 2), Signature.of(trials)
-    obs, change = scalers(data)
-    model = DiscreteModel(4, 16, signature, obs, change, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
+    data = Batch.of(trials, 2)
+    scales = Scales.of(Signature.of(trials), data)
+    model = DiscreteModel(4, 16, scales, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
     with torch.no_grad():
         memory = model.start(len(data))
         for t in range(data.mask.shape[2]):
@@ -213,7 +214,7 @@ def test_discrete_loss_splits_trials_into_histories() -> None:
     trials, _ = demonstrations("slippery_cartpole", 2)
     data, signature = Batch.of(trials, 1)[:, :, :6], Signature.of(trials)
     data.mask[0, 1, 4:] = 0
-    model = DiscreteModel(3, 16, signature, *scalers(data), draws)
+    model = DiscreteModel(3, 16, Scales.of(signature, data), draws)
     with torch.no_grad():
         log_next = model.dynamics.log_prob(data.obs, data.action, data.next_obs)[0].double().numpy()
         loss = model.loss(data, None, 0.0, draws).item()
@@ -228,11 +229,11 @@ def test_discrete_loss_splits_trials_into_histories() -> None:
 def test_synthetic_actions_are_blind_to_the_latent_of_the_dynamics() -> None:
     """Tier 1: two latents with the same dynamics, a policy that pulls its latent's arm: no correlation of the two."""
     trials, _ = demonstrations("bandit", 6, 1)
-    data, signature = Batch.of(trials, 1), Signature.of(trials)
-    obs, change = scalers(data)
+    data = Batch.of(trials, 1)
+    scales = Scales.of(Signature.of(trials), data)
     draws = Draws([np.random.default_rng(0)], "cpu")
-    model = VariationalModel("evidence", 1, 8, signature, obs, change, draws)
-    policy_ = ActionHead(2, 8, signature, draws)
+    model = VariationalModel("evidence", 1, 8, scales, draws)
+    policy_ = ActionHead(2, 8, scales, draws)
     with torch.no_grad():
         for layer in (policy_.net[0], policy_.net[2]):
             layer.weight.zero_()
@@ -295,8 +296,9 @@ def test_synthetic_episodes_end_outside_the_expert_range() -> None:
     mask[:, :, -2:], obs[:, :, -2:] = False, 1e3  # padding
     trials = Trials(obs, trials.action, mask)
     data, starts = Batch.of(trials, 2), torch.tensor(obs[:, :, 0]).reshape(2, -1, signature.obs)
-    model = VariationalModel("evidence", 1, 8, signature, *scalers(data), draws)
-    policy_, latents = ActionHead(signature.obs + 1, 8, signature, draws), torch.zeros(2, 2, 1)
+    scales = Scales.of(signature, data)
+    model = VariationalModel("evidence", 1, 8, scales, draws)
+    policy_, latents = ActionHead(signature.obs + 1, 8, scales, draws), torch.zeros(2, 2, 1)
     config = OfflineConfig(synthetic=8)
     synthetic = deconfounded_offline.synthesise(model, policy_, latents, data, starts, mask.shape[2], config, draws)
     for s, own in enumerate(np.split(trials.obs[:, :, :-3], 2)):

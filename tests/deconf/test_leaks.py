@@ -17,7 +17,7 @@ from deconfounded.deconf.core import models
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.models import DiscreteModel, LatentModel, VariationalModel
-from deconfounded.deconf.core.nets import ActionHead, scalers
+from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.methods import (
     dagger,
     deconfounded,
@@ -229,9 +229,10 @@ def make(kind: str, name: str = CONTROL) -> tuple[LatentModel, Batch, Draws, Dec
     env = envs.BatchEnv(envs.get(name), 6)
     trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 2, 1).trials
     data, draws = Batch.of(trials, 2), Draws([np.random.default_rng(i) for i in range(2)], "cpu")
-    sizes = (3, 16, Signature.of(trials), *scalers(data), draws)
+    scales = Scales.of(Signature.of(trials), data)
+    sizes = (3, 16, scales, draws)
     model = DiscreteModel(*sizes) if kind == "discrete" else VariationalModel(kind, *sizes)
-    policy_ = ActionHead(model.inputs.obs_width + 3, 16, Signature.of(trials), draws)
+    policy_ = ActionHead(model.inputs.obs_width + 3, 16, scales, draws)
     return model.eval(), data, draws, DeconfoundedAgent(model, policy_)
 
 

@@ -11,7 +11,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import new_model
-from deconfounded.deconf.core.nets import Scaler, scalers
+from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
 from deconfounded.deconf.methods import rma
@@ -46,9 +46,11 @@ def poisoned(batch: Batch) -> Batch:
     return Batch(*filled, batch.mask)
 
 
-def test_scalers_read_no_padding(batch: Batch) -> None:
+def test_scales_read_no_padding(batch: Batch) -> None:
     """Mean and deviation are those of the steps that took place, by hand."""
-    for one, data in zip(scalers(poisoned(batch)), (batch.obs, batch.next_obs - batch.obs), strict=True):
+    scales = Scales.of(FLAT, poisoned(batch))
+    columns = (batch.obs, batch.next_obs - batch.obs, batch.action, batch.action)
+    for one, data in zip((scales.obs, scales.change, scales.action, scales.label), columns, strict=True):
         for seed in range(2):
             rows = data[seed][batch.mask[seed] == 1]
             torch.testing.assert_close(one.mean[seed], rows.mean(0))
@@ -74,13 +76,13 @@ Loss = Callable[[Batch], Tensor]
 
 def losses(batch: Batch) -> dict[str, Loss]:
     """What each agent and model is trained to make small, without random numbers of one call in another."""
-    obs, change = scalers(batch)
+    scales = Scales.of(FLAT, batch)
     shape = {"width": 16, "layers": 1, "heads": 2, "window": 9}
-    recurrent, blind = RecurrentAgent.new(8, FLAT, obs, draws()), ObsAgent.new(8, FLAT, obs, draws())
-    transformer = TransformerAgent.new(shape, FLAT, obs, draws())
-    dagger = DaggerAgent.new(16, 3, False, FLAT, obs, change, draws())
-    adapter = rma.Adapter(8, 1, FLAT, obs, draws())
-    student = rma.RmaAgent(adapter, recurrent.policy, obs)
+    recurrent, blind = RecurrentAgent.new(8, scales, draws()), ObsAgent.new(8, scales, draws())
+    transformer = TransformerAgent.new(shape, scales, draws())
+    dagger = DaggerAgent.new(16, 3, False, scales, draws())
+    adapter = rma.Adapter(8, 1, scales, draws())
+    student = rma.RmaAgent(adapter, recurrent.policy)
     found: dict[str, Loss] = {
         "naive_rnn": lambda given: recurrent.loss(given, given.action, recurrent.memory.start(4))[0],
         "naive_obs": lambda given: blind.loss(given, given.action, blind.memory.start(4))[0],
@@ -89,8 +91,8 @@ def losses(batch: Batch) -> dict[str, Loss]:
         "rma": lambda given: student.loss(given, given.action, adapter.start(4))[0],
     }
     for kind in ("evidence", "gru", "discrete"):
-        model = new_model(kind, 3, 16, FLAT, obs, change, draws()).eval()
-        agent = DeconfoundedAgent.new(kind, 3, 16, FLAT, obs, change, draws())
+        model = new_model(kind, 3, 16, scales, draws()).eval()
+        agent = DeconfoundedAgent.new(kind, 3, 16, scales, draws())
         belief = agent.model.belief(agent.model.final_memory(batch)).detach()
         found[f"{kind} model"] = lambda given, model=model: model.loss(given, None, 0.1, draws())  # type: ignore[misc]
         found[f"{kind} policy"] = lambda given, agent=agent, belief=belief: agent.loss(given, belief, None, draws())  # type: ignore[misc]
@@ -127,8 +129,7 @@ def test_gradients_are_clipped_seed_by_seed(size: float, right: float | None) ->
 class TestExploration:
     def explorer(self, share: float) -> Explorer:
         """Of 8 trials for each of two seeds; its policy is sure, and its latents of expert trials are 7."""
-        obs = Scaler(draws().normal(4, 3, 2), torch.ones(2, 4, 3))
-        agent = DeconfoundedAgent.new("evidence", 3, 16, FLAT, obs, obs, draws())
+        agent = DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 2), draws())
         made = Explorer(agent, torch.full((2, 4, 3), 7.0), share)
         made.begin(16)
         made.reset([np.random.default_rng(i) for i in range(2)])

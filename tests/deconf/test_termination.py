@@ -9,9 +9,15 @@ import torch
 
 from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.data import Batch, Draws
-from deconfounded.deconf.core.nets import scalers
+from deconfounded.deconf.core.nets import Scaler
 from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
 from deconfounded.experts.rollout import Trials
+
+
+def observed(trials: Trials) -> Scaler:
+    """The scaler of observations."""
+    batch = Batch.of(trials, 1)
+    return Scaler(batch.obs, batch.mask)
 
 
 def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
@@ -27,7 +33,7 @@ def test_the_limit_is_learned() -> None:
     """Termination beyond the limit and not within: right for 95% of observations .3 or more from it."""
     trials = walks()
     draws = Draws([np.random.default_rng(0)], "cpu")
-    model = termination.fit([trials], scalers(Batch.of(trials, 1))[0], draws)
+    model = termination.fit([trials], observed(trials), draws)
     assert model is not None
     obs = torch.linspace(-4, 4, 401)[None, :, None]
     predicted = (model.logit(obs) > 0)[0]
@@ -38,7 +44,7 @@ def test_the_limit_is_learned() -> None:
 
 def test_a_horizon_is_no_termination() -> None:
     trials = walks(limit=1e9)
-    assert termination.fit([trials], scalers(Batch.of(trials, 1))[0], Draws([np.random.default_rng(0)], "cpu")) is None
+    assert termination.fit([trials], observed(trials), Draws([np.random.default_rng(0)], "cpu")) is None
 
 
 def test_labels() -> None:

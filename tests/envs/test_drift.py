@@ -10,7 +10,7 @@ from deconfounded.deconf.core import models
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.models import LatentModel
-from deconfounded.deconf.core.nets import Scaler
+from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
@@ -116,8 +116,7 @@ def test_kept_share_is_chosen_without_theta() -> None:
 def test_forgetting(kind: str) -> None:
     """A share of 1 leaves the memory as it was, a share of 0 gives the initial one; .5 is in between."""
     draws = Draws([np.random.default_rng(0)], "cpu")
-    unit = Scaler(draws.normal(50, 2), torch.ones(1, 50))
-    model = models.new_model(kind, 3, 16, Signature(2, 1, 0, False), unit, unit, draws).eval()
+    model = models.new_model(kind, 3, 16, Scales.plain(Signature(2, 1, 0, False), 1), draws).eval()
     step = Batch(draws.normal(4, 2), draws.normal(4, 1), draws.normal(4, 2), torch.ones(1, 4))
     memory = model.update(model.start(4), step)
     assert torch.equal(model.forget(memory), memory) or kind == "discrete"
