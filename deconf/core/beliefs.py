@@ -80,22 +80,24 @@ class EvidenceBelief(Belief):
 
     The network reads *innovations*: changes of the observation, less those that a theta-blind model of the dynamics
     expects (`innovation_loss`). What theta does to a step is often small beside what the state and the action do; the
-    network would have to subtract these before it sees theta.
+    network would have to subtract these before it sees theta. Innovations are part of the sum as they are, too: of what
+    theta adds to a change, their mean is a sufficient statistic.
     """
 
     longest: Tensor
 
     def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(latent, draws)
-        self.inputs, self.change, self.width = Inputs(scales), scales.change, width // 4
+        self.inputs, self.change = Inputs(scales), scales.change
         signature = scales.signature
         products = signature.obs * signature.action_features
         self.products = products if products <= MAX_PRODUCTS else 0
-        self.expected = Mlp(signature.obs + signature.action_features, width, signature.obs, draws)
-        inputs = 2 * signature.obs + signature.action_features + self.products
-        self.evidence = Mlp(inputs, width, self.width, draws)
-        self.whiten = Whitener(self.width, draws)
-        self.out = Mlp(2 * self.width + 1, width, 2 * latent, draws)
+        inputs = signature.obs + signature.action_features
+        self.expected = Mlp(inputs, width, signature.obs, draws)
+        self.evidence = Mlp(inputs + signature.obs + self.products, width, width // 4, draws)
+        self.width, self.features = width, width // 4 + signature.obs + self.products
+        self.whiten = Whitener(self.features, draws)
+        self.out = Mlp(2 * self.features + 1, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
 
     def _innovation(self, batch: Batch) -> Tensor:
@@ -111,10 +113,11 @@ class EvidenceBelief(Belief):
         with torch.no_grad():
             innovation = self._innovation(batch)
             action = self.inputs.action(batch.action)
-            inputs = [self.inputs.obs(batch.obs), action, innovation]
+            direct = [innovation]
             if self.products:
-                inputs.append((action[..., None] * innovation[..., None, :]).flatten(-2))
-        evidence = self.whiten(self.evidence(torch.cat(inputs, -1)), batch.mask)
+                direct.append((action[..., None] * innovation[..., None, :]).flatten(-2))
+            inputs = torch.cat([self.inputs.obs(batch.obs), action, *direct], -1)
+        evidence = self.whiten(torch.cat([self.evidence(inputs), *direct], -1), batch.mask)
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)
 
@@ -125,7 +128,7 @@ class EvidenceBelief(Belief):
         return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 
     def start(self, n: int) -> Tensor:
-        return self.prior_mean.new_zeros(len(self.prior_mean), n, self.width + 1)
+        return self.prior_mean.new_zeros(len(self.prior_mean), n, self.features + 1)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)

@@ -75,7 +75,7 @@ class DaggerAgent(LearnedAgent):
         return cls.new(*sizes, scales, draws)
 
     def shape(self) -> dict[str, Any]:
-        return {"width": 4 * self.memory.width, "latent": self.latent, "forgets": self.forgets}
+        return {"width": self.memory.width, "latent": self.latent, "forgets": self.forgets}
 
     def parts(self) -> dict[str, nn.Module]:
         return {"memory": self.memory, "policy": self.policy}
@@ -144,8 +144,9 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
         for _ in range(updates[i]):
             index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)
             target = take(label[:, :, : batch.mask.shape[2]], index)
-            loss = agent.loss(batch.trials(index), target, config.steps, draws)
-            optimizer.step(loss)
+            own = batch.trials(index)
+            loss = agent.loss(own, target, config.steps, draws)
+            optimizer.step(loss + agent.memory.innovation_loss(own.steps(own.draw_steps(config.steps, draws))))
             done += 1
             monitor.update(done, sum(updates), {"imitation": loss.mean().item()}, agent)
     return agent
@@ -153,6 +154,7 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
 
 @uses(
     "queries",
+    version=2,
     cost=4,
     on_control=DaggerConfig(),
     on_bandit=DaggerConfig(batch=64, shortest=1.0, updates=1000),

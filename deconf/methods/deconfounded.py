@@ -41,7 +41,7 @@ class DeconfoundedConfig(Configuration):
 
     model: Literal["evidence", "gru", "discrete"] = "evidence"
     width: int = 64
-    latent: int = 4  # dimensions of theta_hat, or its number of values if discrete
+    latent: int = 8  # dimensions of theta_hat, or its number of values if discrete
     beta: float = 1e-3
     warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
@@ -268,7 +268,7 @@ PAPER = DeconfoundedConfig(  # appendix D and table 1; docs/paper.md has what th
 
 def large(config: DeconfoundedConfig) -> dict[str, Any]:
     """Changes for large observations: more inference updates, at a lower rate (with 3e-3 ant_goal is worse)."""
-    return {"latent": LARGE_LATENT, "inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
+    return {"inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
 
 
 def per_episode(agent: DeconfoundedAgent) -> DeconfoundedAgent:
@@ -284,7 +284,9 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 }
 
 
-@uses(*USES, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED)
+@uses(
+    *USES, version=2, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""
     trials = given.demonstrations if given.config.accumulate else given.source

@@ -25,7 +25,7 @@ ON_BANDIT = DeconfoundedConfig(
 PAPER = replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40)
 
 
-@uses(*USES, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **SHARED)
+@uses(*USES, version=2, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the discrete model."""
     return deconfounded.fit(given)

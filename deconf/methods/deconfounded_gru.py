@@ -17,7 +17,9 @@ from deconfounded.deconf.methods.deconfounded import (
 ON_CONTROL, BANDIT = DeconfoundedConfig(model="gru"), replace(ON_BANDIT, model="gru")
 
 
-@uses(*USES, cost=14, on_control=ON_CONTROL, on_bandit=BANDIT, paper=PAPER, large=deconfounded.large, **SHARED)
+@uses(
+    *USES, version=2, cost=14, on_control=ON_CONTROL, on_bandit=BANDIT, paper=PAPER, large=deconfounded.large, **SHARED
+)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the GRU belief."""
     return deconfounded.fit(given)

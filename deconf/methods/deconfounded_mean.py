@@ -171,6 +171,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
 
 @uses(
     *("demonstrations", "exploration"),
+    version=2,
     cost=8,
     on_control=MeanConfig(model="evidence"),
     on_bandit=MeanConfig(

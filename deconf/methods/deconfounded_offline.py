@@ -145,6 +145,7 @@ def synthesise(
 
 @uses(
     "demonstrations",
+    version=2,
     cost=7,
     on_control=OfflineConfig(),
     on_bandit=OfflineConfig(

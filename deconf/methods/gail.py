@@ -236,6 +236,7 @@ def train(
 
 @uses(
     *("demonstrations", "exploration"),
+    version=2,
     cost=60,
     on_control=GailConfig(discriminator_rate=3e-4),
     on_bandit=GailConfig(

@@ -58,6 +58,7 @@ class ActionDropoutAgent(RecurrentAgent):
 
 @uses(
     "demonstrations",
+    version=2,
     cost=2,
     on_control=DropoutConfig(learning_rate=9e-4),
     on_bandit=DropoutConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),

@@ -30,6 +30,7 @@ class ObsAgent(RecurrentAgent):
 
 @uses(
     "demonstrations",
+    version=2,
     cost=2,
     on_control=RecurrentConfig(learning_rate=9e-4),
     on_bandit=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=3e-3),

@@ -19,6 +19,7 @@ def train(trials: Source, config: RecurrentConfig, rng: Rngs, monitor: Monitor |
 
 @uses(
     "demonstrations",
+    version=2,
     cost=2,
     on_control=RecurrentConfig(),
     on_bandit=RecurrentConfig(updates=2000, batch=128, chunk=50, learning_rate=1e-2),

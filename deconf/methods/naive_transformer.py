@@ -252,6 +252,7 @@ def train(trials: Source, config: TransformerConfig, rng: Rngs, monitor: Monitor
 
 @uses(
     "demonstrations",
+    version=2,
     cost=30,
     on_control=TransformerConfig(layers=4),
     on_bandit=TransformerConfig(width=32, layers=4, updates=1500, batch=64, shortest=1.0, learning_rate=3e-3),

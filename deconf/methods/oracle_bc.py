@@ -6,7 +6,7 @@ from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.memoryless_bc import PRESETS, MemorylessAgent
 
 
-@uses("demonstrations", "theta", **PRESETS)
+@uses("demonstrations", "theta", version=2, **PRESETS)
 def fit(given: Given) -> MemorylessAgent:
     """Clone the expert's action at each step, given theta."""
     trials, theta = given.demonstrations, given.theta

@@ -80,6 +80,7 @@ class PalrAgent(RecurrentAgent):
 
 @uses(
     "demonstrations",
+    version=2,
     cost=4,
     on_control=PalrConfig(penalty=1.0),
     on_bandit=PalrConfig(penalty=1.0, updates=2000, batch=128, chunk=50, learning_rate=1e-2),

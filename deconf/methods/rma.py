@@ -163,6 +163,7 @@ def per_step(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
 
 @uses(
     *("demonstrations", "exploration", "theta"),
+    version=2,
     cost=4,
     on_control=RmaConfig(updates=3000, learning_rate=6e-4),
     on_bandit=RmaConfig(updates=2000, batch=128, rounds=2, learning_rate=3e-3, teacher_updates=500),
