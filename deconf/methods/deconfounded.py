@@ -21,7 +21,7 @@ from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
-from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
