@@ -1,0 +1,1 @@
+"""Simulators of others with a hidden context, in which the truth about confounding is measured."""
