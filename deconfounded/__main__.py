@@ -20,6 +20,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from trials, without theta", REPEATED),
     "look": ("benchmarks.look", "what is in your data, and what would mislead a diagnosis", NOTHING),
     "validate": ("benchmarks.studies.validate", "is a diagnosis right, where the truth is known?", REPEATED),
+    "foreign": ("benchmarks.studies.foreign.measure", "is a diagnosis right on simulators of others?", REPEATED),
     "play": ("benchmarks.play", "run a saved agent in one environment", NOTHING),
     "score": ("benchmarks.score", "score a saved agent on fresh thetas, or on another range", NOTHING),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),

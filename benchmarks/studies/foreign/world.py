@@ -1,29 +1,33 @@
-"""A world: a simulator of others with a hidden theta, and its expert. Roll-outs of agents in it, and their scores."""
+"""A foreign world, a simulator of others with a hidden theta and its expert: logs of it, and scores of agents in it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
 
 from deconfounded.deconf.core.data import Rngs, as_generators
-from deconfounded.envs.streams import Array, Obs
-from deconfounded.experts.rollout import Agent, Rollout, Trials
+from deconfounded.envs.batch import BatchEnv
+from deconfounded.envs.blackbox import BlackBox, task_of
+from deconfounded.envs.streams import Array, Mask, Obs
+from deconfounded.experts.rollout import Agent, RandomAgent, Rollout, Trials, run_trials
 
 Controller = Callable[[Array], Array]
 """Maps an observation [O] to an action in the simulator's units."""
 
 
 class World(ABC):
-    """A simulator with a hidden theta, which is constant for a trial of `episodes` episodes of at most `steps` steps.
+    """A world of envs/world.py, whose expert may have habits, and whose logs may have faults.
 
-    noise: standard deviation of the expert's actions, in the simulator's units.
+    evidence: the columns of observations whose motion is linear in theta and about linear in the rest, for
+    LinearFilter; none where there is no such filter.
     """
 
     episodes = 2
     steps = 60
     noise = 0.0
+    evidence: tuple[int, ...] = ()
 
     @abstractmethod
     def make(self, theta: Array) -> gymnasium.Env:
@@ -46,128 +50,64 @@ class World(ABC):
         return trials
 
 
-class Units:
-    """Actions of Trials, in [-1, 1] or a number from 0 up, and those of an action space."""
-
-    def __init__(self, space: spaces.Space) -> None:
-        self.actions = 0
-        if isinstance(space, spaces.Discrete):
-            self.actions, self.start, self.width = int(space.n), int(space.start), 1
-        else:
-            assert isinstance(space, spaces.Box)
-            assert space.shape is not None
-            self.low, self.high, self.width = space.low, space.high, space.shape[0]
-            self.dtype = space.dtype
-
-    def raw(self, action: Array) -> Array:
-        """Actions [N, A] of Trials in the simulator's units: [N, A], or [N] if discrete."""
-        if self.actions:
-            return action[:, 0].astype(int) + self.start
-        return (self.low + (np.clip(action, -1, 1) + 1) / 2 * (self.high - self.low)).astype(self.dtype)
-
-    def scaled(self, action: Array) -> Array:
-        """The inverse of `raw`; actions out of range are clipped."""
-        if self.actions:
-            return np.asarray(action, float).reshape(-1, 1) - self.start
-        return np.clip(2 * (np.asarray(action, float) - self.low) / (self.high - self.low) - 1, -1, 1)
+def task(world: World) -> BlackBox:
+    """The world as a task."""
+    return task_of(type(world))()
 
 
 class WorldExpert(Agent):
     """The expert in N trials. theta [N, D]: what it acts by."""
 
-    def __init__(self, world: World, units: Units, theta: Array) -> None:
-        self.world, self.units, self.theta = world, units, theta
+    def __init__(self, world: World, theta: Array) -> None:
+        self.world, self.theta, self.space = world, theta, task(world).facts.space
         self._controllers: list[Controller] = []
 
     def begin(self, n: int) -> None:
         self._controllers = []
 
-    def reset(self, rngs: list[np.random.Generator]) -> None:  # type: ignore[override]
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         if not self._controllers:  # an expert may remember earlier episodes
-            spawned = rngs[0].spawn(len(self.theta))
-            self._controllers = [self.world.controller(*x) for x in zip(self.theta, spawned, strict=True)]
+            each = [np.random.default_rng(seed) for seed in rngs[0].integers(2**62, size=len(self.theta))]
+            self._controllers = [self.world.controller(*pair) for pair in zip(self.theta, each, strict=True)]
 
     def act(self, obs: Obs) -> Array:
         pairs = zip(self._controllers, obs.astype(float), strict=True)
-        return self.units.scaled(np.stack([np.asarray(controller(o)) for controller, o in pairs]))
+        return scaled(self.space, np.stack([np.asarray(controller(row), float) for controller, row in pairs]))
 
 
-class Uniform(Agent):
-    """Uniformly random actions."""
-
-    def __init__(self, units: Units) -> None:
-        self.units = units
-
-    def reset(self, rngs: list[np.random.Generator]) -> None:  # type: ignore[override]
-        self._rng = rngs[0]
-
-    def act(self, obs: Obs) -> Array:
-        draws = self._rng.random((len(obs), self.units.width))
-        return np.floor(draws * self.units.actions) if self.units.actions else 2 * draws - 1
+def scaled(space: gymnasium.Space, action: Array) -> Array:
+    """Actions [N, A] or [N] in the simulator's units as those of Trials [N, A], clipped."""
+    if isinstance(space, gymnasium.spaces.Discrete):
+        return action.reshape(-1, 1) - space.start
+    assert isinstance(space, gymnasium.spaces.Box)
+    return np.clip(2 * (action - space.low) / (space.high - space.low) - 1, -1, 1)
 
 
 def thetas(world: World, n: int, seed: int) -> Array:
     """Draws [N, D] from p(theta)."""
-    return np.stack([np.asarray(world.sample_theta(rng), float) for rng in np.random.default_rng([seed, 0]).spawn(n)])
-
-
-def units_of(world: World) -> Units:
-    """The units of its actions."""
-    env = world.make(thetas(world, 1, 0)[0])
-    space = env.action_space
-    env.close()
-    return Units(space)
+    rng = np.random.default_rng([seed, 0])
+    return np.stack([np.asarray(world.sample_theta(rng), float) for _ in range(n)])
 
 
 def roll_out(world: World, agent: Agent, theta: Array, seed: int) -> Rollout:
-    """Trials of an agent, one under each theta [N, D]; the seed is that of simulators and of the agent."""
-    n, envs = len(theta), [world.make(row) for row in theta]
-    units, (width,) = Units(envs[0].action_space), envs[0].observation_space.shape or (1,)
-    obs = np.zeros((n, world.episodes, world.steps + 1, width), np.float32)
-    action = np.zeros((n, world.episodes, world.steps, units.width), np.float32)
-    mask, returns = np.zeros((n, world.episodes, world.steps), bool), np.zeros((n, world.episodes))
-    agent.begin(n)
-    for e in range(world.episodes):
-        now = np.stack([env.reset(seed=s)[0] for env, s in zip(envs, _seeds(seed, e, n), strict=True)])
-        now = now.astype(np.float32)
-        agent.reset([np.random.default_rng([seed, 1, e])])
-        obs[:, e], alive = now[:, None], np.ones(n, bool)
-        for t in range(world.steps):
-            chosen, then = np.asarray(agent.act(now)), now.copy()
-            raw, acting = units.raw(chosen), alive.copy()
-            for i in np.flatnonzero(acting):
-                then[i], reward, terminated, truncated, _ = envs[i].step(raw[i])
-                returns[i, e] += float(reward)
-                alive[i] = not (terminated or truncated)
-            agent.observe(now, chosen, then, acting)
-            obs[:, e, t + 1 :], mask[:, e, t] = then[:, None], acting
-            action[:, e, t] = np.where(acting[:, None], chosen, 0)
-            now = then
-            if not alive.any():
-                break
-    for env in envs:
-        env.close()
-    return Rollout(Trials(obs, action, mask, units.actions), returns, theta[:, None].repeat(world.episodes, 1))
-
-
-def _seeds(seed: int, episode: int, n: int) -> list[int]:
-    return np.random.SeedSequence([seed, 2, episode]).generate_state(n).tolist()
+    """Trials of an agent, one under each theta [N, D]."""
+    return run_trials(BatchEnv(task(world), len(theta)), agent, world.episodes, seed, theta)
 
 
 def demonstrations(world: World, n: int, seed: int) -> Rollout:
-    """Trials of the expert, each under a fresh theta."""
+    """Trials of the expert as they are logged, each under a fresh theta."""
     theta = thetas(world, n, seed)
-    made = roll_out(world, WorldExpert(world, units_of(world), theta), theta, seed)
+    made = roll_out(world, WorldExpert(world, theta), theta, seed)
     return made._replace(trials=world.logged(made.trials))
 
 
 def explorer(world: World, n: int, rng: Rngs) -> Callable[[Agent | None], Trials]:
     """A function that rolls out an agent, or uniformly random actions, in n trials under fresh thetas."""
-    (generator,), units = as_generators(rng), units_of(world)
+    (generator,), random = as_generators(rng), RandomAgent(task(world).action_space)
 
     def explore(agent: Agent | None) -> Trials:
         seed = int(generator.integers(2**31))
-        return roll_out(world, agent or Uniform(units), thetas(world, n, seed), seed).trials
+        return roll_out(world, agent or random, thetas(world, n, seed), seed).trials
 
     return explore
 
@@ -176,9 +116,17 @@ class Scorer:
     """Scores of agents by returns in n trials: 0 of an expert told another theta, 1 of the expert."""
 
     def __init__(self, world: World, n: int, seed: int) -> None:
-        self.world, self.seed, self.theta, units = world, seed, thetas(world, n, seed), units_of(world)
-        other = np.roll(self.theta, 1, 0)
-        self.expert, self.other = (self.returns(WorldExpert(world, units, told)) for told in (self.theta, other))
+        self.world, self.seed, self.theta = world, seed, thetas(world, n, seed)
+
+    @cached_property
+    def expert(self) -> Array:
+        """The returns [N, E] of the expert."""
+        return self.returns(WorldExpert(self.world, self.theta))
+
+    @cached_property
+    def other(self) -> Array:
+        """The returns [N, E] of the expert told another theta."""
+        return self.returns(WorldExpert(self.world, np.roll(self.theta, 1, 0)))
 
     def returns(self, agent: Agent) -> Array:
         """The returns [N, E]."""
@@ -188,3 +136,45 @@ class Scorer:
         """The score in the last episode."""
         expert, other, returns = (x[:, -1].mean() for x in (self.expert, self.other, self.returns(agent)))
         return float((returns - other) / (expert - other))
+
+
+class LinearFilter(Agent):
+    """A reference: the linear-Gaussian filter of theta, and the expert at its mean.
+
+    The next observation's columns `evidence` are W [1, s, a] + C theta + N(0, Sigma), fitted by least squares to n
+    trials of known thetas, half by the expert and half by the expert told another theta; theta is Gaussian.
+    """
+
+    def __init__(self, world: World, n: int, seed: int) -> None:
+        self.world, self.space, self.columns = world, task(world).facts.space, list(world.evidence)
+        theta = thetas(world, n, seed)
+        told = np.where(np.arange(n)[:, None] % 2, theta, np.roll(theta, 1, 0))
+        trials = roll_out(world, WorldExpert(world, told), theta, seed).trials
+        mask, by_step = trials.mask, np.broadcast_to(theta[:, None, None], (*trials.mask.shape, theta.shape[1]))
+        inputs = self._inputs(trials.obs[:, :, :-1][mask], trials.action[mask])
+        target = trials.obs[:, :, 1:][mask].astype(float)[:, self.columns]
+        both = np.concatenate([inputs, by_step[mask]], 1)
+        fit = np.linalg.lstsq(both, target, rcond=None)[0]
+        left = target - both @ fit
+        self.weight, effect = fit[: inputs.shape[1]], fit[inputs.shape[1] :]
+        self.gain = np.linalg.solve(np.atleast_2d(left.T @ left / len(left)), effect.T)  # Sigma^-1 C, [K, D]
+        self.information = effect @ self.gain
+        self.prior = np.linalg.inv(np.atleast_2d(np.cov(theta.T))), theta.mean(0)
+
+    @staticmethod
+    def _inputs(obs: Array, action: Array) -> Array:
+        return np.concatenate([np.ones((len(obs), 1)), obs.astype(float), action.astype(float)], 1)
+
+    def begin(self, n: int) -> None:
+        self._precision = np.tile(self.prior[0], (n, 1, 1))
+        self._total = np.tile(self.prior[0] @ self.prior[1], (n, 1))
+
+    def act(self, obs: Obs) -> Array:
+        mean = np.linalg.solve(self._precision, self._total[..., None])[..., 0]
+        pairs = zip(obs.astype(float), mean, strict=True)
+        return scaled(self.space, np.stack([np.asarray(self.world.expert(*pair), float) for pair in pairs]))
+
+    def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:
+        rest = next_obs[:, self.columns] - self._inputs(obs, action) @ self.weight
+        self._total += alive[:, None] * (rest @ self.gain)
+        self._precision += alive[:, None, None] * self.information

@@ -1,0 +1,68 @@
+"""The foreign worlds, what is true of each by its design, and the logs by which a diagnosis is to find it."""
+
+import importlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from deconfounded.benchmarks.studies.foreign.world import World, demonstrations, explorer
+from deconfounded.deconf.diagnosis import exploration
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.envs.support.errors import InputError
+from deconfounded.experts.rollout import Trials, joined
+
+TRIALS, EXPLORED, SEED = 160, 96, 11  # of the expert; of each exploration; of the logs
+
+
+@dataclass(frozen=True)
+class Case:
+    """A world `module:class`, and the tier that it needs: 1 where nothing is confounded, 3 where no exploration helps.
+
+    unseen: thresholds are set without it.
+    """
+
+    reference: str
+    tier: int
+    unseen: bool
+
+    @property
+    def name(self) -> str:
+        return self.reference.replace(":", "_").lower()
+
+    @cached_property
+    def world(self) -> World:
+        module, name = self.reference.split(":")
+        made: World = getattr(importlib.import_module(f"{__package__}.{module}"), name)()
+        return made
+
+    @property
+    def truth(self) -> tuple[str, int]:
+        """The verdict and the tier of a right diagnosis."""
+        return "not confounded" if self.tier == 1 else "confounded", self.tier
+
+    def logs(self, folder: Path) -> tuple[Path, Path]:
+        """Files of the expert's trials, and of exploration: half at random, half by a clone that tries things."""
+        files = folder / "demonstrations.npz", folder / "explored.npz"
+        try:
+            _ = [Trials.load(file) for file in files]
+        except InputError:
+            folder.mkdir(parents=True, exist_ok=True)
+            rng, trials = np.random.default_rng(SEED), demonstrations(self.world, TRIALS, SEED).trials
+            explore, clone = explorer(self.world, EXPLORED, rng), exploration.fit(trials, MemorylessConfig(), rng)
+            trials.save(files[0])
+            joined([explore(agent) for agent in (None, clone)]).save(files[1])
+        return files
+
+
+_TIERS = {
+    **dict.fromkeys(("arm:Arm", "classic:GustyCart", "classic:PendulumWind", "motor:Motor"), 2),
+    **dict.fromkeys(("lane:LaneWind", "reactor:ReactorHeat"), 2),
+    **dict.fromkeys(("mujoco:ArmTarget", "reactor:ReactorOrder"), 3),
+    **dict.fromkeys(("classic:ReversedCart", "classic:MountainPower", "classic:AcrobotPauses"), 1),
+    **dict.fromkeys(("mujoco:ArmTrembles", "mujoco:PushedPole", "motor:MotorIntegral"), 1),
+    **dict.fromkeys(("lane:LaneHabits", "lane:LaneLate", "reactor:ReactorTwice", "motor:MotorCalm"), 1),
+}
+CASES = tuple(Case(reference, tier, i % 2 == 1) for i, (reference, tier) in enumerate(_TIERS.items()))
+"""Every other one is unseen. The order was fixed before any was diagnosed."""

@@ -1,0 +1,151 @@
+"""Is a diagnosis right on simulators of others? `deconf foreign`
+
+In each world (cases.py) agents are trained and their returns measured; then its logs are diagnosed. docs/diagnose/
+foreign.json has a row each. It needs `pip install .[foreign]`; interrupted, it goes on where it was.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deconfounded.benchmarks.console import Parser, place
+from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine.catalogue import check_names
+from deconfounded.benchmarks.studies.cards import DOCS, kept
+from deconfounded.benchmarks.studies.foreign.cases import CASES, EXPLORED, SEED, TRIALS, Case
+from deconfounded.benchmarks.studies.foreign.world import (
+    LinearFilter,
+    Scorer,
+    WorldExpert,
+    demonstrations,
+    explorer,
+    task,
+)
+from deconfounded.deconf.methods import deconfounded, memoryless_bc, naive_rnn
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import write_json
+from deconfounded.experts.rollout import Agent, RandomAgent, Rollout
+
+KEPT = "diagnose/foreign"
+SCORED, SCORING = 96, 7  # trials, and their seed
+
+
+class Bench:
+    """What a world's agents are made of, made when first asked for, and the returns of those that were scored."""
+
+    def __init__(self, case: Case, folder: Path) -> None:
+        self.case, self.file = case, folder / "returns.json"
+        self.returns: dict[str, list[float]] = json.loads(self.file.read_bytes()) if self.file.is_file() else {}
+        self._scorer: Scorer | None = None
+        self._demonstrated: Rollout | None = None
+
+    @property
+    def scorer(self) -> Scorer:
+        self._scorer = self._scorer or Scorer(self.case.world, SCORED, SCORING)
+        return self._scorer
+
+    @property
+    def demonstrated(self) -> Rollout:
+        self._demonstrated = self._demonstrated or demonstrations(self.case.world, TRIALS, SEED)
+        return self._demonstrated
+
+    def encoded(self, theta: Array) -> Array:
+        """Of about unit scale."""
+        rest = self.demonstrated.theta
+        return (theta - rest.mean((0, 1))) / np.maximum(rest.std((0, 1)), 1e-9)
+
+    def measure(self, name: str) -> None:
+        """The mean return of each episode."""
+        if name not in self.returns and (agent := AGENTS[name](self)) is not None:
+            self.returns[name] = self.scorer.returns(agent).mean(0).tolist()
+            write_json(self.file, self.returns)
+
+
+def _oracle(bench: Bench) -> Agent:
+    trials, theta = bench.demonstrated.trials, bench.encoded(bench.demonstrated.theta)
+    return memoryless_bc.train(trials, MemorylessConfig(), rng(), theta, lambda: bench.encoded(bench.scorer.theta))
+
+
+def rng() -> np.random.Generator:
+    """Of initial weights and batches."""
+    return np.random.default_rng(SEED)
+
+
+def _deconfounded(bench: Bench) -> Agent:
+    explore = explorer(bench.case.world, EXPLORED, np.random.default_rng(SEED + 1))
+    return deconfounded.train(bench.demonstrated.trials, explore, DeconfoundedConfig(), rng())
+
+
+AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
+    "random": lambda bench: RandomAgent(task(bench.case.world).action_space),
+    "expert": lambda bench: WorldExpert(bench.case.world, bench.scorer.theta),
+    "told another": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
+    "filter": lambda bench: LinearFilter(bench.case.world, TRIALS, SEED) if bench.case.world.evidence else None,
+    "blind_bc": lambda bench: memoryless_bc.train(bench.demonstrated.trials, MemorylessConfig(), rng()),
+    "oracle_bc": _oracle,
+    "naive_rnn": lambda bench: naive_rnn.train(bench.demonstrated.trials, RecurrentConfig(), rng()),
+    "deconfounded": _deconfounded,
+}
+"""By name, how each is made; cheap ones first."""
+
+
+def scores(returns: dict[str, list[float]]) -> dict[str, float]:
+    """Of the last episode, 1 of the expert. 0 is the expert told another theta; where that costs nothing, random."""
+    last = {name: values[-1] for name, values in returns.items()}
+    whole = last["expert"] - last["random"]
+    zero = "told another" if last["expert"] - last["told another"] > 0.05 * whole else "random"
+    return {name: (value - last[zero]) / (last["expert"] - last[zero]) for name, value in last.items()}
+
+
+def diagnosed(case: Case, folder: Path) -> dict[str, Any]:
+    """The verdict on the world's logs, and whether it is right; None if it cannot tell."""
+    from deconfounded.benchmarks.diagnose import run
+    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
+
+    demonstrated, explored = case.logs(folder)
+    command = f"deconf foreign --cases {case.name}"
+    diagnosis, _ = run([demonstrated], [explored], {}, 0, folder / "diagnosis", command)
+    alike = case.tier == 1 and diagnosis.next is VARY_LATENT
+    right = alike or (diagnosis.verdict, diagnosis.tier) == case.truth
+    return {
+        "verdict": diagnosis.verdict,
+        "diagnosed_tier": diagnosis.tier,
+        "right": None if diagnosis.verdict == "cannot tell" and not right else right,
+        "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
+    }
+
+
+def write(case: Case, **measured: Any) -> None:
+    """Put what was measured in the case's row."""
+    rows = {row["case"]: row for row in kept(KEPT) or ()}
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    row = rows.get(case.name, {}) | {"case": case.name, "tier": case.tier, "unseen": case.unseen} | measured | about
+    rows[case.name] = row
+    write_json(DOCS / f"{KEPT}.json", [rows[case.name] for case in CASES if case.name in rows])
+
+
+def main() -> None:
+    parser = Parser(__doc__)
+    parser.add_argument("--cases", nargs="+", metavar="NAME", help="some of the cases; default: all")
+    parser.add_argument("--out", type=place, default=Path("results") / "foreign", help="output folder")
+    args = parser.parse_args()
+    check_names("case", args.cases or (), [case.name for case in CASES])
+    cases = [case for case in CASES if case.name in (args.cases or [case.name])]
+    benches = {case: Bench(case, args.out / case.name) for case in cases}
+    for name in AGENTS:
+        for case, bench in benches.items():
+            bench.file.parent.mkdir(parents=True, exist_ok=True)
+            bench.measure(name)
+            if name in bench.returns and {"random", "expert", "told another"} <= bench.returns.keys():
+                write(case, returns=bench.returns, scores=scores(bench.returns))
+                print(f"{case.name}: {name} {scores(bench.returns)[name]:.2f}", flush=True)
+    for case in cases:
+        row = diagnosed(case, args.out / case.name)
+        write(case, **row)
+        print(f"{case.name}: {row['verdict']}, {'cannot tell' if row['right'] is None else row['right']}", flush=True)

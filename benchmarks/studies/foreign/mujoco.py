@@ -1,0 +1,100 @@
+"""Gymnasium's MuJoCo: an arm without loads, whose target is hidden or whose expert trembles, and a pushed pole."""
+
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from deconfounded.benchmarks.studies.foreign.arm import Arm
+from deconfounded.benchmarks.studies.foreign.world import Controller, World
+from deconfounded.envs.streams import Array
+
+RADIUS, PUSH, GUST = 0.18, 20.0, 0.15  # m; N; m/s and rad/s a step
+
+
+class ArmTrembles(Arm):
+    """No loads, nothing hidden: the expert's noise is AR(1), and a step keeps .9 of it."""
+
+    episodes, noise, evidence = 1, 0.1, ()
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return np.zeros(2)
+
+    def controller(self, theta: Array, rng: np.random.Generator) -> Controller:
+        tremble = np.zeros(2)
+
+        def act(obs: Array) -> Array:
+            nonlocal tremble
+            tremble = 0.9 * tremble + (1 - 0.9**2) ** 0.5 * self.noise * rng.standard_normal(2)
+            return self.expert(obs, theta) + tremble
+
+        return act
+
+
+class Unseen(gymnasium.Wrapper):
+    """Puts the target at a place, and observes the arm alone."""
+
+    def __init__(self, env: gymnasium.Env, place: Array) -> None:
+        super().__init__(env)
+        self.place, self.observation_space = place, spaces.Box(-np.inf, np.inf, (6,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        env = self.env.unwrapped
+        data = env.data  # type: ignore[attr-defined]
+        env.set_state(np.concatenate([data.qpos[:2], self.place]), data.qvel.copy())  # type: ignore[attr-defined]
+        return obs[[0, 1, 2, 3, 6, 7]], info
+
+    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        obs, *rest = self.env.step(action)
+        return obs[[0, 1, 2, 3, 6, 7]], *rest
+
+
+class ArmTarget(Arm):
+    """theta: where the target is [2] in m, which nothing but the reward reveals, and so no exploration helps."""
+
+    episodes, evidence = 1, ()
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        return Unseen(super().make(np.zeros(2)), theta)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        angle = rng.uniform(-np.pi, np.pi)
+        return RADIUS * rng.uniform() ** 0.5 * np.array([np.cos(angle), np.sin(angle)])
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        whole = np.concatenate([obs[:4], theta, obs[4:], np.zeros(2)])
+        return super().expert(whole, np.zeros(2))
+
+
+class PushedPole(World):
+    """InvertedPendulum-v5 whose cart is pushed by a hidden force: feedback is enough to keep the pole up."""
+
+    noise = 0.05
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=self.steps, disable_env_checker=True)
+        return Pushed(env, float(theta[0]))
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(-PUSH, PUSH, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return np.array([obs @ (0.5, 8.0, 0.8, 1.6)]) - theta / 100  # a motor of gear 100
+
+
+class Pushed(gymnasium.Wrapper):
+    """A constant force on a cart, and gusts on its speed and the pole's after each step."""
+
+    def __init__(self, env: gymnasium.Env, force: float) -> None:
+        super().__init__(env)
+        self.force = force
+
+    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        data, gust = self.get_wrapper_attr("data"), GUST * self.np_random.standard_normal(2)
+        data.qfrc_applied[0] = self.force
+        obs, *rest = self.env.step(action)
+        data.qvel += gust
+        obs[2:] += gust
+        return obs, *rest
