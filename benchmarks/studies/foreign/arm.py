@@ -33,7 +33,8 @@ class Loaded(gymnasium.Wrapper):
 class Arm(World):
     """theta: load torques [2] in N m. Observations and actions are Reacher's own."""
 
-    noise, evidence = 2.0 / GEAR, (6, 7)
+    noise = 2.0 / GEAR
+    evidence = [6, 7]
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make(

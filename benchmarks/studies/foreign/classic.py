@@ -33,7 +33,8 @@ class Windy(gymnasium.Wrapper):
 class PendulumWind(World):
     """Pendulum-v1, held upright in a hidden steady wind: confounded, and Tier 2 suffices."""
 
-    noise, evidence = 0.05, (2,)
+    noise = 0.05
+    evidence = [2]
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("Pendulum-v1", max_episode_steps=self.steps, disable_env_checker=True)
@@ -54,11 +55,11 @@ class Turned(gymnasium.Wrapper):
         self.sign, self.gust = sign, gust
 
     def step(self, action: int) -> Step:
-        _, *rest = self.env.step(int(action) if self.sign > 0 else 1 - int(action))
+        _, reward, terminated, truncated, info = self.env.step(action if self.sign > 0 else 1 - action)
         state = np.array(self.get_wrapper_attr("state"), float)
         state[[1, 3]] += self.gust * self.np_random.standard_normal(2)
         self.env.unwrapped.state = tuple(state)  # type: ignore[attr-defined]
-        return state.astype(np.float32), *rest
+        return state.astype(np.float32), reward, terminated, truncated, info
 
 
 class ReversedCart(World):

@@ -52,7 +52,8 @@ class LaneWind(World):
     Episodes are on the straight road alone.
     """
 
-    steps, noise, gust, evidence = 35, 0.02 / STEERING, GUST, (2,)
+    steps, noise, gust = 35, 0.02 / STEERING, GUST
+    evidence = [2]
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("lane-keeping-v0", disable_env_checker=True)
@@ -70,7 +71,8 @@ class LaneWind(World):
 class LaneHabits(LaneWind):
     """No wind: each driver keeps an offset of their own, of up to a metre, which costs nothing to speak of."""
 
-    gust, evidence = 0.4, ()
+    gust = 0.4
+    evidence = []
 
     def make(self, theta: Array) -> gymnasium.Env:
         return super().make(np.zeros(1))
@@ -85,7 +87,8 @@ class LaneHabits(LaneWind):
 class LaneLate(LaneWind):
     """No wind, nothing hidden: each action is logged a step late."""
 
-    gust, evidence = 0.4, ()
+    gust = 0.4
+    evidence = []
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return np.zeros(1)

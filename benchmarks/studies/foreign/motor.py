@@ -54,7 +54,8 @@ class Hoist(gymnasium.Wrapper):
 class Motor(World):
     """theta: the load [1] in N m, for which the expert feeds a voltage forward: confounded, and Tier 2 suffices."""
 
-    episodes, noise, evidence, gust = 1, 0.02, (0,), GUST
+    episodes, noise, gust = 1, 0.02, GUST
+    evidence = [0]
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gem.make(
@@ -88,7 +89,7 @@ class Motor(World):
 class MotorIntegral(Motor):
     """The same load, and an expert that does not see it either: it integrates its errors, as a clone may."""
 
-    evidence = ()
+    evidence = []
 
     def expert(self, obs: Array, theta: Array) -> Array:
         return super().expert(obs, np.zeros(1))

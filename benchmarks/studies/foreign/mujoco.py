@@ -16,7 +16,8 @@ RADIUS, PUSH, GUST = 0.18, 20.0, 0.15  # m; N; m/s and rad/s a step
 class ArmTrembles(Arm):
     """No loads, nothing hidden: the expert's noise is AR(1), and a step keeps .9 of it."""
 
-    episodes, noise, evidence = 1, 0.1, ()
+    episodes, noise = 1, 0.1
+    evidence = []
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return np.zeros(2)
@@ -54,7 +55,8 @@ class Unseen(gymnasium.Wrapper):
 class ArmTarget(Arm):
     """theta: where the target is [2] in m, which nothing but the reward reveals, and so no exploration helps."""
 
-    episodes, evidence = 1, ()
+    episodes = 1
+    evidence = []
 
     def make(self, theta: Array) -> gymnasium.Env:
         return Unseen(super().make(np.zeros(2)), theta)

@@ -68,7 +68,8 @@ class Reactor(gymnasium.Env):
 class ReactorHeat(World):
     """theta: the heat [1] in kJ/h, for which the expert feeds cooling forward: confounded, and Tier 2 suffices."""
 
-    episodes, steps, noise, evidence = 1, 40, 100.0, (2, 3)
+    episodes, steps, noise = 1, 40, 100.0
+    evidence = [2, 3]
 
     def make(self, theta: Array) -> gymnasium.Env:
         return Reactor(float(theta[0]), TARGET)
@@ -83,7 +84,7 @@ class ReactorHeat(World):
 class ReactorOrder(ReactorHeat):
     """theta: the temperature [1] that was ordered. Nothing but the reward reveals it, and so no exploration helps."""
 
-    evidence = ()
+    evidence = []
 
     def make(self, theta: Array) -> gymnasium.Env:
         return Reactor(0.0, float(theta[0]))
@@ -98,7 +99,7 @@ class ReactorOrder(ReactorHeat):
 class ReactorTwice(ReactorHeat):
     """Nothing hidden, and each trial is in the log twice."""
 
-    evidence = ()
+    evidence = []
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return np.zeros(1)

@@ -27,7 +27,7 @@ class World(ABC):
     episodes = 2
     steps = 60
     noise = 0.0
-    evidence: tuple[int, ...] = ()
+    evidence: Sequence[int] = ()
 
     @abstractmethod
     def make(self, theta: Array) -> gymnasium.Env:
