@@ -57,7 +57,7 @@ def main(*first: str) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise
-        extra = "train" if name == "train" else "data" if error.name in ("minari", "h5py", "pyarrow") else "bench"
+        extra = name if name in ("train", "foreign") else "data" if error.name in ("minari", "h5py", "pyarrow") else "bench"
         end(f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it")
 
 

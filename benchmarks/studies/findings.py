@@ -7,6 +7,7 @@ import numpy as np
 from deconfounded.benchmarks.output import records, scoring
 from deconfounded.benchmarks.studies import spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
+from deconfounded.benchmarks.studies.foreign import report
 
 UNTUNED = "naive_rnn"  # tried with the others, whose first setting is kept: docs/baselines.md says why
 BUDGET = 4  # settings of each baseline
@@ -40,6 +41,12 @@ def validated() -> str:
     rows = kept(validate.KEPT)
     parts = [f"{validate.summary(rows)} ({_origins(rows)})", validate.table(rows)]
     return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"])
+
+
+def foreign() -> str:
+    """The second table of docs/diagnose.md: what `deconf foreign` measured on simulators of others."""
+    rows = kept(report.KEPT)
+    return f"{report.summary(rows)} ({_origins(rows)})\n\n{report.table(rows)}"
 
 
 def noises() -> str:

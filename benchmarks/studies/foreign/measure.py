@@ -6,6 +6,7 @@ foreign.json has a row each. It needs `pip install .[foreign]`; interrupted, it 
 
 import json
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.studies.cards import DOCS, kept
 from deconfounded.benchmarks.studies.foreign.cases import CASES, EXPLORED, SEED, TRIALS, Case
+from deconfounded.benchmarks.studies.foreign.report import KEPT
 from deconfounded.benchmarks.studies.foreign.world import (
     LinearFilter,
     Scorer,
@@ -32,7 +34,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_json
 from deconfounded.experts.rollout import Agent, RandomAgent, Rollout
 
-KEPT = "diagnose/foreign"
+SIMULATORS = ("gym-electric-motor", "highway-env", "do-mpc", "casadi")  # others are ours too
 SCORED, SCORING = 96, 7  # trials, and their seed
 
 
@@ -60,11 +62,17 @@ class Bench:
         rest = self.demonstrated.theta
         return (theta - rest.mean((0, 1))) / np.maximum(rest.std((0, 1)), 1e-9)
 
-    def measure(self, name: str) -> None:
-        """The mean return of each episode."""
-        if name not in self.returns and (agent := AGENTS[name](self)) is not None:
+    def measure(self, name: str) -> str:
+        """Measure the mean return of each episode of an agent, and keep it; returns the last one, to print."""
+        if name not in self.returns:
+            agent = (AGENTS | LATER)[name](self)
+            if agent is None:
+                return "none"
             self.returns[name] = self.scorer.returns(agent).mean(0).tolist()
             write_json(self.file, self.returns)
+        if {"random", "expert", "told another"} <= self.returns.keys():
+            write(self.case, returns=self.returns, scores=scores(self.returns))
+        return f"{self.returns[name][-1]:.4g}"
 
 
 def _oracle(bench: Bench) -> Agent:
@@ -87,12 +95,14 @@ AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
     "expert": lambda bench: WorldExpert(bench.case.world, bench.scorer.theta),
     "told another": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
     "filter": lambda bench: LinearFilter(bench.case.world, TRIALS, SEED) if bench.case.world.evidence else None,
+    "naive_rnn": lambda bench: naive_rnn.train(bench.demonstrated.trials, RecurrentConfig(), rng()),
+}
+LATER: dict[str, Callable[[Bench], Agent | None]] = {
     "blind_bc": lambda bench: memoryless_bc.train(bench.demonstrated.trials, MemorylessConfig(), rng()),
     "oracle_bc": _oracle,
-    "naive_rnn": lambda bench: naive_rnn.train(bench.demonstrated.trials, RecurrentConfig(), rng()),
     "deconfounded": _deconfounded,
 }
-"""By name, how each is made; cheap ones first."""
+"""By name, how each agent is made."""
 
 
 def scores(returns: dict[str, list[float]]) -> dict[str, float]:
@@ -103,9 +113,10 @@ def scores(returns: dict[str, list[float]]) -> dict[str, float]:
     return {name: (value - last[zero]) / (last["expert"] - last[zero]) for name, value in last.items()}
 
 
-def diagnosed(case: Case, folder: Path) -> dict[str, Any]:
-    """The verdict on the world's logs, and whether it is right; None if it cannot tell."""
+def diagnosed(case: Case, folder: Path) -> str:
+    """Diagnose the world's logs, and keep the verdict, and whether it is right (None: it cannot tell)."""
     from deconfounded.benchmarks.diagnose import run
+    from deconfounded.benchmarks.studies.validate import predicted
     from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
 
     demonstrated, explored = case.logs(folder)
@@ -113,20 +124,24 @@ def diagnosed(case: Case, folder: Path) -> dict[str, Any]:
     diagnosis, _ = run([demonstrated], [explored], {}, 0, folder / "diagnosis", command)
     alike = case.tier == 1 and diagnosis.next is VARY_LATENT
     right = alike or (diagnosis.verdict, diagnosis.tier) == case.truth
-    return {
-        "verdict": diagnosis.verdict,
-        "diagnosed_tier": diagnosis.tier,
-        "right": None if diagnosis.verdict == "cannot tell" and not right else right,
-        "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
-    }
+    write(
+        case,
+        verdict=diagnosis.verdict,
+        diagnosed_tier=diagnosis.tier,
+        right=None if diagnosis.verdict == "cannot tell" and not right else right,
+        predicted=predicted(diagnosis),
+        figures={key: figure._asdict() for key, figure in diagnosis.figures.items()},
+    )
+    return f"{diagnosis.verdict}, tier {diagnosis.tier}: {'right' if right else 'not right'}"
 
 
 def write(case: Case, **measured: Any) -> None:
     """Put what was measured in the case's row."""
     rows = {row["case"]: row for row in kept(KEPT) or ()}
-    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
-    row = rows.get(case.name, {}) | {"case": case.name, "tier": case.tier, "unseen": case.unseen} | measured | about
-    rows[case.name] = row
+    versions = identity.versions() | {name: metadata.version(name) for name in SIMULATORS}
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": versions}
+    row = {"case": case.name, "world": case.reference, "tier": case.tier, "unseen": case.unseen}
+    rows[case.name] = rows.get(case.name, {}) | row | measured | about
     write_json(DOCS / f"{KEPT}.json", [rows[case.name] for case in CASES if case.name in rows])
 
 
@@ -138,14 +153,9 @@ def main() -> None:
     check_names("case", args.cases or (), [case.name for case in CASES])
     cases = [case for case in CASES if case.name in (args.cases or [case.name])]
     benches = {case: Bench(case, args.out / case.name) for case in cases}
-    for name in AGENTS:
+    for name in (*AGENTS, "diagnosis", *LATER):
         for case, bench in benches.items():
-            bench.file.parent.mkdir(parents=True, exist_ok=True)
-            bench.measure(name)
-            if name in bench.returns and {"random", "expert", "told another"} <= bench.returns.keys():
-                write(case, returns=bench.returns, scores=scores(bench.returns))
-                print(f"{case.name}: {name} {scores(bench.returns)[name]:.2f}", flush=True)
-    for case in cases:
-        row = diagnosed(case, args.out / case.name)
-        write(case, **row)
-        print(f"{case.name}: {row['verdict']}, {'cannot tell' if row['right'] is None else row['right']}", flush=True)
+            folder = args.out / case.name
+            folder.mkdir(parents=True, exist_ok=True)
+            said = diagnosed(case, folder) if name == "diagnosis" else bench.measure(name)
+            print(f"{case.name}: {name} {said}", flush=True)

@@ -1,0 +1,47 @@
+"""What `deconf foreign` found, in words and as a table of docs/diagnose.md."""
+
+from typing import Any
+
+from scipy import stats
+
+from deconfounded.benchmarks.output.scoring import two_decimals
+from deconfounded.benchmarks.studies.cards import markdown_table
+
+KEPT = "diagnose/foreign"
+AGENTS = ("told another", "blind_bc", "naive_rnn", "deconfounded", "oracle_bc", "filter")
+JUDGED = {True: "right", False: "wrong", None: "cannot tell"}
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """How many verdicts are right, and Spearman's correlation of the predicted and the measured gap, of each half."""
+    sentences = []
+    for what, unseen in (("by which thresholds are set", False), ("by which they are judged", True)):
+        of = [row for row in rows if row["unseen"] is unseen and "verdict" in row]
+        if not of:
+            continue
+        wrong = sum(row["right"] is False for row in of)
+        share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {wrong} wrong"
+        both = [(row["predicted"], gap) for row in of if (gap := measured(row)) is not None]
+        rank = stats.spearmanr(*zip(*both, strict=True)).statistic if len(both) > 2 else None
+        alike = "" if rank is None else f"; the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
+        sentences.append(f"Of the half {what}, {share}{alike}.")
+    return " ".join(sentences)
+
+
+def measured(row: dict[str, Any]) -> float | None:
+    """The gap that was measured, if it was."""
+    scores = row["scores"]
+    return scores["deconfounded"] - scores["naive_rnn"] if {"deconfounded", "naive_rnn"} <= scores.keys() else None
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """A row a case."""
+    lines = []
+    for row in rows:
+        cells = (two_decimals(row["scores"][name]) if name in row["scores"] else "" for name in AGENTS)
+        verdict = row.get("verdict", "")
+        verdict += f", Tier {row['diagnosed_tier']}" if verdict == "confounded" else ""
+        judged = JUDGED[row["right"]] if "verdict" in row else ""
+        half = "judged" if row["unseen"] else "set"
+        lines.append((row["world"], str(row["tier"]), half, *cells, verdict, judged))
+    return markdown_table(("world", "tier needed", "half", *AGENTS, "diagnosis", ""), lines)

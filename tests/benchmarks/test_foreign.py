@@ -1,0 +1,78 @@
+"""Foreign worlds: their cases, scores and filter, in those simulators that are ours too."""
+
+import numpy as np
+import pytest
+
+from deconfounded.benchmarks.studies.foreign import report, world
+from deconfounded.benchmarks.studies.foreign.cases import CASES, Case
+from deconfounded.benchmarks.studies.foreign.measure import scores
+from deconfounded.experts.rollout import RandomAgent
+
+OURS = [case for case in CASES if case.reference.split(":")[0] in ("arm", "classic", "mujoco")]
+NAMES = [case.name for case in OURS]
+HARMLESS = ("classic_reversedcart", "classic_mountainpower", "mujoco_pushedpole")  # though dynamics depend on theta
+
+
+def test_halves_are_alike() -> None:
+    for unseen in (False, True):
+        tiers = [case.tier for case in CASES if case.unseen is unseen]
+        assert (tiers.count(1), tiers.count(2), tiers.count(3)) == (5, 3, 1)
+    assert len({case.reference.split(":")[0] for case in CASES}) >= 5
+
+
+@pytest.mark.parametrize("case", OURS, ids=NAMES)
+def test_theta_is_hidden_at_first_and_seeds_repeat(case: Case) -> None:
+    made = case.world
+    theta = world.thetas(made, 6, 0)
+    agent = RandomAgent(world.task(made).action_space)
+    one, other = (world.roll_out(made, agent, x, 5).trials for x in (theta, np.roll(theta, 1, 0)))
+    again = world.roll_out(made, agent, theta, 5).trials
+    assert one.sha256 == again.sha256
+    assert np.array_equal(one.obs[:, 0, 0], other.obs[:, 0, 0])
+    moved = not np.array_equal(one.obs, other.obs)
+    assert moved is (case.tier == 2 or case.name in HARMLESS)
+
+
+def test_experts_have_their_habits() -> None:
+    by_name = {case.name: case.world for case in OURS}
+    pauses = world.demonstrations(by_name["classic_acrobotpauses"], 12, 0).trials
+    waits = (pauses.action[:, 0, :, 0] == 1).cumprod(1).sum(1)
+    assert waits.max() <= 25
+    assert len(set(waits.tolist())) > 4
+    trials = world.demonstrations(by_name["mujoco_armtrembles"], 4, 0).trials
+    made = by_name["mujoco_armtrembles"]
+    mean = world.task(made).expert_mean(trials.obs[:, 0, :-1].reshape(-1, 10), np.zeros((4 * made.steps, 2)))
+    left = (trials.action[:, 0] - mean.reshape(4, made.steps, 2)).transpose(0, 2, 1).reshape(-1, made.steps)
+    assert 0.7 < np.corrcoef(left[:, 1:].ravel(), left[:, :-1].ravel())[0, 1] < 0.97
+
+
+@pytest.mark.slow
+def test_a_filter_does_as_well_as_the_expert() -> None:
+    made = next(case.world for case in CASES if case.name == "classic_pendulumwind")
+    score = world.Scorer(made, 24, 0)
+    assert score(world.WorldExpert(made, score.theta)) == 1
+    assert score(world.LinearFilter(made, 32, 1)) == pytest.approx(1, abs=0.1)
+    lost = world.LinearFilter(made, 32, 1)
+    lost.gain = 0 * lost.gain  # it takes no evidence in
+    assert score(lost) < 0.8
+
+
+def test_scores() -> None:
+    returns = {"random": [0.0, 0.0], "expert": [9.0, 10.0], "told another": [9.0, 6.0], "naive_rnn": [9.0, 8.0]}
+    assert scores(returns) == {"random": -1.5, "expert": 1, "told another": 0, "naive_rnn": 0.5}
+    assert scores(returns | {"told another": [9.0, 9.9]})["naive_rnn"] == 0.8  # nothing is at stake: 0 is random
+
+
+def test_report() -> None:
+    row = {"world": "arm:Arm", "tier": 2, "unseen": False, "scores": {"naive_rnn": 0.2, "deconfounded": 0.9}}
+    said = {"verdict": "confounded", "diagnosed_tier": 3, "right": False, "predicted": 0.5}
+    unsure = {"verdict": "cannot tell", "diagnosed_tier": None, "right": None, "predicted": 0.0}
+    rows = [row | said, row | unsure | {"unseen": True}, row]
+    assert report.summary(rows) == (
+        "Of the half by which thresholds are set, 0 of 1 verdicts are right, 1 wrong."
+        " Of the half by which they are judged, 0 of 1 verdicts are right, 0 wrong."
+    )
+    lines = report.table(rows).splitlines()
+    assert lines[2].endswith("| confounded, Tier 3 | wrong |")
+    assert lines[3].endswith("| cannot tell | cannot tell |")
+    assert lines[4].endswith("|  |  |")
