@@ -1,0 +1,240 @@
+"""The documentation site, docs/_build/html: `make docs`, with Sphinx (extra `docs`).
+
+Its sources are staged in docs/_build/source: the pages of docs/, CONTRIBUTING and CHANGELOG, with their links resolved,
+and a page for each task, method and module (site_pages.py). A paragraph that is only a link to a section of README or
+CONTRIBUTING is replaced by that section. Sphinx then builds with warnings as errors, and every link of the result is
+checked. Nothing is trained.
+"""
+
+import os
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from deconfounded import envs
+from deconfounded.benchmarks.console import ROOT, run_command
+from deconfounded.benchmarks.studies import results, site_pages
+from deconfounded.benchmarks.studies.cards import DOCS
+from deconfounded.envs.support.files import write_atomically
+
+BUILD = DOCS / "_build"
+HOME, INTERACTIVE = "docs/home.md", "docs/index.html"
+CONTENTS = {  # caption: page: its file, from the root of the repository; None: it is generated
+    "First steps": {"start": "docs/start.md", "concepts": "docs/concepts.md"},
+    "Benchmark": {
+        **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "baselines": "docs/baselines.md"},
+        **{"paper": "docs/paper.md", "spectrum": "docs/spectrum.md", "speed": "docs/speed.md"},
+    },
+    "How to": {
+        **{"environments": "docs/environments.md", "own_task": "docs/own_task.md", "own_method": "docs/own_method.md"},
+        **{"worlds": "docs/worlds.md", "core": "docs/core.md", "diagnose": "docs/diagnose.md"},
+        **{"deploy": "docs/deploy.md", "cluster": "docs/cluster.md", "submit": "docs/submit.md"},
+    },
+    "Reference": {"commands": None, "api/index": None},
+    "Project": {
+        **{"contributing": "CONTRIBUTING.md", "design": "docs/design.md", "records": "docs/records/README.md"},
+        **{"versions": "docs/versions.md", "faults": "docs/faults.md", "tried": "docs/tried.md"},
+        **{"changelog": "CHANGELOG.md"},
+    },
+}
+PAGES = {file: page for pages in CONTENTS.values() for page, file in pages.items() if file} | {HOME: "index"}
+ELSEWHERE = {  # what a link to another file of the repository becomes
+    **{"README.md": "index", "docs/tasks.md": "tasks/index", "docs/certificates": "tasks/index"},
+    **{"docs/records": "records", "deconf/methods": "methods/index"},
+}
+FENCE = re.compile(r"^(```+|~~~+).*?^\1\s*?$", re.S | re.M)
+LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\[\]]*\])*\])\(([^()\s]+)\)")
+SECTION = re.compile(r"^\[[^\]\n]+\]\(([^()\s#]*(?:README|CONTRIBUTING)\.md)#([\w-]+)\)\n", re.M)
+
+
+def slug(heading: str) -> str:
+    """The anchor of a heading, as on GitHub."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
+
+
+def section(text: str, anchor: str) -> str:
+    """What a page says under the heading of that anchor. Raises InputError if it has none."""
+    headings = [(found.start(), found.end(), len(found[1]), found[2]) for found in _headings(text)]
+    for i, (_, end, level, heading) in enumerate(headings):
+        if slug(heading) == anchor:
+            after = [start for start, _, deeper, _ in headings[i + 1 :] if deeper <= level]
+            return text[end : after[0] if after else len(text)].strip() + "\n"
+    raise envs.InputError(f"there is no section #{anchor}; there are {', '.join(slug(one[3]) for one in headings)}")
+
+
+def _headings(text: str) -> list[re.Match[str]]:
+    fences = [found.span() for found in FENCE.finditer(text)]
+    found = re.finditer(r"^(#+) (.+)$", text, re.M)
+    return [one for one in found if not any(start < one.start() < end for start, end in fences)]
+
+
+def _outside_code(text: str, change: Callable[[str], str]) -> str:
+    """The text with its parts changed that are not in a fence of code."""
+    done, at = [], 0
+    for fence in FENCE.finditer(text):
+        done += [change(text[at : fence.start()]), fence[0]]
+        at = fence.end()
+    return "".join([*done, change(text[at:])])
+
+
+class Site:
+    """Stages pages in a folder: `source` for Sphinx, and `extra`, which it copies as it is."""
+
+    def __init__(self, folder: Path) -> None:
+        self.source, self.extra = folder / "source", folder / "extra"
+        self.sections: dict[tuple[str, str], str] = {}  # (file, anchor): the page that shows that section
+        for file, page in PAGES.items():
+            for found in SECTION.finditer((ROOT / file).read_text("utf-8")):
+                self.sections[_place(found[1], file), found[2]] = page
+
+    def stage(self, page: str, text: str, file: str) -> None:
+        """Write a page. text: Markdown, with links as in the file, from the root of the repository, that it is of."""
+
+        def shown(found: re.Match[str]) -> str:
+            origin = _place(found[1], file)
+            return self.resolved(section((ROOT / origin).read_text("utf-8"), found[2]), page, origin)
+
+        text = SECTION.sub(shown, self.resolved(text, page, file, keep=SECTION))
+        target = self.source / f"{page}.md"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(target, text)
+
+    def resolved(self, text: str, page: str, file: str, keep: re.Pattern[str] | None = None) -> str:
+        """The text with its links to files of the repository as links of the site; keep: paragraphs left alone."""
+
+        def link(found: re.Match[str]) -> str:
+            words, target = found.groups()
+            if urlsplit(target).scheme or target.startswith(("#", "/")):
+                return found[0]
+            path, _, anchor = target.partition("#")
+            return self._link(words, _place(path, file), anchor, page)
+
+        def change(part: str) -> str:
+            kept = [found.span() for found in keep.finditer(part)] if keep else []
+            done, at = [], 0
+            for start, end in kept:
+                done += [LINK.sub(link, part[at:start]), part[start:end]]
+                at = end
+            return "".join([*done, LINK.sub(link, part[at:])])
+
+        return _outside_code(text, change)
+
+    def _link(self, words: str, place: str, anchor: str, page: str) -> str:
+        """A link to a file of the repository, and to an anchor in it. Raises InputError if it does not exist."""
+        if place == INTERACTIVE:
+            above = "../" * page.count("/")
+            return f'<a href="{above}interactive/index.html">{words[1:-1].strip("*")}</a>'
+        if place == "docs/tasks.md" and anchor:
+            return f"{words}(/tasks/{anchor}.md)"
+        if (shown := self.sections.get((place, anchor))) and place not in PAGES:
+            return f"{words}(/{shown}.md)"
+        if target := PAGES.get(place) or ELSEWHERE.get(place):
+            return f"{words}(/{target}.md{'#' * bool(anchor and place in PAGES)}{anchor * (place in PAGES)})"
+        if not (ROOT / place).exists():
+            raise envs.InputError(f"a link of {page} leads to {place}, which does not exist")
+        if (ROOT / place).is_dir():
+            return f"{words[1:-1]} (`{place}`)"
+        copy = self.source / "files" / place
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / place, copy)
+        return f"{words}(/files/{place})"
+
+    def write(self) -> None:
+        """Stage all pages, and the interactive page of results beside them."""
+        found = results.published()
+        for file, page in PAGES.items():
+            text = (ROOT / file).read_text("utf-8")
+            self.stage(page, text + _contents() if file == HOME else text, file)
+        for page, text in site_pages.pages(found).items():
+            self.stage(page, text, "docs/generated.md")
+        shutil.copytree(DOCS, self.extra / "interactive", ignore=_not_shown, dirs_exist_ok=True)
+        html = (DOCS / "index.html").read_text("utf-8")
+        html = re.sub(r'href="tasks\.md#([\w-]+)"', r'href="../tasks/\1.html"', html)
+        html = re.sub(r'(["(])(results|baselines|tasks)\.md', r"\1../\2.html", html)
+        write_atomically(self.extra / "interactive" / "index.html", html)
+
+
+def _place(path: str, file: str) -> str:
+    """A path from the root of the repository, of one as it is in a file."""
+    return os.path.normpath(os.path.join(os.path.dirname(file), path)).replace(os.sep, "/")
+
+
+def _not_shown(folder: str, names: list[str]) -> set[str]:
+    """What the interactive page does not refer to: all but clips, certificates and records."""
+    if Path(folder) == DOCS:
+        kept = {"certificates", "records", *(name for name in names if name.endswith(".webp"))}
+        return set(names) - kept
+    return {name for name in names if name.endswith(".md")}
+
+
+def _contents() -> str:
+    """The tables of contents, for the home page."""
+    parts = []
+    for caption, pages in CONTENTS.items():
+        parts.append("\n".join(["```{toctree}", ":hidden:", f":caption: {caption}", "", *pages, "```"]))
+    return "\n" + "\n\n".join(parts) + "\n"
+
+
+class _Links(HTMLParser):
+    """Collects what a page refers to, and the anchors that it has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "id" and value:
+                self.anchors.add(value)
+            if name in ("href", "src") and value:
+                self.links.append(value)
+
+
+def dead_links(folder: Path) -> list[str]:
+    """Of all pages in a folder, the links to a file or an anchor that it does not hold: `page: link`."""
+    pages = {}
+    for file in sorted(folder.rglob("*.html")):
+        pages[file.resolve()] = made = _Links()
+        made.feed(file.read_text("utf-8"))
+    dead = []
+    for file, page in pages.items():
+        for link in page.links:
+            scheme, host, path, _, anchor = urlsplit(link)
+            target = (file.parent / unquote(path)).resolve() if path else file
+            held = pages.get(target)
+            scripted = "_modules" not in file.parts and held is not None and "interactive" in target.parts
+            missing = not target.is_file() or (anchor and held and unquote(anchor) not in held.anchors)
+            if not (scheme or host or (scripted and target.is_file())) and missing:
+                dead.append(f"{file.relative_to(folder.resolve())}: {link}")
+    return dead
+
+
+def build(folder: Path) -> Path:
+    """Stage and build the site in a folder; returns that of its html. Raises InputError for warnings and dead links."""
+    try:
+        from sphinx.cmd.build import main as sphinx
+    except ModuleNotFoundError:
+        raise envs.InputError("Sphinx is not installed; `pip install .[docs]` brings it") from None
+    for part in ("source", "extra", "html"):
+        shutil.rmtree(folder / part, ignore_errors=True)
+    site, html = Site(folder), folder / "html"
+    site.write()
+    places = ["-c", str(DOCS / "site"), "-d", str(folder / "doctrees"), str(site.source), str(html)]
+    if sphinx(["-W", "--keep-going", "-q", "-E", "-D", f"html_extra_path={site.extra}", *places]):
+        raise envs.InputError("Sphinx had warnings, see above")
+    if dead := dead_links(html):
+        raise envs.InputError(f"{len(dead)} links lead nowhere: {'; '.join(dead[:20])}")
+    return html
+
+
+def main() -> None:
+    print(build(BUILD) / "index.html")
+
+
+if __name__ == "__main__":
+    sys.exit(run_command(main, "nothing was built"))

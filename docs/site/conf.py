@@ -1,0 +1,33 @@
+"""Sphinx's settings. The pages are staged by benchmarks/studies/site.py; `make docs` builds them."""
+
+import re
+
+from deconfounded import __version__
+
+project, author, copyright = "Deconfounded imitation", "The deconfounded-imitation contributors", "Apache-2.0"
+version = release = __version__
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx.ext.mathjax", "sphinx_copybutton"]
+html_theme, html_title = "furo", "Deconfounded imitation"
+html_copy_source = html_show_sourcelink = False
+html_theme_options = {"navigation_with_keys": True}
+exclude_patterns = ["files"]
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+autodoc_typehints_format = "short"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+copybutton_exclude = ".linenos, .gp, .go"
+suppress_warnings = ["config.cache"]
+
+
+def as_rst(app, what, name, obj, options, lines):
+    """Docstrings are plain text with `code`: code becomes literal, and nothing else is markup."""
+    text = "\n".join(lines)
+    parts = re.split(r"(`+[^`]+`+)", text)
+    for i, part in enumerate(parts):
+        parts[i] = f"``{part.strip('`')}``" if i % 2 else re.sub(r"([*|\\_])", r"\\\1", part)
+    lines[:] = "".join(parts).split("\n")
+
+
+def setup(app):
+    app.connect("autodoc-process-docstring", as_rst)
