@@ -1,8 +1,8 @@
-# Everything from nothing but Python 3.11, 3.12 or 3.13: `make setup`, `make demo`, `make test` and `make quick`.
+# Everything from nothing but Python 3.11, 3.12 or 3.13: `make setup`, `make demo`, `make test`, `make quick` and `make docs`.
 PYTHON ?= python3
 VENV := .venv
 
-.PHONY: setup demo test quick lint
+.PHONY: setup demo test quick lint docs
 
 setup: $(VENV)/installed
 
@@ -19,6 +19,9 @@ lint: $(VENV)/installed
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
+
+docs: $(VENV)/installed  # the site, docs/_build/html/index.html
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m deconfounded.benchmarks.studies.site
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python >= 3.11 is needed')"

@@ -152,15 +152,20 @@ class Site:
         for page, text in site_pages.pages(found).items():
             self.stage(page, text, "docs/generated.md")
         shutil.copytree(DOCS, self.extra / "interactive", ignore=_not_shown, dirs_exist_ok=True)
-        html = (DOCS / "index.html").read_text("utf-8")
-        html = re.sub(r'href="tasks\.md#([\w-]+)"', r'href="../tasks/\1.html"', html)
-        html = re.sub(r'(["(])(results|baselines|tasks)\.md', r"\1../\2.html", html)
+        html = re.sub(r'href="([^"#]*)(#[\w-]*)?"', _from_interactive, (ROOT / INTERACTIVE).read_text("utf-8"))
         write_atomically(self.extra / "interactive" / "index.html", html)
 
 
 def _place(path: str, file: str) -> str:
     """A path from the root of the repository, of one as it is in a file."""
     return os.path.normpath(os.path.join(os.path.dirname(file), path)).replace(os.sep, "/")
+
+
+def _from_interactive(found: re.Match[str]) -> str:
+    """A link of docs/index.html, as from interactive/index.html of the site."""
+    place = _place(found[1], INTERACTIVE)
+    page = PAGES.get(place) or ELSEWHERE.get(place)
+    return f'href="../{page}.html{found[2] or ""}"' if page else found[0]
 
 
 def _not_shown(folder: str, names: list[str]) -> set[str]:

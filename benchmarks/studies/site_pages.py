@@ -14,7 +14,7 @@ from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, scoring
 from deconfounded.benchmarks.studies import cards, results
-from deconfounded.benchmarks.studies.cards import DOCS, TIERS, markdown_table
+from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
 from deconfounded.deconf import methods
 from deconfounded.deconf.method import ENVIRONMENT, USES
 
@@ -100,7 +100,9 @@ def task_page(task: envs.Task, made: dict[str, Any] | None) -> str:
     if (DOCS / f"certificates/{task.name}.png").exists():
         files = f"[json](certificates/{task.name}.json)"
         parts += ["## Certificate", f"![certificate of {task.name}](certificates/{task.name}.png)"]
-        parts += [f"Made by `deconf certify --task {task.name}` ({files}); [what it measures](concepts.md#certificate)."]
+        parts += [
+            f"Made by `deconf certify --task {task.name}` ({files}); [what it measures](concepts.md#certificate)."
+        ]
     if made:
         section = results.section(task, made).split("\n\n")
         parts += ["## Results", scoring.outcome(made["methods"])]
@@ -144,7 +146,12 @@ def _as_in_docs(text: str) -> str:
 def _methods(found: index.Found, certified: dict[str, Any]) -> str:
     """The table of methods."""
     table = results.fared(found, certified)
-    table = re.sub(r"^\| (\w+) \|", lambda row: f"| [{row[1]}](/methods/{row[1]}.md) |" if row[1] in METHODS else row[0], table, flags=re.M)
+    table = re.sub(
+        r"^\| (\w+) \|",
+        lambda row: f"| [{row[1]}](/methods/{row[1]}.md) |" if row[1] in METHODS else row[0],
+        table,
+        flags=re.M,
+    )
     text = "Scores in the last episode, with 95% intervals, over the tasks whose certificate is passed. A *tier* is the"
     text += " data that a method may use: 1, demonstrations; 2, also exploration; 3, also queries of the expert."
     about = "Each page is made from the method's module, its declaration and its [records](records)."
@@ -168,8 +175,9 @@ def method_page(name: str, found: index.Found) -> str:
         parts += [f"Its agent is also scored in another deployment: {ways}."]
     asked = "" if name in DEFAULT else f" --methods {name}"
     parts += [f"```bash\ndeconf run --task slippery_cartpole{asked}\n```", "## Results", _scores(name, found)]
-    if items := _bullets(baselines.partition("Where methods fail")[2], name):
-        parts += ["## Where it fails", "\n".join(items)]
+    items = _bullets(baselines.partition("Where methods fail")[2], name)
+    if behind := _behind(name, found):
+        parts += ["## Where it fails", behind, "\n".join(items)]
     parts += ["## Amounts", _amounts(name)]
     parts += ["## Source", f"```{{eval-rst}}\n.. automodule:: {module.__name__}\n   :members:\n```"]
     if module is not methods and _shared(module, name):
@@ -199,13 +207,27 @@ def _scores(name: str, found: index.Found) -> str:
     return f"{text} {scoring.INTERVALS}\n\n{markdown_table(head, rows)}" if rows else "There are no records."
 
 
+def _behind(name: str, found: index.Found, most: int = 3) -> str:
+    """The tasks on which a method is furthest behind the exact interventional policy."""
+    gaps = list[tuple[float, str]]()
+    for task, made in found:
+        if "interventional" in (of := made["methods"]) and name in of and METHODS[name].learned:
+            score, exact = (of[one]["score_last"] for one in (name, "interventional"))
+            words = f"`{task.name}`, {scoring.two_decimals(score)} of {scoring.two_decimals(exact)}"
+            gaps.append((score - exact, words))
+    worst = "; ".join(words for gap, words in sorted(gaps)[:most] if gap < 0)
+    return f"Furthest behind the exact interventional policy, in the last episode: {worst}." if worst else ""
+
+
 def _amounts(name: str) -> str:
     """Hyperparameters in the default preset, and the data of a seed."""
     settings = {kind: preset("default", envs.get(task), "cpu", [name]) for kind, task in TYPICAL.items()}
     configs = [made.configs.get(name, {}) for made in settings.values()]
     if not any(configs):
         return "It has no hyperparameters."
-    keys = [key for key in dict.fromkeys(key for config in configs for key in config) if key not in ("device", "drifts")]
+    keys = [
+        key for key in dict.fromkeys(key for config in configs for key in config) if key not in ("device", "drifts")
+    ]
     rows = [(f"`{key}`", *(f"{config.get(key, '')}" for config in configs)) for key in keys]
     text = "Hyperparameters in the preset `default`, on control tasks and on the bandit;"
     text += f" `--set {name}.{keys[0]}=VALUE` changes one. What they mean is below, under *Source*."
@@ -214,22 +236,32 @@ def _amounts(name: str) -> str:
 
 def _commands() -> str:
     """The table of commands."""
-    rows = ((f"`deconf {name}`", text, "a checkout" if module.startswith(STUDIES) else "") for name, (module, text, _) in COMMANDS.items())
-    text = "`deconf COMMAND --help` shows a command's options. Invalid input ends a command with one line and exit code 2."
+    rows = (
+        (f"`deconf {name}`", text, "a checkout" if module.startswith(STUDIES) else "")
+        for name, (module, text, _) in COMMANDS.items()
+    )
+    text = (
+        "`deconf COMMAND --help` shows a command's options. Invalid input ends a command with one line and exit code 2."
+    )
     return f"# Commands\n\n{text}\n\n{markdown_table(('command', 'what it does', 'needs'), rows)}\n"
 
 
 def _api() -> dict[str, str]:
     """A page for each module of the reference, and their table."""
-    made, parts = {}, ["# API reference", "Made from docstrings. Shape letters are those of {py:mod}`deconfounded.envs.task`."]
+    made, parts = (
+        {},
+        ["# API reference", "Made from docstrings. Shape letters are those of {py:mod}`deconfounded.envs.task`."],
+    )
     for caption, names in MODULES.items():
         for name in names:
             module = importlib.import_module(name)
-            body = f"```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n   :show-inheritance:\n```"
-            if offered := [each for each in getattr(module, "__all__", ()) if callable(getattr(module, each))]:
+            offered = [each for each in getattr(module, "__all__", ()) if callable(getattr(module, each))]
+            members = "" if offered else "\n   :members:\n   :show-inheritance:"
+            body = f"```{{eval-rst}}\n.. automodule:: {name}{members}\n```"
+            if offered:  # they are documented where they are defined
                 places = ((each, getattr(module, each).__module__) for each in offered)
-                rows = ((f"`{each}`", f"{{py:mod}}`{where}`") for each, where in places)
-                body += f"\n\nIts names:\n\n{markdown_table(('name', 'from'), rows)}"
+                rows = ((f"`{each}`", f"{{py:obj}}`{where}.{each}`") for each, where in places)
+                body += f"\n\nIts names:\n\n{markdown_table(('name', 'defined as'), rows)}"
             made[f"api/{name}"] = f"# {name}\n\n{body}\n"
         rows = [(f"[{name}](/api/{name}.md)", _headline(importlib.import_module(name))) for name in names]
         parts += [f"## {caption}", markdown_table(("module", "what"), rows), _toctree(names)]

@@ -16,8 +16,9 @@ myst_heading_anchors = 4
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
+autodoc_inherit_docstrings = False  # of gymnasium and dm_env, which are written in another markup
+viewcode_follow_imported_members = False
 copybutton_exclude = ".linenos, .gp, .go"
-suppress_warnings = ["config.cache"]
 
 
 def as_rst(app, what, name, obj, options, lines):

@@ -1,0 +1,80 @@
+"""The documentation site: every task and method has its page, links lead somewhere, and Sphinx has no warnings."""
+
+from pathlib import Path
+
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.studies import site
+from deconfounded.deconf import methods
+
+PAGE = """# A *page*
+
+## One
+first
+
+```bash
+# Two
+```
+### Deeper
+second
+## Two, and more
+third
+"""
+
+
+def test_section() -> None:
+    """It ends at the next heading of its level; a comment in code is no heading."""
+    assert site.section(PAGE, "one") == "first\n\n```bash\n# Two\n```\n### Deeper\nsecond\n"
+    assert site.section(PAGE, "two-and-more") == "third\n"
+    with pytest.raises(envs.InputError, match=r"no section #two; there are a-page, one, deeper, two-and-more"):
+        site.section(PAGE, "two")
+
+
+def test_links(tmp_path: Path) -> None:
+    """Links lead to pages of the site, or to copies of files; those in code and to other sites are left alone."""
+    made = site.Site(tmp_path)
+    for file, link, becomes in (
+        ("docs/speed.md", "[a](results.md#bandit)", "[a](/results.md#bandit)"),
+        ("docs/speed.md", "[a](tasks.md#bandit)", "[a](/tasks/bandit.md)"),
+        ("docs/speed.md", "[a](../README.md#is-it-confounded)", "[a](/concepts.md)"),
+        ("docs/speed.md", "[a](../deconf/exact.py)", "[a](/files/deconf/exact.py)"),
+        ("README.md", "![a [b] c](docs/gap.png)", "![a [b] c](/files/docs/gap.png)"),
+        ("docs/paper.md", "[a](paper/preset)", "a (`docs/paper/preset`)"),
+        ("README.md", "[a](docs/index.html)", '<a href="interactive/index.html">a</a>'),
+        *(("README.md", same, same) for same in ("[a](https://b.c)", "[a](#b)", "```\n[a](b)\n```", "x[0](y)")),
+    ):
+        assert made.resolved(link, "speed", file) == becomes
+    assert (tmp_path / "source/files/docs/gap.png").is_file()
+    with pytest.raises(envs.InputError, match=r"a link of speed leads to docs/absent\.md, which does not exist"):
+        made.resolved("[a](absent.md)", "speed", "docs/speed.md")
+
+
+def test_dead_links(tmp_path: Path) -> None:
+    """Files and anchors that are not there, by page."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b.html").write_text('<p id="x"><a href="../c.html#y"><a href="#x"><a href="https://d.e/f">')
+    (tmp_path / "c.html").write_text('<a href="a/b.html#x"><img src="g.png"><a href="a/b.html#z">')
+    assert site.dead_links(tmp_path) == ["a/b.html: ../c.html#y", "c.html: g.png", "c.html: a/b.html#z"]
+
+
+def test_every_page_is_listed() -> None:
+    """Each page of docs/ is one of the site, but for tasks.md, of which each task has its own part."""
+    listed = {Path(file).name for file in site.PAGES if file.startswith("docs/")}
+    assert {file.name for file in site.DOCS.glob("*.md")} - listed == {"tasks.md"}
+
+
+@pytest.mark.slow
+def test_build(tmp_path: Path) -> None:
+    """Without a warning or a dead link; a page for each task and method, with what such a page must have."""
+    pytest.importorskip("sphinx", reason="Sphinx is not installed")
+    html = site.build(tmp_path)
+    for name in envs.SUITE:
+        page = (html / "tasks" / f"{name}.html").read_text("utf-8")
+        parts = ("latent", "observation", "Action", "results", "expert", "versions")
+        assert all(part in page for part in parts), name
+    for name in methods.METHODS:
+        page = (html / "methods" / f"{name}.html").read_text("utf-8")
+        assert 'id="results"' in page, name
+        assert 'id="source"' in page, name
+    assert (html / "interactive" / "index.html").is_file()
