@@ -9,7 +9,6 @@ checked. Nothing is trained.
 import os
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
@@ -23,7 +22,9 @@ from deconfounded.envs.support.files import write_atomically
 
 BUILD = DOCS / "_build"
 HOME, INTERACTIVE = "docs/home.md", "docs/index.html"
-CONTENTS = {  # caption: page: its file, from the root of the repository; None: it is generated
+CONTENTS: dict[
+    str, dict[str, str | None]
+] = {  # caption: page: its file, from the root of the repository; None: it is generated
     "First steps": {"start": "docs/start.md", "concepts": "docs/concepts.md"},
     "Benchmark": {
         **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "baselines": "docs/baselines.md"},
@@ -242,4 +243,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_command(main, "nothing was built"))
+    run_command(main, "nothing was built")

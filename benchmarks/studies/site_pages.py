@@ -36,6 +36,13 @@ MODULES = {  # of the API reference
         *("deconfounded.deconf.core.agents", "deconfounded.deconf.core.beliefs", "deconfounded.deconf.core.models"),
         *("deconfounded.deconf.core.nets", "deconfounded.deconf.core.monitor", "deconfounded.deconf.methods"),
     ),
+    "Methods": tuple(
+        dict.fromkeys(
+            f"{methods.__name__}.{place.partition(':')[0]}"
+            for place in (*methods.METHODS.values(), "sequence_bc", "memoryless_bc")
+        )
+    ),
+    "Tasks": tuple(f"deconfounded.envs.tasks.{name}" for name in envs.SUITE),
     "Diagnosis": tuple(
         f"deconfounded.deconf.diagnosis.{name}" for name in ("diagnose", "look", "exploration", "measures", "latent")
     ),
@@ -55,9 +62,8 @@ def pages(found: index.Found) -> dict[str, str]:
     return made | _api()
 
 
-def _toctree(names: Iterable[str], caption: str = "") -> str:
-    options = [f":caption: {caption}"] if caption else [":hidden:"]
-    return "\n".join(["```{toctree}", *options, "", *names, "```"])
+def _toctree(names: Iterable[str]) -> str:
+    return "\n".join(["```{toctree}", ":hidden:", "", *names, "```"])
 
 
 def _bullets(text: str, name: str) -> list[str]:
@@ -108,8 +114,7 @@ def task_page(task: envs.Task, made: dict[str, Any] | None) -> str:
         parts += ["## Results", scoring.outcome(made["methods"])]
         parts += [part for part in section[1:] if not part.startswith("![expert, naive")]
     parts += ["## Expert", _expert(task), "## Versions", _history(task)]
-    module = type(task).__module__
-    parts += ["## Source", f"{{py:mod}}`{module}`", f"```{{eval-rst}}\n.. automodule:: {module}\n   :members:\n```"]
+    parts += ["## Source", f"{{py:mod}}`{type(task).__module__}`"]
     return "\n\n".join(parts) + "\n"
 
 
@@ -165,7 +170,7 @@ def method_page(name: str, found: index.Found) -> str:
     baselines = (DOCS / "baselines.md").read_text("utf-8")
     own = f"*{inspect.getdoc(fit)}*" if fit.__name__ != "fit" else ""
     parts = [f"# {name}", own, inspect.getdoc(module) or ""]
-    if row := re.search(rf"^\| {name} \| ([^|]+) \| ([^|]+) \|", baselines, re.M):
+    if row := re.search(rf"^\| {name} \| ([^|]+) \| ([^|]+) \|", baselines.partition("\n## ")[0], re.M):
         parts += [f"In short: {row[1]}. After: {row[2]}."]
     uses = {**USES, ENVIRONMENT: "the environments of evaluation, and the expert: for references alone"}
     used = "; ".join(f"*{kind}*, {uses[kind]}" for kind in method.uses) or "nothing"
@@ -175,20 +180,12 @@ def method_page(name: str, found: index.Found) -> str:
         parts += [f"Its agent is also scored in another deployment: {ways}."]
     asked = "" if name in DEFAULT else f" --methods {name}"
     parts += [f"```bash\ndeconf run --task slippery_cartpole{asked}\n```", "## Results", _scores(name, found)]
-    items = _bullets(baselines.partition("Where methods fail")[2], name)
+    items = [item for item in _bullets(baselines, name) if item.startswith(f"- `{name}`")]
     if behind := _behind(name, found):
         parts += ["## Where it fails", behind, "\n".join(items)]
     parts += ["## Amounts", _amounts(name)]
-    parts += ["## Source", f"```{{eval-rst}}\n.. automodule:: {module.__name__}\n   :members:\n```"]
-    if module is not methods and _shared(module, name):
-        parts[-1] = f"[{module.__name__}](/methods/{_shared(module, name)}.md#source)"
+    parts += ["## Source", f"{{py:mod}}`{module.__name__}`"]
     return "\n\n".join(filter(None, parts)) + "\n"
-
-
-def _shared(module: Any, name: str) -> str:
-    """The first method of the module, whose page documents it, unless that is the method of that name."""
-    first = next(other for other in methods.METHODS if methods.load(other).__module__ == module.__name__)
-    return "" if first == name else first
 
 
 def _scores(name: str, found: index.Found) -> str:
@@ -230,7 +227,9 @@ def _amounts(name: str) -> str:
     ]
     rows = [(f"`{key}`", *(f"{config.get(key, '')}" for config in configs)) for key in keys]
     text = "Hyperparameters in the preset `default`, on control tasks and on the bandit;"
-    text += f" `--set {name}.{keys[0]}=VALUE` changes one. What they mean is below, under *Source*."
+    text += (
+        f" `--set {name}.{keys[0]}=VALUE` changes one. The configuration's class, see *Source*, says what they mean."
+    )
     return f"{text}\n\n{markdown_table(('hyperparameter', *TYPICAL), rows)}"
 
 
@@ -263,6 +262,6 @@ def _api() -> dict[str, str]:
                 rows = ((f"`{each}`", f"{{py:obj}}`{where}.{each}`") for each, where in places)
                 body += f"\n\nIts names:\n\n{markdown_table(('name', 'defined as'), rows)}"
             made[f"api/{name}"] = f"# {name}\n\n{body}\n"
-        rows = [(f"[{name}](/api/{name}.md)", _headline(importlib.import_module(name))) for name in names]
-        parts += [f"## {caption}", markdown_table(("module", "what"), rows), _toctree(names)]
+        lines = ((f"[{name}](/api/{name}.md)", _headline(importlib.import_module(name))) for name in names)
+        parts += [f"## {caption}", markdown_table(("module", "what"), lines), _toctree(names)]
     return made | {"api/index": "\n\n".join(parts) + "\n"}

@@ -10,6 +10,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphin
 html_theme, html_title = "furo", "Deconfounded imitation"
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}
+smartquotes = False
 exclude_patterns = ["files"]
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 4
@@ -30,5 +31,12 @@ def as_rst(app, what, name, obj, options, lines):
     lines[:] = "".join(parts).split("\n")
 
 
+def short_arrays(app, what, name, obj, options, signature, returns):
+    """`ndarray[floating]`, not what numpy.typing makes of it."""
+    long = r"ndarray\[tuple\[[^\]]*\.\.\.\], [~.\w]*dtype\[[~.]*(?:\w+\.)*(\w+)(?:\[[^\]]*\])?\]\]"
+    return tuple(text and re.sub(long, r"ndarray[\1]", text) for text in (signature, returns))
+
+
 def setup(app):
+    app.connect("autodoc-process-signature", short_arrays)
     app.connect("autodoc-process-docstring", as_rst)

@@ -24,8 +24,8 @@ OFFLINE = ("--no-deps", "--no-index")
 
 
 def files(folder: Path) -> set[str]:
-    """All but bytecode and locks, which anybody may leave."""
-    found = (file for file in folder.rglob("*") if not file.is_dir() and "__pycache__" not in file.parts)
+    """All but bytecode, locks and the built site, which anybody may leave."""
+    found = (file for file in folder.rglob("*") if not file.is_dir() and not {"__pycache__", "_build"} & {*file.parts})
     found = (file for file in found if file.name != ".lock")
     return {str(file.relative_to(folder)) for file in found}
 
@@ -38,7 +38,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with FileLock(made.with_suffix(".lock")):
         if not (made / "site").exists():
             shutil.rmtree(made, ignore_errors=True)
-            aside = shutil.ignore_patterns(".*", "results", "runs", "build", "dist", "__pycache__", "*.egg-info")
+            aside = shutil.ignore_patterns(
+                ".*", "results", "runs", "build", "_build", "dist", "__pycache__", "*.egg-info"
+            )
             shutil.copytree(ROOT, made / "copy", symlinks=True, ignore=aside)  # a build writes into its own tree
             build = "from setuptools import build_meta; build_meta.build_sdist('..')"
             subprocess.run([sys.executable, "-c", build], cwd=made / "copy", check=True, capture_output=True)
