@@ -2,17 +2,21 @@
 
 import re
 
+from docutils import nodes
+from docutils.utils.math import latex2mathml
+
 from deconfounded import __version__
 
 project, author, copyright = "Deconfounded imitation", "The deconfounded-imitation contributors", "Apache-2.0"
 version = release = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx.ext.mathjax", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
 html_theme, html_title = "furo", "Deconfounded imitation"
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}
 smartquotes = False
 exclude_patterns = ["files"]
 myst_enable_extensions = ["dollarmath"]
+html_math_renderer = "mathml"
 myst_heading_anchors = 4
 autodoc_typehints_format = "short"
 autodoc_member_order = "bysource"
@@ -37,6 +41,17 @@ def short_arrays(app, what, name, obj, options, signature, returns):
     return tuple(text and re.sub(long, r"ndarray[\1]", text) for text in (signature, returns))
 
 
+def mathml(block):
+    """A renderer of formulas as MathML, which browsers show without a network."""
+
+    def visit(self, node):
+        self.body.append(latex2mathml.tex2mathml(node.astext(), as_block=block))
+        raise nodes.SkipNode
+
+    return visit
+
+
 def setup(app):
+    app.add_html_math_renderer("mathml", (mathml(False), None), (mathml(True), None))
     app.connect("autodoc-process-signature", short_arrays)
     app.connect("autodoc-process-docstring", as_rst)
