@@ -18,7 +18,7 @@ from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.diagnosis.diagnose import Diagnosis
+    from deconfounded.deconf.diagnosis.judgement import Diagnosis
     from deconfounded.deconf.diagnosis.measures import Amounts, Findings
 
 
@@ -90,7 +90,8 @@ def run(
     from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.scheduler import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
-    from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check, judge
+    from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check
+    from deconfounded.deconf.diagnosis.judgement import judge
 
     config, start = DiagnoseConfig(), time.time()
     remarks = look.look(trials, explore)
@@ -112,7 +113,8 @@ def run(
             if log is not None and file is not None:
                 log.save(file)
         run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run)
-    diagnosis = judge([findings for refit in refits if (findings := refit.findings()) is not None])
+    found = [findings for refit in refits if (findings := refit.findings()) is not None]
+    diagnosis = judge(found, None if explore is None else len(explore))
     about |= {"columns": columns, "units": asdict(trials.units), "look": [remark._asdict() for remark in remarks]}
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
     return diagnosis, page.write(diagnosis, about, folder)

@@ -7,7 +7,8 @@ from typing import Any
 
 from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, encoded, panels
-from deconfounded.deconf.diagnosis.diagnose import GOOD, NEGLIGIBLE, STAKES, Diagnosis, Figure
+from deconfounded.deconf.diagnosis.judgement import Diagnosis, Figure
+from deconfounded.deconf.diagnosis.thresholds import GOOD, NEGLIGIBLE, STAKES
 from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts.datasets.units import Units
 

@@ -24,7 +24,7 @@ from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.diagnosis.diagnose import Diagnosis
+    from deconfounded.deconf.diagnosis.judgement import Diagnosis
 
 CASES: dict[str, str | None] = {
     **dict.fromkeys(envs.SUITE),
@@ -51,20 +51,25 @@ def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
-    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
+    from deconfounded.deconf.diagnosis.advice import VARY_LATENT
 
     truth = ("confounded", 2) if certified else ("not confounded", 1)
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
         truth = ("confounded", 3)
     alike = task.name == "nothing_hidden" and diagnosis.next is VARY_LATENT
-    return alike or (diagnosis.verdict, diagnosis.tier) == truth
+    verdict = "not confounded" if diagnosis.verdict == "nothing at stake" else diagnosis.verdict
+    return alike or (verdict, diagnosis.tier) == truth
 
 
 def predicted(diagnosis: "Diagnosis") -> float:
     """The gap that Tier 2 could close, in scores; 0 where nothing is confounded, or alike, or queries are needed."""
-    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
+    from deconfounded.deconf.diagnosis.advice import VARY_LATENT
 
-    nothing = diagnosis.verdict == "not confounded" or diagnosis.tier == 3 or diagnosis.next is VARY_LATENT
+    nothing = (
+        diagnosis.verdict in ("not confounded", "nothing at stake")
+        or diagnosis.tier == 3
+        or diagnosis.next is VARY_LATENT
+    )
     return 0.0 if nothing else diagnosis.figures["gap"].value
 
 

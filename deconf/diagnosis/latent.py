@@ -1,5 +1,9 @@
-"""A latent that explains an expert's trials: inferred from the dynamics alone, or from actions and dynamics."""
+"""A latent that explains an expert's trials: inferred from the dynamics alone, or from actions and dynamics.
 
+Likelihoods are trimmed means over held-out trials, so that no single one, a fall say, decides.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -23,21 +27,28 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
+TRIM = 0.1  # share of held-out trials that is left out at either end, when likelihoods are averaged
+
+LogProb = Callable[[Batch, Tensor], Tensor]
+"""Log-likelihoods [1, B, T] of steps given latents [1, B, T, D]."""
 
 
 class Explanation(NamedTuple):
     """A model that infers latents, a policy given latents, and the latents [1, N, D] of the trials of training.
 
-    Nats a step, None without exploration. action_likelihood: log-likelihood of held-out expert actions at odd steps,
-    given the latent inferred from even steps. action_evidence: the same less that given another trial's latent;
-    exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
+    Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
+    the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
+    much to overfit. action_evidence: the former less that given another trial's latent; exploration_evidence,
+    expert_evidence: as much of next observations, in exploration and in expert trials. exploration_fit: that of
+    exploration which the model was trained on.
     """
 
     model: VariationalModel
     policy: ActionHead
     latents: Tensor
-    action_likelihood: float | None = None
+    latent_gain: float | None = None
     action_evidence: float | None = None
+    exploration_fit: float | None = None
     exploration_evidence: float | None = None
     expert_evidence: float | None = None
 
@@ -74,21 +85,25 @@ def from_dynamics(
     def log_next(batch: Batch, latent: Tensor) -> Tensor:
         return model.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, latent)[..., 0]
 
-    def log_policy(batch: Batch, latent: Tensor) -> Tensor:
-        return policy.log_prob(torch.cat([model.inputs.obs(batch.obs), latent], -1), batch.action)
+    def log_policy(of: ActionHead) -> LogProb:
+        return lambda x, latent: of.log_prob(torch.cat([model.inputs.obs(x.obs), latent], -1), x.action)
 
-    _, exploration_evidence = _evidence(log_next, model, explored_held_out, per_theta, draws)
+    fit, evidence = (_evidence(log_next, model, x, per_theta, draws) for x in (explored, explored_held_out))
     _refit_noise(model, train, draws)
-    policy = _train_policy(model, train, cloning, draws)
-    likelihood, action_evidence = _evidence(log_policy, model, held_out, per_theta, draws)
-    _, expert_evidence = _evidence(log_next, model, held_out, per_theta, draws)
-    latents = model.sample(_belief(model, train), draws)
-    return Explanation(model, policy, latents, likelihood, action_evidence, exploration_evidence, expert_evidence)
+    belief = _belief(model, train)
+    policy, other = (_train_policy(model, train, x, cloning, draws) for x in (belief, belief.roll(per_theta, 1)))
+    gain = _gain(log_policy(policy), log_policy(other), model, held_out, draws)
+    in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
+    in_trials = _evidence(log_next, model, held_out, per_theta, draws)
+    return Explanation(model, policy, model.sample(belief, draws), gain, in_actions, fit, evidence, in_trials)
 
 
-def step_mean(x: Tensor, batch: Batch) -> float:
-    """The mean of x [1, B, T] over the steps of a batch."""
-    return float(masked_mean(x.flatten(1), batch.mask.flatten(1)))
+def typical(x: Tensor, batch: Batch) -> float:
+    """The trimmed mean over trials of the means of x [1, B, T] over their steps."""
+    steps = batch.mask[0].sum(-1)
+    means = ((x * batch.mask)[0].sum(-1) / steps.clamp(min=1))[steps > 0].sort().values
+    trimmed = min(math.ceil(TRIM * len(means)), (len(means) - 1) // 2)
+    return float(means[trimmed : len(means) - trimmed].mean())
 
 
 def odd_steps(batch: Batch) -> Batch:
@@ -156,22 +171,29 @@ def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
 
 
 @torch.no_grad()
-def _evidence(
-    log_prob: Callable[[Batch, Tensor], Tensor], model: VariationalModel, data: Batch, per_theta: int, draws: Draws
-) -> tuple[float, float]:
-    """Log-likelihood of odd steps given the latent of the even ones, and its excess over that given another trial's.
+def _evidence(log_prob: LogProb, model: VariationalModel, data: Batch, per_theta: int, draws: Draws) -> float:
+    """Log-likelihood of odd steps given the latent of the even ones, less that given the latent of another trial.
 
-    Nats a step. log_prob: of steps [1, B, T] given latents [1, B, T, D]. The other trial is `per_theta` before.
+    Nats a step. The other trial is `per_theta` before.
     """
     odd, latents = odd_steps(data), model.sample(_belief(model, data), draws)
-    own, other = (step_mean(log_prob(odd, _per_step(odd, x)), odd) for x in (latents, latents.roll(per_theta, 1)))
-    return own, own - other
+    own, other = (log_prob(odd, _per_step(odd, x)) for x in (latents, latents.roll(per_theta, 1)))
+    return typical(own - other, odd)
 
 
-def _train_policy(model: VariationalModel, data: Batch, config: MemorylessConfig, draws: Draws) -> ActionHead:
-    """A policy, cloned given the latents that a model infers from the trials."""
+@torch.no_grad()
+def _gain(log_prob: LogProb, less: LogProb, model: VariationalModel, data: Batch, draws: Draws) -> float:
+    """Log-likelihood of odd steps given the latent of the even ones, less that by another policy; nats a step."""
+    odd, latents = odd_steps(data), _per_step(data, model.sample(_belief(model, data), draws))
+    return typical(log_prob(odd, latents) - less(odd, latents), odd)
+
+
+def _train_policy(
+    model: VariationalModel, data: Batch, belief: Tensor, config: MemorylessConfig, draws: Draws
+) -> ActionHead:
+    """A policy, cloned given latents of beliefs [1, B, P] about the trials."""
     policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)
-    agent, belief = DeconfoundedAgent(model, policy), _belief(model, data)
+    agent = DeconfoundedAgent(model, policy)
     optimizer = Adam([policy], config.learning_rate, config.updates)
     for _ in range(config.updates):
         optimizer.step(agent.loss(data, belief, config.batch, draws))

@@ -44,6 +44,10 @@ class LatentPolicy:
     def remember(self, step: Batch) -> None:
         pass
 
+    def next_obs(self, obs: Tensor, action: Tensor, draws: Draws) -> Tensor:
+        """A draw of the next observations [S, N, O], under the latents of the trials."""
+        return self.model.dynamics.sample(obs, action, self.theta_hat, draws)
+
     def point(self, obs: Tensor, latent: Tensor) -> Tensor:
         """The mean action [..., A], or log-probabilities of discrete actions."""
         out = self.policy.net(self.features(obs, latent))
@@ -167,7 +171,7 @@ class LearnedEnv:
                 action = actor.choose(obs)
                 total += alive * self._action_error(obs, action) + left
                 count += alive + left
-                next_obs = self.reference.model.dynamics.sample(obs, action, self.reference.theta_hat, draws)
+                next_obs = self.reference.next_obs(obs, action, draws)
                 actor.remember(Batch(obs, action, next_obs, alive))  # before clamping, as log_next models it
                 obs = torch.where(alive[..., None] > 0, next_obs.clamp(*self.observed), obs)
                 inside = ((obs >= self.valid[0]) & (obs <= self.valid[1])).all(-1)

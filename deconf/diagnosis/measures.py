@@ -17,14 +17,22 @@ from torch import Tensor
 
 from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
-from deconfounded.deconf.diagnosis import latent
+from deconfounded.deconf.diagnosis import fits, latent, trait
 from deconfounded.deconf.diagnosis.deviation import deviation, excess_score, max_ratio, paired_deviation, trajectories
-from deconfounded.deconf.diagnosis.latent import Explanation, step_mean
-from deconfounded.deconf.diagnosis.learned_env import Actor, AgentActor, LatentPolicy, LearnedEnv, PosteriorSampler
+from deconfounded.deconf.diagnosis.latent import Explanation, typical
+from deconfounded.deconf.diagnosis.learned_env import (
+    Actor,
+    AgentActor,
+    LatentPolicy,
+    LearnedEnv,
+    PosteriorSampler,
+    valid_range,
+)
+from deconfounded.deconf.diagnosis.trait import Trait, TraitPolicy
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
@@ -70,13 +78,15 @@ class Amounts:
 
 
 class Findings(NamedTuple):
-    """The figures of one split. Nats are a step, on held-out trials.
+    """The figures of one split. Nats are a step, on held-out trials, of which no single one decides (`latent.typical`).
 
     memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone.
-    latent_gain: the same by the latent inferred from the dynamics. Evidence is the log-likelihood given a trial's own
-    latent less that given another trial's. exploration_evidence, expert_evidence: evidence in the dynamics, of
-    exploration and of expert trials. action_evidence: evidence in the expert's actions, for which a naive clone takes
-    its own.
+    latent_gain: that by the latent inferred from the dynamics, over latents of other trials. Evidence is the
+    log-likelihood given a trial's own latent less that given another trial's. exploration_evidence, expert_evidence:
+    evidence in the dynamics, of exploration and of expert trials; exploration_fit: of exploration in the trials of
+    training, which exceeds that of held-out ones where the trials are too few. action_evidence: evidence in the
+    expert's actions, for which a naive clone takes its own. dynamics_differ: rank correlation of what two halves of an
+    exploration trial do beyond a fit of all trials, 0 if that is chance (`fits.own_dynamics`).
 
     The others are of the last episode of rollouts in the learned dynamics, and deviations are over chance, which is 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
@@ -85,6 +95,9 @@ class Findings(NamedTuple):
     naive clone and of posterior sampling, from 0 for a wrong latent to 1 for the right one, by paired deviation;
     naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
     are None, and the latent explains actions too, Eq. (7).
+
+    Only where a memory gains and the dynamics explain next to none of it, others are None: trait_gain, the gain by a
+    trait of the trial that is inferred from the actions of its other half (`trait.py`), and the stakes of the trait.
     """
 
     memory_gain: float
@@ -92,6 +105,8 @@ class Findings(NamedTuple):
     exploration_evidence: float | None
     expert_evidence: float | None
     action_evidence: float | None
+    exploration_fit: float | None
+    dynamics_differ: float | None
     stakes: float
     paired_stakes: float
     model_deviation: float
@@ -99,6 +114,9 @@ class Findings(NamedTuple):
     latent: float
     naive_by_actions: float
     latent_by_actions: float
+    trait_gain: float | None = None
+    trait_stakes: float | None = None
+    paired_trait_stakes: float | None = None
 
 
 class PartMonitor(Monitor):
@@ -135,7 +153,7 @@ def measure(
     with torch.no_grad():
         held_out, episodes = Batch.of(expert[1], 1), Batch.of(split_episodes(train), 1)
         present = blind.policy.log_prob(blind.scales.obs(held_out.obs), held_out.action)
-        memory = -float(recurrent.held_out_loss(held_out)) - step_mean(present, held_out)
+        memory = typical(recurrent.log_prob(held_out) - present, held_out)
         episodes = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # trials may have fewer than others
         batches, (_, per_trial, horizon) = [Batch.of(trials, 1) for trials in data], trials.mask.shape
 
@@ -143,11 +161,57 @@ def measure(
             return LearnedEnv(reference, episodes, batches, per_trial, horizon, ends)
 
         rollouts = _rollouts(explanation, learned_env, recurrent, trajectories(episodes), amounts, rngs)
+    in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
+    differ = None if explore is None else _differ(trials, explore)
+    found = Findings(memory, *in_dynamics, explanation.action_evidence, explanation.exploration_fit, differ, *rollouts)
+    if memory > CLEAR and max(in_dynamics[0] or 0.0, in_dynamics[2] or 0.0) < CLEAR and explore is not None:
+        whole = Batch.of(train, 1)
+        of_trial = trait.fit(whole, held_out, present, Signature.of(train), amounts.cloning, draws)
+        stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)
+        found = found._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
     report(1)
-    likelihood = explanation.action_likelihood
-    explained = None if likelihood is None else likelihood - step_mean(present, latent.odd_steps(held_out))
-    evidence = (explanation.exploration_evidence, explanation.expert_evidence, explanation.action_evidence)
-    return Findings(memory, explained, *evidence, *rollouts)
+    return found
+
+
+def _differ(expert: Trials, explore: Trials) -> float | None:
+    """How much exploration trials differ in their dynamics, within the range of the expert's: see Findings."""
+    low, high = (x[0].numpy() for x in valid_range(Batch.of(expert, 1)))
+    inside = np.logical_and(explore.obs >= low, explore.obs <= high).all(-1)[:, :, :-1] & explore.mask
+    near = Trials(explore.obs, explore.action, inside, explore.actions)
+    measured = fits.own_dynamics(near, fits.Steps.of(near))
+    return None if measured is None else measured[0]
+
+
+@torch.no_grad()
+def _trait_stakes(
+    of_trial: Trait,
+    explanation: Explanation,
+    learned_env: Callable[[LatentPolicy], LearnedEnv],
+    amounts: Amounts,
+    rngs: list[np.random.Generator],
+) -> tuple[float, float]:
+    """Stakes and paired stakes of wrong traits, under latents of the dynamics which they do not depend on."""
+    draws, count = Draws(rngs, "cpu"), amounts.rollouts
+    candidates = take(of_trial.traits, draws.integers(of_trial.traits.shape[1], amounts.candidates))
+    index = draws.integers(amounts.candidates, count)
+    dynamics = take(explanation.latents, draws.integers(explanation.latents.shape[1], count))
+    right, wrong = (
+        TraitPolicy(explanation.model, of_trial.policy, dynamics, take(candidates, i))
+        for i in (index, draw_distant(candidates, index, draws))
+    )
+    env = learned_env(right)
+    return stakes_of([env.rollout(actor, rngs)[1][0] for actor in (wrong, right, right, right)])
+
+
+def stakes_of(paths: list[Tensor]) -> tuple[float, float]:
+    """Deviation of trajectories [N, T, O] under wrong latents from those under right ones, over chance; and paired.
+
+    paths: under wrong latents, under right ones, and two repeats of the latter, so that errors are independent.
+    """
+    away, home, repeat, second = paths
+    half = len(home) // 2
+    stakes = max_ratio(*(deviation(path[half:], home[:half], repeat[half:]) for path in (away, home)))
+    return stakes, max_ratio(*(paired_deviation(path, home, repeat) for path in (away, second)))
 
 
 def _rollouts(
@@ -157,7 +221,7 @@ def _rollouts(
     paths: Tensor,
     amounts: Amounts,
     rngs: list[np.random.Generator],
-) -> tuple[float, ...]:
+) -> tuple[float, float, float, float, float, float, float]:
     """Figures of rollouts: `stakes` and those after it in Findings. paths: trajectories of the data [N, T, O]."""
     draws, model, policy = Draws(rngs, "cpu"), explanation.model, explanation.policy
     candidates = take(explanation.latents, draws.integers(explanation.latents.shape[1], amounts.candidates))
@@ -165,18 +229,18 @@ def _rollouts(
     right = LatentPolicy(model, policy, take(candidates, index))
     wrong = LatentPolicy(model, policy, take(candidates, draw_distant(candidates, index, draws)))
     imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(model, policy, candidates)]
-    env, half = learned_env(right), amounts.rollouts // 2
+    env = learned_env(right)
     rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, *[right] * 3]]
     least, most, *errors = (error for error, _ in rollouts[:4])
     judged = (float(1 - (error - least) / (most - least).clamp(min=0.05)) for error in errors)
     home, away, cloned, inferred, repeat, *repeats = (path[0] for _, path in rollouts)
     paired = [paired_deviation(path, home, repeat) for path in (away, cloned, inferred, *repeats)]
     mistake, *others, chance, second_chance = paired  # of two repeats, so that their errors are independent
-    stakes = max_ratio(*(deviation(path[half:], home[:half], repeat[half:]) for path in (away, home)))
+    stakes, paired_stakes = stakes_of([away, home, repeat, repeats[0]])
     scores = (excess_score(deviations - second_chance, mistake - chance) for deviations in others)
     shuffled = paths[torch.randperm(len(paths), generator=torch.Generator().manual_seed(0))]
     unlike = float(deviation(home, *shuffled.tensor_split(2)).mean())
-    return stakes, max_ratio(mistake, chance), unlike, *scores, *judged
+    return stakes, paired_stakes, unlike, *scores, *judged
 
 
 def draw_distant(latents: Tensor, index: Tensor, draws: Draws) -> Tensor:
@@ -209,7 +273,7 @@ def _explain(
         part = PartMonitor(report, 0.25 + 0.55 * i / len(units), 0.25 + 0.55 * (i + 1) / len(units))
         explanations.append(latent.from_dynamics(*unit, amounts.cloning, draws, part))
     whole, single = explanations[0], explanations[-1]
-    of_actions = (single.action_likelihood or 0.0) - (whole.action_likelihood or 0.0)
+    of_actions = (single.latent_gain or 0.0) - (whole.latent_gain or 0.0)
     of_dynamics = (single.expert_evidence or 0.0) - (whole.expert_evidence or 0.0)
     return single if min(of_actions, of_dynamics) > CLEAR else whole
 

@@ -131,10 +131,18 @@ class RecurrentAgent(LearnedAgent):
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """The imitation loss [S] of labels [S, B, T, A] after a memory [S, B, W], and the memory after the batch."""
+        log_policy, states = self._log_policy(batch, label, state)
+        return imitation_loss(log_policy.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
+
+    def _log_policy(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         states = self.memory(batch, state)
         features = torch.cat([states[:, :, :-1], self.memory.inputs.scales.obs(batch.obs)], -1)
-        log_policy = self.policy.log_prob(features, label)
-        return imitation_loss(log_policy.flatten(1), batch.mask.flatten(1)), states[:, :, -1].detach()
+        return self.policy.log_prob(features, label), states
+
+    @torch.no_grad()
+    def log_prob(self, batch: Batch) -> Tensor:
+        """log pi [S, B, T] of the actions of whole trials."""
+        return self._log_policy(batch, batch.action, self.memory.start(len(batch)))[0]
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:

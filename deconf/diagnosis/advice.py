@@ -1,0 +1,67 @@
+"""What a diagnosis says: verdicts and their headlines, what a wrong verdict would look like, and what to do next."""
+
+from typing import Literal, NamedTuple
+
+Verdict = Literal["confounded", "not confounded", "nothing at stake", "cannot tell"]
+HEADLINES: dict[Verdict, str] = {
+    "confounded": "Confounded",
+    "not confounded": "Not confounded",
+    "nothing at stake": "Past actions predict, nothing is at stake",
+    "cannot tell": "Cannot tell",
+}
+IF_WRONG: dict[tuple[Verdict, int | None], str] = {
+    ("confounded", 2): (
+        "a naive clone does as well as the agent that explores. It takes minutes to train: compare the two in a few"
+        " trials before you rely on either."
+    ),
+    ("confounded", 3): (
+        "what differs between trials is a habit, and no goal: whichever of the experts' ways a clone takes is right,"
+        " and its episodes end as well as theirs."
+    ),
+    ("not confounded", 1): (
+        "a clone begins well, then commits to a course that the expert would have corrected, and repeats it with"
+        " certainty: another one in each trial. Look for that in its first trials."
+    ),
+    ("nothing at stake", 1): (
+        "a clone fails in whole trials, and does well in others. If that happens, something differs between trials that"
+        " the expert observes, and your columns do not show."
+    ),
+}
+"""By verdict and tier: 'If this is wrong, ...'."""
+
+
+class Next(NamedTuple):
+    """What to do, and a line of Python that does it with `trials`; explore and query are the user's functions."""
+
+    advice: str
+    fit: str = ""
+
+
+CLONE = Next(
+    "Clone the expert; a memory does no harm here.",
+    "naive_rnn.train(trials, naive_rnn.RecurrentConfig(), np.random.default_rng(0))",
+)
+CLONE_HABITS = Next(
+    "Clone the expert. A memory of past actions copies pauses, noise and habits too; cut out of the logs what you do"
+    " not want copied, or clone without a memory.",
+    "memoryless_bc.train(trials, memoryless_bc.MemorylessConfig(), np.random.default_rng(0))",
+)
+EXPLORE = Next(
+    "Explore by a policy that does not see what is hidden, and learn from what the world answers (Tier 2, Algorithm 1)."
+    " The printed lines learn from your log of exploration alone; trials in which the agent itself acts do better.",
+    "deconfounded.train(trials, explore, deconfounded.DeconfoundedConfig(), np.random.default_rng(0))",
+)
+QUERY = Next(
+    "Ask the expert for its actions in states that the clone visits (Tier 3).",
+    "dagger.train(query, dagger.DaggerConfig(), np.random.default_rng(0))",
+)
+EXPLORE_FIRST = Next(
+    "Explore a little, by a memoryless clone with some random actions (deconf/diagnosis/exploration.py), and diagnose"
+    " again; or try Tier 1, Algorithm 3, which needs no more data.",
+    "deconfounded_offline.train(trials, deconfounded_offline.OfflineConfig(), np.random.default_rng(0))",
+)
+VARY_LATENT = Next("Record trials under other conditions too, and diagnose again.")
+EXPLORE_MORE = Next(
+    "Explore more, where the expert goes, by any policy that does not see what is hidden, and diagnose again."
+)
+MORE_TRIALS = Next("Record more trials of the same kind, and diagnose again.")

@@ -1,0 +1,297 @@
+"""The verdict on figures of several splits of the trials, with its reasons."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from deconfounded.deconf.diagnosis.advice import (
+    CLONE,
+    CLONE_HABITS,
+    EXPLORE,
+    EXPLORE_FIRST,
+    EXPLORE_MORE,
+    HEADLINES,
+    IF_WRONG,
+    MORE_TRIALS,
+    QUERY,
+    VARY_LATENT,
+    Next,
+    Verdict,
+)
+from deconfounded.deconf.diagnosis.measures import Findings
+from deconfounded.deconf.diagnosis.thresholds import (
+    DIFFERS,
+    GOOD,
+    MAX_MODEL_DEVIATION,
+    MEMORISED,
+    MISFIT,
+    NEGLIGIBLE,
+    NO_EVIDENCE,
+    NO_LOSS,
+    SMALL_GAP,
+    STAKES,
+    TRAIT_SHARE,
+    TRAIT_STAKES,
+)
+from deconfounded.envs.support.errors import InputError
+
+PASSING = (
+    "Past actions tell a clone of the expert's next one, but what they tell passes, and is not in the world: pauses,"
+    " noise that lasts, or a memory of the expert's own. A clone that goes by its own past actions loses nothing by it."
+)
+
+
+class Figure(NamedTuple):
+    """The mean over refits, and their range."""
+
+    value: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(refits: Sequence[float]) -> "Figure":
+        """The figure of the refits' values."""
+        return Figure(sum(refits) / len(refits), min(refits), max(refits))
+
+    def __format__(self, spec: str) -> str:
+        """With `%`, in percent."""
+        if spec == "%":
+            return f"{self.value:.0%} ({self.low:.0%} to {self.high:.0%})"
+        return str(self)
+
+    def __str__(self) -> str:
+        return f"{self.value:.2g} ({self.low:.2g} to {self.high:.2g})"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.
+
+    found, cost, sure, wrong: plain sentences on what was found, what it costs, how sure that is, and what a wrong
+    verdict would look like. `reasons` have the figures. Figures are those of Findings, and three more. `gap`: the
+    predicted loss by naive cloning, in scores by paired deviation; `gap_by_actions`: by Eq. (1); `ratio`: the evidence
+    of actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone.
+    """
+
+    verdict: Verdict
+    figures: dict[str, Figure]
+    reasons: tuple[str, ...]
+    tier: int | None
+    next: Next
+    found: str = ""
+    agreeing: int = 0
+    refits: int = 0
+
+    @property
+    def headline(self) -> str:
+        """A title."""
+        return HEADLINES[self.verdict]
+
+    @property
+    def cost(self) -> str:
+        """What cloning would cost."""
+        if self.verdict == "cannot tell" or self.tier == 3:
+            return "Not known from these data."
+        if self.verdict != "confounded":
+            return "Next to nothing, as far as the learned model of your system shows."
+        naive, latent = (self.figures[key] for key in ("naive", "latent"))
+        lost, rest = (Figure(1 - x.value, 1 - x.high, 1 - x.low) for x in (naive, latent))
+        return (
+            f"In the learned model of your system, a clone with a memory goes astray by {lost:%} of what an expert"
+            f" would who takes the hidden thing for another; one that infers it from what the world does by {rest:%}. The"
+            " latter is what is possible in the model, not what a trained agent is promised to reach."
+        )
+
+    @property
+    def sure(self) -> str:
+        """How sure the verdict is."""
+        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone."
+        if self.verdict == "cannot tell":
+            return text
+        if self.agreeing < self.refits:
+            return f"Not very: {text}"
+        return f"Fairly: {text} They share most of their data and the same kind of model, so that this is no proof."
+
+    @property
+    def wrong(self) -> str:
+        """What a wrong verdict would look like; empty if there is none."""
+        text = IF_WRONG.get((self.verdict, self.tier))
+        return f"If this is wrong, {text}" if text else ""
+
+
+def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
+    """The verdict, and why. explored: trials of exploration. Raises InputError if a figure is not finite."""
+    diagnosis = _judge(refits, explored)
+    alone = [_judge([refit], explored) for refit in refits] if len(refits) > 1 else [diagnosis]
+    agreeing = sum((one.verdict, one.tier) == (diagnosis.verdict, diagnosis.tier) for one in alone)
+    return replace(diagnosis, agreeing=agreeing, refits=len(refits))
+
+
+def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
+    """Figures of Diagnosis; those of traits only if all refits have them."""
+    figures = {}
+    for key, column in zip(Findings._fields, zip(*refits, strict=True), strict=True):
+        values = [value for value in column if value is not None]
+        if not np.isfinite(values).all():
+            raise InputError(f"learning failed: {key} is {values}; are there outliers, or scales that differ a lot?")
+        if len(values) == len(refits):
+            figures[key] = Figure.of(values)
+    figures["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])
+    figures["gap_by_actions"] = Figure.of([refit.latent_by_actions - refit.naive_by_actions for refit in refits])
+    if "exploration_evidence" in figures:
+        ratios = [(refit.action_evidence or 0.0) / max(refit.expert_evidence or 0.0, NO_EVIDENCE) for refit in refits]
+        figures["ratio"] = Figure.of(ratios)
+    return figures
+
+
+def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
+    figures = _figures(refits)
+    names = ("memory_gain", "stakes", "paired_stakes", "model_deviation", "naive", "latent", "gap", "gap_by_actions")
+    memory, stakes, paired, model, naive, latent, gap, by_actions = (figures[name] for name in names)
+    in_exploration = figures.get("exploration_evidence")
+    at_stake = any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, paired))
+    harmless = max(stakes.high, paired.high) < STAKES and model.value < MAX_MODEL_DEVIATION
+    reasons = [
+        f"A memory improves the prediction of the expert's action by {memory} nats a step over the present observation."
+    ]
+
+    def conclude(verdict: Verdict, tier: int | None, found: str, advice: Next) -> Diagnosis:
+        return Diagnosis(verdict, figures, tuple(reasons), tier, advice, found)
+
+    def more_exploration(found: str) -> Diagnosis:
+        had = "" if explored is None else f" You have {explored} trials of it."
+        return conclude("cannot tell", None, found + had, EXPLORE_MORE)
+
+    if memory.low < -MISFIT:
+        found = "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
+        return conclude("cannot tell", None, found, MORE_TRIALS)
+    unused = in_exploration is not None and figures["latent_gain"].low > max(memory.high, 0) + NEGLIGIBLE
+    if memory.low <= NEGLIGIBLE and not unused:
+        if memory.high > NEGLIGIBLE:
+            return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
+        if in_exploration is not None and min(in_exploration.low, figures["expert_evidence"].low) > DIFFERS:
+            reasons.append(_rollouts(figures))
+            if at_stake and max(gap.low, by_actions.low) > SMALL_GAP and figures["latent_gain"].low > 0:
+                found = (
+                    "Your system differs from trial to trial, and the expert seems to act on it: the clone with a"
+                    " memory found nothing of that in the logs, and would lose by it."
+                )
+                return conclude("cannot tell", None, found, MORE_TRIALS)
+            found = (
+                "Your system differs from trial to trial, but past actions tell a clone nothing of the expert's next"
+                " one that the present observation does not."
+            )
+            return conclude("not confounded", 1, found, CLONE)
+        found = (
+            "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. Under these"
+            " conditions a clone misses nothing; about others the trials say nothing."
+        )
+        return conclude("cannot tell", None, found, VARY_LATENT)
+    reasons.append(_rollouts(figures))
+    if in_exploration is None:
+        found = (
+            "Past actions tell a clone more of the expert's next one than the present observation. Whether the world"
+            " would tell it too cannot be seen in expert trials alone: they hold nearly one action for each"
+            " observation, so that effects of the action and of what is hidden cannot be separated."
+        )
+        return conclude("cannot tell", None, found, EXPLORE_FIRST)
+    in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
+    reasons.append(_evidence(figures))
+    if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
+        return _silent(figures, conclude, more_exploration)
+    if in_trials.low <= NO_EVIDENCE:
+        return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")
+    if harmless and gain.low > 0:
+        found = (
+            "Something is hidden that the expert acts on, but where trials go hardly depends on it: acting on another"
+            " value of it would change next to nothing."
+        )
+        return conclude("not confounded", 1, found, CLONE)
+    if (harmless and gain.high < NEGLIGIBLE) or (min(naive.low, latent.low) > NO_LOSS and not unused):
+        return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
+    if not at_stake:
+        return more_exploration(
+            "What is hidden hardly matters for where trials go, or the learned model of your system is poor where it"
+            " does."
+        )
+    if gain.high <= 0:
+        return more_exploration("What the world tells does not yet explain any of the expert's actions.")
+    if naive.low > GOOD and max(gap.high, by_actions.high) < SMALL_GAP:
+        found = "Something is hidden, and the clone with a memory infers it by itself."
+        return conclude("not confounded", 1, found, CLONE)
+    if unused:
+        found = (
+            "The world tells more of the expert's actions than the clone's memory makes use of: it did not learn what"
+            " it could."
+        )
+        return conclude("cannot tell", None, found, MORE_TRIALS)
+    if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
+        found = "Something is hidden; whether a clone loses by it is not clear."
+        return conclude("cannot tell", None, found, MORE_TRIALS)
+    found = (
+        "The expert acts on something that your columns do not show. A clone with a memory takes its own past actions"
+        " for evidence of it, though it chose them itself; what the world does would tell."
+    )
+    return conclude("confounded", 2, found, EXPLORE)
+
+
+def _silent(
+    figures: dict[str, Figure],
+    conclude: Callable[[Verdict, int | None, str, Next], Diagnosis],
+    more_exploration: Callable[[str], Diagnosis],
+) -> Diagnosis:
+    """The verdict where the dynamics of expert trials say nothing, and explain nothing: see `trait.py`."""
+    memory, evidence = figures["memory_gain"], figures["exploration_evidence"]
+    differ = figures.get("dynamics_differ")
+    if evidence.high >= NEGLIGIBLE or differ is None or differ.high > 0:
+        return more_exploration(
+            "Trials seem to differ in what actions do, but not enough was explored to say what it tells of the expert's"
+            " actions."
+        )
+    if figures["exploration_fit"].value - evidence.value > MEMORISED:
+        return more_exploration("The model of your system learned its trials by heart: there are too few of them.")
+    gain = figures.get("trait_gain")
+    if gain is None:
+        return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
+    if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):
+        return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
+    if max(figures["trait_stakes"].high, figures["paired_trait_stakes"].high) < TRAIT_STAKES:
+        found = (
+            "Experts act in ways of their own, which last for a trial, but where trials go hardly depends on them, and"
+            " the world tells nothing of them: habits, rather than anything hidden in your system."
+        )
+        return conclude("nothing at stake", 1, found, CLONE_HABITS)
+    if gain.low < max(NEGLIGIBLE, TRAIT_SHARE * memory.high) or figures["paired_trait_stakes"].low < TRAIT_STAKES:
+        found = "Whether experts differ by goals that only they see, or by habits, is not clear."
+        return conclude("cannot tell", None, found, MORE_TRIALS)
+    found = (
+        "The expert goes elsewhere in different trials, by something that only it sees, and the world tells nothing of"
+        " it, with or without exploration. If where it goes is a matter of taste, nothing is lost: any clone's way is"
+        " right. Otherwise only the expert, or a sensor, can tell."
+    )
+    return conclude("confounded", 3, found, QUERY)
+
+
+def _rollouts(figures: dict[str, Figure]) -> str:
+    names = ("stakes", "paired_stakes", "naive", "latent", "naive_by_actions", "latent_by_actions")
+    stakes, paired, naive, latent, *by_actions = (figures[name] for name in names)
+    return (
+        "In rollouts in the learned dynamics, trajectories of an expert policy given a wrong latent deviate from those"
+        f" given right ones {stakes} times as much as by chance, and {paired} times as much when paired by latent and"
+        f" start. From 0 for the wrong latent to 1 for the right one, a naive clone scores {naive} by trajectories, and"
+        f" a policy that infers the latent from the dynamics {latent}; by actions, Eq. (1), {by_actions[0]} and"
+        f" {by_actions[1]}."
+    )
+
+
+def _evidence(figures: dict[str, Figure]) -> str:
+    names = ("exploration_evidence", "expert_evidence", "latent_gain", "action_evidence", "ratio")
+    in_exploration, in_trials, gain, in_actions, ratio = (figures[name] for name in names)
+    return (
+        f"The dynamics are evidence of the latent, by {in_exploration} nats a step in exploration and {in_trials} in"
+        f" expert trials; the latent inferred from them improves the prediction of the expert's actions by {gain} over"
+        f" latents of other trials. The actions are evidence of it by {in_actions} nats a step: {ratio} times as much,"
+        " for a clone that takes its own actions for the expert's."
+    )

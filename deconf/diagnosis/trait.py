@@ -1,0 +1,104 @@
+"""A trait of the expert that is constant in a trial, inferred from one half of it by actions, and shown in the other.
+
+Where the dynamics tell nothing, it separates what a memory predicts of a trial as a whole (a goal that only the expert
+sees, or an operator's habits) from what passes: pauses, noise that lasts, an expert's own memory.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
+from deconfounded.deconf.diagnosis.latent import typical
+from deconfounded.deconf.diagnosis.learned_env import LatentPolicy
+from deconfounded.deconf.equations import imitation_loss
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+
+TRAIT, TRIALS, STEPS = 4, 32, 64  # dimensions; trials of an update, and steps of each half of them
+NOISE = 0.3  # of traits in training, so that they do not name trials
+
+
+class Trait(NamedTuple):
+    """A policy given a trait, traits [1, B, D] of the trials of training, and its gain in held-out ones.
+
+    gain: log-likelihood of the actions of their second half, given the trait of the first, over the present observation
+    alone; nats a step.
+    """
+
+    policy: ActionHead
+    traits: Tensor
+    gain: float
+
+
+class Encoder(nn.Module):
+    """The mean of features of a trial's steps, observation and action, as a trait."""
+
+    def __init__(self, width: int, scales: Scales, draws: Draws) -> None:
+        super().__init__()
+        self.inputs = Inputs(scales)
+        self.step = Mlp(self.inputs.obs_width + self.inputs.action_width, width, width, draws)
+        self.out = Mlp(width, width, TRAIT, draws)
+
+    def forward(self, steps: Batch) -> Tensor:
+        """[S, B, T] -> [S, B, TRAIT]."""
+        x = self.step(torch.cat([self.inputs.obs(steps.obs), self.inputs.action(steps.action)], -1))
+        weight = steps.mask[..., None]
+        return self.out((x * weight).sum(2) / weight.sum(2).clamp(min=1))
+
+
+def halves(data: Batch) -> tuple[Batch, Batch]:
+    """The first half of the steps of each trial, and the second."""
+    early = data.mask.cumsum(-1) <= data.mask.sum(-1, keepdim=True) / 2
+    return tuple(replace(data, mask=data.mask * part) for part in (early, ~early))  # type: ignore[return-value]
+
+
+def _draw(data: Batch, draws: Draws) -> Batch:
+    """Random steps of each trial [S, B, STEPS], those that took place first."""
+    order = (draws.uniform(*data.mask.shape[1:]) + 2 * (1 - data.mask)).argsort(-1)[..., :STEPS]
+    index = order[..., None]
+    obs, action, next_obs = (x.gather(2, index.expand(-1, -1, -1, x.shape[-1])) for x in data.tensors[:3])
+    return Batch(obs, action, next_obs, data.mask.gather(2, order))
+
+
+def fit(
+    train: Batch, held_out: Batch, present: Tensor, signature: Signature, config: MemorylessConfig, draws: Draws
+) -> Trait:
+    """Train encoder and policy on halves of the trials, and measure the gain over `present` [1, B, T]."""
+    scales = Scales.of(signature, train)
+    encoder = Encoder(config.width, scales, draws)
+    policy = ActionHead(signature.obs + TRAIT, config.width, scales, draws)
+
+    def log_prob(steps: Batch, trait: Tensor) -> Tensor:
+        features = [scales.obs(steps.obs), trait[:, :, None].expand(-1, -1, steps.mask.shape[2], -1)]
+        return policy.log_prob(torch.cat(features, -1), steps.action)
+
+    optimizer = Adam([encoder, policy], config.learning_rate, config.updates)
+    for update in range(config.updates):
+        parts = [_draw(half, draws) for half in halves(train.draw_trials(TRIALS, draws))]
+        context, rest = parts if update % 2 else parts[::-1]
+        trait = encoder(context)
+        trait = trait + NOISE * draws.normal(*trait.shape[1:])
+        loss = imitation_loss(log_prob(rest, trait).flatten(1), rest.mask.flatten(1))
+        optimizer.step(loss + 1e-3 * trait.square().mean((1, 2)))
+    with torch.no_grad():
+        early, late = halves(held_out)
+        return Trait(policy, encoder(train), typical(log_prob(late, encoder(early)) - present, late))
+
+
+class TraitPolicy(LatentPolicy):
+    """A policy given traits [S, N, TRAIT], in dynamics under latents [S, N, D]; theta_hat holds both."""
+
+    def __init__(self, model: VariationalModel, policy: ActionHead, latent: Tensor, trait: Tensor) -> None:
+        super().__init__(model, policy, torch.cat([latent, trait], -1))
+
+    def features(self, obs: Tensor, latent: Tensor) -> Tensor:
+        return torch.cat([self.model.inputs.scales.obs(obs), latent[..., -TRAIT:]], -1)
+
+    def next_obs(self, obs: Tensor, action: Tensor, draws: Draws) -> Tensor:
+        return self.model.dynamics.sample(obs, action, self.theta_hat[..., :-TRAIT], draws)
