@@ -100,8 +100,8 @@ class Diagnosis:
         lost, rest = (Figure(1 - x.value, 1 - x.high, 1 - x.low) for x in (naive, latent))
         return (
             f"In the learned model of your system, a clone with a memory goes astray by {lost:%} of what an expert"
-            f" would who takes the hidden thing for another; one that infers it from what the world does by {rest:%}. The"
-            " latter is what is possible in the model, not what a trained agent is promised to reach."
+            f" would who takes the hidden thing for another; one that infers it from what the world does by {rest:%}."
+            " The latter is what is possible in the model, not what a trained agent is promised to reach."
         )
 
     @property

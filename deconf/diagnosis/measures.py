@@ -176,8 +176,8 @@ def measure(
 def _differ(expert: Trials, explore: Trials) -> float | None:
     """How much exploration trials differ in their dynamics, within the range of the expert's: see Findings."""
     low, high = (x[0].numpy() for x in valid_range(Batch.of(expert, 1)))
-    inside = np.logical_and(explore.obs >= low, explore.obs <= high).all(-1)[:, :, :-1] & explore.mask
-    near = Trials(explore.obs, explore.action, inside, explore.actions)
+    inside = np.asarray(explore.obs >= low) & np.asarray(explore.obs <= high)
+    near = Trials(explore.obs, explore.action, inside.all(-1)[:, :, :-1] & explore.mask, explore.actions)
     measured = fits.own_dynamics(near, fits.Steps.of(near))
     return None if measured is None else measured[0]
 
@@ -240,7 +240,9 @@ def _rollouts(
     scores = (excess_score(deviations - second_chance, mistake - chance) for deviations in others)
     shuffled = paths[torch.randperm(len(paths), generator=torch.Generator().manual_seed(0))]
     unlike = float(deviation(home, *shuffled.tensor_split(2)).mean())
-    return stakes, paired_stakes, unlike, *scores, *judged
+    naive, inferring = scores
+    naive_by_actions, inferring_by_actions = judged
+    return stakes, paired_stakes, unlike, naive, inferring, naive_by_actions, inferring_by_actions
 
 
 def draw_distant(latents: Tensor, index: Tensor, draws: Draws) -> Tensor:
