@@ -24,6 +24,9 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     made = {
         "verdict": diagnosis.verdict,
         "tier": diagnosis.tier,
+        "headline": diagnosis.headline,
+        **{key: getattr(diagnosis, key) for key in ("found", "cost", "sure", "wrong")},
+        "agreeing": diagnosis.agreeing,
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
         "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
@@ -33,7 +36,13 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     page = template("diagnosis.html.jinja").render(diagnosis=diagnosis, findings=findings, code=code, about=about)
     write_atomically(folder / "index.html", page + "\n")
     how = f"\n\n{code}" if code else ""
-    text = "\n".join([diagnosis.verdict.upper(), *diagnosis.reasons, f"Next: {diagnosis.next.advice}{how}"])
+    plain = {
+        "Found": diagnosis.found,
+        "Cost of cloning": diagnosis.cost,
+        "How sure": f"{diagnosis.sure} {diagnosis.wrong}".strip(),
+        "Next": f"{diagnosis.next.advice}{how}",
+    }
+    text = "\n".join([diagnosis.headline.upper(), *(f"{title}: {said}" for title, said in plain.items())])
     return f"{text}\n-> {folder / 'index.html'}"
 
 
@@ -86,9 +95,8 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
         gain = figure["latent_gain"]
         predictors["latent from dynamics"] = (gain, colour("interventional"))
         source = (
-            f"A latent that is inferred from the dynamics alone accounts for {gain} of it (below 0: it predicts"
-            " less well than the present observation). The rest is, for the most part, evidence of the expert's past"
-            " actions, and a clone's own actions are no evidence."
+            f"A latent that is inferred from the dynamics alone accounts for {gain} of it (0 or less: for none). The"
+            " rest is, for the most part, evidence of the expert's past actions, and a clone's own actions are no evidence."
         )
     sections = [
         (

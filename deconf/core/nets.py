@@ -14,6 +14,8 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear, Mlp
 
+HEAVY = 30.0  # excess kurtosis of labels: a normal distribution has 0, Laplace's 3
+
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to broadcast against tensors [S, ..., F]."""
@@ -49,6 +51,42 @@ class Scaler(nn.Module):
         return x * per_seed(self.std, x) + per_seed(self.mean, x)
 
 
+class LabelScaler(Scaler):
+    """Standardises labels; those with heavy tails by arcsinh about their median first, in units of their usual size.
+
+    Else a few large labels, of a bolus or a brake, set the unit, in which all others are a spike.
+    """
+
+    median: Tensor
+    size: Tensor
+    heavy: Tensor
+
+    def __init__(self, data: Tensor, mask: Tensor) -> None:
+        flat, kept = data.flatten(1, -2), mask.flatten(1) > 0
+        mean, variance = moments(data, mask)
+        fourth, _ = moments((data - per_seed(mean, data)).square().square(), mask)
+        median = torch.stack([x[steps].median(0).values for x, steps in zip(flat, kept, strict=True)])
+        distance = (flat - median[:, None]).abs()
+        usual = 1.48 * torch.stack([x[steps].median(0).values for x, steps in zip(distance, kept, strict=True)])
+        super().__init__(data, mask)
+        self.register_buffer("median", median)
+        self.register_buffer("size", torch.where(usual > 1e-6, usual, self.std))
+        self.register_buffer("heavy", (fourth > (3 + HEAVY) * variance.square()) & (variance > 1e-12))
+        bent = Scaler(self._bend(data), mask)
+        self.mean, self.std = (torch.where(self.heavy, x, y) for x, y in ((bent.mean, self.mean), (bent.std, self.std)))
+
+    def _bend(self, x: Tensor) -> Tensor:
+        return torch.asinh((x - per_seed(self.median, x)) / per_seed(self.size, x))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(torch.where(per_seed(self.heavy, x), self._bend(x), x))
+
+    def inverse(self, x: Tensor) -> Tensor:
+        flat = super().inverse(x)
+        raw = per_seed(self.median, x) + per_seed(self.size, x) * torch.sinh(flat)
+        return torch.where(per_seed(self.heavy, x), raw, flat)
+
+
 class Scales(nn.Module):
     """The kind of data, and how networks standardise it: observations, their changes in a step, actions and labels.
 
@@ -60,7 +98,7 @@ class Scales(nn.Module):
         super().__init__()
         self.signature = signature
         self.obs, self.change = Scaler(data.obs, data.mask), Scaler(data.next_obs - data.obs, data.mask)
-        self.action, self.label = Scaler(data.action, data.mask), Scaler(label, label_mask)
+        self.action, self.label = Scaler(data.action, data.mask), LabelScaler(label, label_mask)
 
     @staticmethod
     def of(signature: Signature, expert: Batch, explored: Batch | None = None) -> "Scales":

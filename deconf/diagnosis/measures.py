@@ -177,7 +177,7 @@ def _differ(expert: Trials, explore: Trials) -> float | None:
     """How much exploration trials differ in their dynamics, within the range of the expert's: see Findings."""
     low, high = (x[0].numpy() for x in valid_range(Batch.of(expert, 1)))
     inside = np.asarray(explore.obs >= low) & np.asarray(explore.obs <= high)
-    near = Trials(explore.obs, explore.action, inside.all(-1)[:, :, :-1] & explore.mask, explore.actions)
+    near = Trials(explore.obs, explore.action, inside[:, :, :-1].all(-1) & explore.mask, explore.actions)
     measured = fits.own_dynamics(near, fits.Steps.of(near))
     return None if measured is None else measured[0]
 

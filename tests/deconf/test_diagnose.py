@@ -11,8 +11,9 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import diagnose as command
 from deconfounded.benchmarks.console import run_command
-from deconfounded.deconf.diagnosis import diagnose, measures
+from deconfounded.deconf.diagnosis import advice, diagnose, measures
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
+from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
@@ -96,6 +97,8 @@ class TestBadInput:
 CLEAR = Findings(
     memory_gain=1.0,
     exploration_evidence=0.2,
+    exploration_fit=0.2,
+    dynamics_differ=0.5,
     expert_evidence=0.2,
     action_evidence=50.0,
     latent_gain=0.5,
@@ -108,7 +111,13 @@ CLEAR = Findings(
     latent_by_actions=0.8,
 )
 
-ALONE = dict.fromkeys(("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence"))
+NO_FIGURES = ("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence")
+ALONE = dict.fromkeys((*NO_FIGURES, "exploration_fit", "dynamics_differ"))
+SILENT = {
+    **{"exploration_evidence": 0.0, "exploration_fit": 0.0, "dynamics_differ": 0.0},
+    **{"expert_evidence": 0.05, "latent_gain": -0.1},
+    **{"trait_gain": 0.6, "trait_stakes": 2.0, "paired_trait_stakes": 5.0},
+}
 
 
 class TestJudge:
@@ -117,62 +126,78 @@ class TestJudge:
     @pytest.mark.parametrize(
         ("changes", "verdict", "tier", "then"),
         [
-            ({}, "confounded", 2, diagnose.EXPLORE),
-            (ALONE, "cannot tell", None, diagnose.EXPLORE_FIRST),
+            ({}, "confounded", 2, advice.EXPLORE),
+            (ALONE, "cannot tell", None, advice.EXPLORE_FIRST),
             (
                 {**ALONE, "stakes": 1.0, "paired_stakes": 1.0, "model_deviation": 1.0},
                 "cannot tell",
                 None,
-                diagnose.EXPLORE_FIRST,
+                advice.EXPLORE_FIRST,
             ),
-            ({"expert_evidence": 0.05, "latent_gain": -0.1}, "confounded", 3, diagnose.QUERY),
-            ({"expert_evidence": 0.05, "latent_gain": 0.05}, "confounded", 3, diagnose.QUERY),
-            ({"expert_evidence": 0.05}, "confounded", 2, diagnose.EXPLORE),
-            ({"latent_gain": -0.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"expert_evidence": -0.5}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"paired_stakes": 1.1}, "confounded", 2, diagnose.EXPLORE),
-            ({"stakes": 1.1, "paired_stakes": 1.4}, "not confounded", 1, diagnose.CLONE),
-            ({"stakes": 1.1, "paired_stakes": 1.4, "model_deviation": 5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"stakes": 1.1, "paired_stakes": 1.4, "latent_gain": -0.1}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"expert_evidence": -5.0, "latent_gain": -5.0}, "cannot tell", None, diagnose.EXPLORE_MORE),
-            ({"memory_gain": -1.0}, "cannot tell", None, diagnose.MORE_TRIALS),
-            ({"naive": 0.7, "latent": 0.75, "naive_by_actions": 0.75}, "cannot tell", None, diagnose.MORE_TRIALS),
-            ({"naive": 0.95, "latent": 1.0, "naive_by_actions": 0.75}, "not confounded", 1, diagnose.CLONE),
-            ({"naive": 0.95, "latent": 1.0}, "confounded", 2, diagnose.EXPLORE),
-            ({"memory_gain": 0.001}, "not confounded", 1, diagnose.CLONE),
-            ({"memory_gain": 0.001, "expert_evidence": -0.002}, "cannot tell", None, diagnose.VARY_LATENT),
-            ({"memory_gain": 0.001, **ALONE}, "cannot tell", None, diagnose.VARY_LATENT),
-            ({"latent": 0.1, "latent_by_actions": -0.2}, "cannot tell", None, diagnose.MORE_TRIALS),
+            (SILENT, "confounded", 3, advice.QUERY),
+            ({**SILENT, "latent_gain": 0.05}, "confounded", 3, advice.QUERY),
+            ({**SILENT, "dynamics_differ": 0.4}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({**SILENT, "exploration_evidence": 0.2}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({**SILENT, "exploration_fit": 0.2}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({**SILENT, "trait_gain": None}, "cannot tell", None, advice.MORE_TRIALS),
+            ({**SILENT, "trait_gain": 0.05}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({**SILENT, "trait_gain": 0.2}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({**SILENT, "paired_trait_stakes": 2.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"expert_evidence": 0.05}, "confounded", 2, advice.EXPLORE),
+            ({"latent_gain": -0.1}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({"naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"memory_gain": 0.0, "latent_gain": 0.05}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"memory_gain": 0.0, "latent_gain": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"memory_gain": 0.0, "latent_gain": -0.1}, "not confounded", 1, advice.CLONE),
+            ({"memory_gain": 0.0, "exploration_evidence": 0.0}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"expert_evidence": -0.5}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({"stakes": 1.1}, "confounded", 2, advice.EXPLORE),
+            ({"paired_stakes": 1.1}, "confounded", 2, advice.EXPLORE),
+            ({"stakes": 1.1, "paired_stakes": 1.4}, "not confounded", 1, advice.CLONE),
+            ({"stakes": 1.1, "paired_stakes": 1.4, "model_deviation": 5.0}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({"stakes": 1.1, "paired_stakes": 1.4, "latent_gain": -0.1}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"expert_evidence": -5.0, "latent_gain": -5.0}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({"memory_gain": -1.0}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"naive": 0.7, "latent": 0.75, "naive_by_actions": 0.75}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"naive": 0.95, "latent": 1.0, "naive_by_actions": 0.75}, "not confounded", 1, advice.CLONE),
+            ({"naive": 0.95, "latent": 1.0}, "confounded", 2, advice.EXPLORE),
+            (
+                {"memory_gain": 0.001, "latent_gain": 0.0, "expert_evidence": -0.002},
+                "cannot tell",
+                None,
+                advice.VARY_LATENT,
+            ),
+            ({"memory_gain": 0.001, **ALONE}, "cannot tell", None, advice.VARY_LATENT),
+            ({"latent": 0.1, "latent_by_actions": -0.2}, "cannot tell", None, advice.MORE_TRIALS),
         ],
     )
-    def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: diagnose.Next) -> None:
-        diagnosis = diagnose.judge([CLEAR._replace(**changes)] * 3)
+    def test_verdict(self, changes: dict, verdict: str, tier: int | None, then: advice.Next) -> None:
+        diagnosis = judge([CLEAR._replace(**changes)] * 3)
         assert (diagnosis.verdict, diagnosis.tier, diagnosis.next) == (verdict, tier, then)
 
     def test_refits_that_disagree(self) -> None:
         """No confident verdict where refits lie on both sides of what decides."""
-        assert diagnose.judge([CLEAR, CLEAR._replace(memory_gain=0.0)]).verdict == "cannot tell"
-        assert diagnose.judge([CLEAR, CLEAR._replace(latent=0.1, latent_by_actions=-0.2)]).verdict == "cannot tell"
-        assert diagnose.judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
-        assert diagnose.judge([CLEAR, CLEAR._replace(expert_evidence=-0.002)]).verdict == "cannot tell"
-        mixed = CLEAR._replace(expert_evidence=0.05, latent_gain=-0.1)
-        assert diagnose.judge([mixed, mixed]).tier == 3
-        assert diagnose.judge([mixed, mixed._replace(latent_gain=0.2)]).tier == 2
+        assert judge([CLEAR, CLEAR._replace(memory_gain=0.0)]).verdict == "cannot tell"
+        assert judge([CLEAR, CLEAR._replace(latent=0.1, latent_by_actions=-0.2)]).verdict == "cannot tell"
+        assert judge([CLEAR._replace(naive=0.5), CLEAR._replace(latent=0.4)]).verdict == "confounded"
+        assert judge([CLEAR, CLEAR._replace(expert_evidence=-0.002)]).verdict == "cannot tell"
+        mixed = CLEAR._replace(**SILENT)
+        assert judge([mixed, mixed]).tier == 3
+        assert judge([mixed, mixed._replace(trait_gain=0.05)]).verdict == "cannot tell"
         alike = CLEAR._replace(paired_stakes=1.4)
-        assert diagnose.judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
-        assert diagnose.judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
+        assert judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
+        assert judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
-            diagnose.judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
+            judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
 
     def test_figures(self) -> None:
         """The mean over refits, the least, and the most of them."""
-        figures = diagnose.judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, expert_evidence=0.5)]).figures
+        figures = judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, expert_evidence=0.5)]).figures
         assert figures["naive"] == pytest.approx((0.3, 0.2, 0.5))
         assert figures["ratio"] == pytest.approx((200, 100, 250))
-        assert "exploration_evidence" not in diagnose.judge([CLEAR._replace(**ALONE)]).figures
+        assert "exploration_evidence" not in judge([CLEAR._replace(**ALONE)]).figures
 
 
 def _bandit(n: int = 24) -> tuple[Trials, Trials]:
@@ -189,9 +214,9 @@ def test_measures(make) -> None:
     expert, explored = make()
     first, second = (measures.measure(expert, explored, TINY, np.random.default_rng(0)) for _ in range(2))
     assert first == second
-    assert np.isfinite(first).all()
+    assert np.isfinite([value for value in first if value is not None]).all()
     alone = measures.measure(expert, None, TINY, np.random.default_rng(0))
-    assert {alone.latent_gain, alone.exploration_evidence, alone.expert_evidence, alone.action_evidence} == {None}
+    assert {getattr(alone, name) for name in ALONE} == {None}
     assert np.isfinite([alone.memory_gain, alone.stakes, alone.naive, alone.latent]).all()
 
 
@@ -224,10 +249,14 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     command.main()
     first = capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
-    assert written["verdict"].upper() in first
-    assert set(written["figures"]) == {*Findings._fields, "gap", "gap_by_actions", "ratio"}
+    assert advice.HEADLINES[written["verdict"]].upper() in first
+    assert set(written["figures"]) >= {*Findings._fields[:-3], "gap", "gap_by_actions", "ratio"}
     page = (tmp_path / "out" / "index.html").read_text()
-    assert written["reasons"][0] in html.unescape(page)
+    unfolded, _, folded = html.unescape(page).partition("<details>")
+    for key in ("headline", "found", "cost", "sure", "wrong"):
+        assert written[key] in unfolded
+    assert not re.search(r"nats|Tier|Eq\.", unfolded.partition("A look at the data")[0].partition("What to do")[0])
+    assert written["reasons"][0] in folded
     assert not re.search(r"(src|href)=\"(?!data:)", page)
     assert first.count("measured in") == 2
     command.main()
