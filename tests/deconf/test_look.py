@@ -15,7 +15,7 @@ from deconfounded.benchmarks import look as look_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
-from deconfounded.deconf.diagnosis.judgement import Diagnosis
+from deconfounded.deconf.diagnosis import diagnose, judgement
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.methods import deconfounded, naive_rnn
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
@@ -234,8 +234,8 @@ def test_from_csv_to_a_verdict(
 ) -> None:
     """In one command; a look comes first, in print, page and json; and the lines that it prints run as they stand."""
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
-    judge = diagnose.judge
-    monkeypatch.setattr(diagnose, "judge", lambda refits: replace(judge(refits), next=advices.EXPLORE))
+    judge = judgement.judge
+    monkeypatch.setattr(judgement, "judge", lambda *given: replace(judge(*given), next=advices.EXPLORE))
     monkeypatch.chdir(tmp_path)
     short = driven()
     short = Trials(short.obs[:24, :, :9], short.action[:24, :, :8], short.mask[:24, :, :8])
@@ -265,7 +265,7 @@ def test_from_csv_to_a_verdict(
     assert (tmp_path / "agent" / "agent.json").is_file()
 
 
-@pytest.mark.parametrize("advice", [advices.CLONE, advices.EXPLORE_FIRST, advices.QUERY])
+@pytest.mark.parametrize("advice", [advices.CLONE, advices.CLONE_HABITS, advices.EXPLORE_FIRST, advices.QUERY])
 def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an .npz too; what only the user can write says so."""
     from deconfounded.benchmarks.output.diagnosis import _code
@@ -279,7 +279,7 @@ def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(naive_rnn, "RecurrentConfig", lambda: RecurrentConfig(updates=1, batch=2))
     few = OfflineConfig(offline_updates=1, online_updates=0, offline_batch=2)
     monkeypatch.setattr(deconfounded_offline, "OfflineConfig", lambda: few)
-    code = _code(Diagnosis("cannot tell", {}, (), None, advice), about)
+    code = _code(judgement.Diagnosis("cannot tell", {}, (), None, advice), about)
     if advice is advices.QUERY:
         assert WRITTEN["query"] in code
         with pytest.raises(NotImplementedError, match="ask the expert"):
