@@ -96,7 +96,8 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
         predictors["latent from dynamics"] = (gain, colour("interventional"))
         source = (
             f"A latent that is inferred from the dynamics alone accounts for {gain} of it (0 or less: for none). The"
-            " rest is, for the most part, evidence of the expert's past actions, and a clone's own actions are no evidence."
+            " rest is, for the most part, evidence of the expert's past actions, and a clone's own actions are no"
+            " evidence."
         )
     sections = [
         (

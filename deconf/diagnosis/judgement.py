@@ -199,7 +199,10 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         return conclude("cannot tell", None, found, EXPLORE_FIRST)
     in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(_evidence(figures))
-    if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
+    differ = figures.get("dynamics_differ")
+    nowhere = in_exploration.high < DIFFERS and differ is not None and differ.high == 0
+    if max(-in_trials.low, in_trials.value) < NEGLIGIBLE and (nowhere or gain.high < NEGLIGIBLE):
+        # what a latent explains where the dynamics differ nowhere is where its trial went
         return _silent(figures, conclude, more_exploration)
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")

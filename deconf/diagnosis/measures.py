@@ -96,7 +96,7 @@ class Findings(NamedTuple):
     naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
     are None, and the latent explains actions too, Eq. (7).
 
-    Only where a memory gains and the dynamics explain next to none of it, others are None: trait_gain, the gain by a
+    Only where a memory gains and the dynamics of expert trials say next to nothing, others are not None: trait_gain, the gain by a
     trait of the trial that is inferred from the actions of its other half (`trait.py`), and the stakes of the trait.
     """
 
@@ -164,7 +164,7 @@ def measure(
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else _differ(trials, explore)
     found = Findings(memory, *in_dynamics, explanation.action_evidence, explanation.exploration_fit, differ, *rollouts)
-    if memory > CLEAR and max(in_dynamics[0] or 0.0, in_dynamics[2] or 0.0) < CLEAR and explore is not None:
+    if explore is not None and memory > CLEAR and (explanation.expert_evidence or 0.0) < CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, present, Signature.of(train), amounts.cloning, draws)
         stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)

@@ -1,13 +1,16 @@
-"""Verdicts on small worlds: what is confounded, and what only looks like it, each trained on and judged."""
+"""Verdicts on small worlds: what is confounded, and what only looks like it; each is trained on, and judged."""
 
-from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
-from deconfounded.deconf.diagnosis import judgement, measures
+from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.nets import LabelScaler, Scaler
+from deconfounded.deconf.diagnosis import judgement, latent, measures
 from deconfounded.deconf.diagnosis.judgement import Diagnosis
-from deconfounded.deconf.diagnosis.measures import Amounts, Findings
+from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
@@ -20,48 +23,120 @@ SMALL = Amounts(
     naive=RecurrentConfig(updates=250, width=32),
     exploring=DeconfoundedConfig(inference_updates=400, inference_rate=3e-3, width=32, latent=2),
 )
-STEPS, NOISE = 40, 0.1
+NOISE = 0.1
 
 
 def world(kind: str, n: int, seed: int, explores: bool = False) -> Trials:
-    """A point is to be held at 0: s' = s + a / 2 + push + noise; explorers add random actions to a blind controller.
+    """A point on a line is to be held at 0: s' = s + a / 2 + push + noise. Explorers act at random about a controller.
 
-    kind, what is hidden or only looks so. wind: a push, constant in a trial, which the expert leans against; goal: the
-    point, 1 to either side, at which only the expert aims; habits: the experts' gains, 1.2 to 1.8; ar1: noise of the
-    expert that lasts; memory: an integral that it keeps; pause: it rests for 0 to 15 steps at first; idle: nothing.
+    kind, what is hidden or only looks so. wind: a push, constant in a trial, which the expert leans against; goal: +-1,
+    to which the expert goes, in four episodes; habits: gains of experts, .3 to 1.7; ar1: noise of the expert that
+    lasts; memory: an integral that it keeps; pause: it rests for 0 to 15 steps at first; idle: nothing.
     """
     rng = np.random.default_rng(seed)
-    theta = rng.uniform(-1, 1, n)
-    gain = 1.5 + 0.3 * theta * (kind == "habits")
-    push = 0.2 * theta * (kind == "wind")
-    goal = np.sign(theta) * (kind == "goal")
-    start = rng.integers(0, 16, n) * (kind == "pause")
-    kept, s = np.zeros(n), rng.normal(0, 0.3, n) + (kind == "pause")
-    obs, actions = [s], []
-    for t in range(STEPS):
-        noise = rng.normal(0, 0.05, n)
-        if explores:
-            act = -s + rng.uniform(-1, 1, n) + (rng.choice([-0.7, 0.7], n) if kind == "goal" else 0)
-        else:
+    theta, episodes, steps = rng.uniform(-1, 1, n), 4 if kind == "goal" else 1, 10 if kind == "goal" else 40
+    push, goal = 0.2 * theta * (kind == "wind"), np.sign(theta) * (kind == "goal")
+    gain, kept, start = 1 + 0.7 * theta * (kind == "habits"), np.zeros(n), rng.integers(0, 16, n) * (kind == "pause")
+    obs, actions = np.zeros((n, episodes, steps + 1, 1)), np.zeros((n, episodes, steps, 1))
+    for e in range(episodes):
+        s = rng.normal(kind == "pause", 0.3, n)
+        for t in range(steps):
             if kind == "ar1":
                 kept = 0.95 * kept + rng.normal(0, 0.06, n)
             elif kind == "memory":
-                kept = 0.9 * kept - 0.15 * s
-            act = gain * (goal - s) / 1.5 - 2 * push + kept + noise
-            act = np.where(t < start, noise / 5, act)
-        act = act.clip(-1, 1)
-        moved = s + act / 2 + push + NOISE * rng.standard_normal(n)
-        s = np.where((t < start) & (not explores), s, moved)
-        obs.append(s)
-        actions.append(act)
-    return Trials(
-        np.stack(obs, -1)[:, None, :, None], np.stack(actions, -1)[:, None, :, None], np.ones((n, 1, STEPS), bool)
-    )
+                kept = 0.95 * kept - 0.2 * s
+            act = (gain * (goal - s)).clip(-0.4, 0.4) - 2 * push + kept + rng.normal(0, 0.05, n)
+            if explores:
+                act = rng.uniform(-1, 1, n) - s + rng.choice([-0.5, 0.5], n) * (kind == "goal")
+            rests = (t < start) & (not explores)
+            act = np.where(rests, 0.02 * rng.standard_normal(n), act).clip(-1, 1)
+            obs[:, e, t, 0], actions[:, e, t, 0] = s, act
+            s = np.where(rests, s, s + act / 2 + push + NOISE * rng.standard_normal(n))
+        obs[:, e, steps, 0] = s
+    return Trials(obs, actions, np.ones((n, episodes, steps), bool))
 
 
-def found(trials: Trials, explored: Trials) -> Findings:
-    return measures.measure(trials, explored, SMALL, np.random.default_rng(0))
+@cache
+def diagnosed(kind: str, explored: int = 96, unit: float = 1.0) -> Diagnosis:
+    """unit: that of the expert's and the explorers' actions."""
+    expert, exploration = world(kind, 96, 0), world(kind, explored, 1, explores=True)
+    logs = (Trials(x.obs, unit * x.action, x.mask) for x in (expert, exploration))
+    return judgement.judge([measures.measure(*logs, SMALL, np.random.default_rng(0))], explored)
 
 
-def diagnosed(kind: str, n: int = 96, explored: int = 96) -> Diagnosis:
-    return judgement.judge([found(world(kind, n, 0), world(kind, explored, 1, explores=True))], explored)
+@pytest.mark.slow
+def test_wind_is_confounded() -> None:
+    diagnosis = diagnosed("wind")
+    assert (diagnosis.verdict, diagnosis.tier) == ("confounded", 2)
+
+
+@pytest.mark.slow
+def test_units_do_not_decide() -> None:
+    """The same logs with actions in a unit fifty times as large: the same verdict, and memory in nats."""
+    diagnosis, scaled = diagnosed("wind"), diagnosed("wind", unit=0.02)
+    assert (scaled.verdict, scaled.tier) == (diagnosis.verdict, diagnosis.tier)
+    assert scaled.figures["memory_gain"].value == pytest.approx(diagnosis.figures["memory_gain"].value, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ar1", "memory", "pause", "habits"])
+def test_nothing_at_stake(kind: str) -> None:
+    """Past actions predict, and nothing is lost by going by them."""
+    diagnosis = diagnosed(kind)
+    assert diagnosis.figures["memory_gain"].value > 0.1
+    assert diagnosis.verdict == "nothing at stake"
+    assert diagnosis.headline == "Past actions predict, nothing is at stake"
+
+
+@pytest.mark.slow
+def test_nothing_hidden() -> None:
+    diagnosis = diagnosed("idle")
+    assert diagnosis.verdict == "cannot tell"
+    assert "differs from trial to trial" not in diagnosis.found
+
+
+@pytest.mark.slow
+def test_tier_3_for_a_goal_that_the_world_does_not_tell() -> None:
+    assert (diagnosed("goal").verdict, diagnosed("goal").tier) == ("confounded", 3)
+
+
+@pytest.mark.slow
+def test_too_little_exploration_is_no_tier_3() -> None:
+    diagnosis = diagnosed("wind", explored=24)
+    assert diagnosis.tier != 3
+    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.found
+
+
+def test_one_trial_does_not_own_a_likelihood() -> None:
+    """A fall in one of forty, a thousand nats, moves what is typical by less than the others' spread."""
+    log_prob = torch.randn(1, 40, 10, generator=torch.Generator().manual_seed(0))
+    batch = Batch(*(torch.zeros(1, 40, 10, 1) for _ in range(3)), torch.ones(1, 40, 10))
+    before = latent.typical(log_prob, batch)
+    log_prob[0, 7] -= 1000
+    assert latent.typical(log_prob, batch) == pytest.approx(before, abs=0.05)
+
+
+class TestHeavyTails:
+    """A bolus now and then, among labels of usual size."""
+
+    x = torch.randn(1, 50, 20, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([0.01, 1.0])
+    x[0, ::10, 3, 0] = 0.9
+    mask = torch.ones(1, 50, 20)
+
+    def test_the_usual_is_no_spike(self) -> None:
+        usual = self.x[0, 1:10].flatten(0, 1)[:, 0]
+        assert (LabelScaler(self.x, self.mask)(self.x)[0, 1:10, :, 0].std() / usual.std()).item() > 50
+        assert Scaler(self.x, self.mask)(self.x)[0, 1:10, :, 0].std() < 0.2
+
+    def test_inverse(self) -> None:
+        scaler = LabelScaler(self.x, self.mask)
+        torch.testing.assert_close(scaler.inverse(scaler(self.x)), self.x, rtol=1e-4, atol=1e-5)
+
+    def test_other_columns_stay(self) -> None:
+        bent, plain = (kind(self.x, self.mask)(self.x) for kind in (LabelScaler, Scaler))
+        assert torch.equal(bent[..., 1], plain[..., 1])
+
+    def test_units(self) -> None:
+        other = 50 * self.x - 3
+        pair = LabelScaler(self.x, self.mask)(self.x), LabelScaler(other, self.mask)(other)
+        torch.testing.assert_close(*pair, rtol=1e-2, atol=1e-2)
