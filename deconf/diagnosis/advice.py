@@ -29,6 +29,11 @@ IF_WRONG: dict[tuple[Verdict, int | None], str] = {
 }
 """By verdict and tier: 'If this is wrong, ...'."""
 
+PASSING = (
+    "Past actions tell a clone of the expert's next one, but what they tell passes, and is not in the world: pauses,"
+    " noise that lasts, or a memory of the expert's own. A clone that goes by its own past actions loses nothing by it."
+)
+
 
 class Next(NamedTuple):
     """What to do, and a line of Python that does it with `trials`; explore and query are the user's functions."""

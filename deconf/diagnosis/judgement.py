@@ -15,6 +15,7 @@ from deconfounded.deconf.diagnosis.advice import (
     HEADLINES,
     IF_WRONG,
     MORE_TRIALS,
+    PASSING,
     QUERY,
     VARY_LATENT,
     Next,
@@ -36,11 +37,6 @@ from deconfounded.deconf.diagnosis.thresholds import (
     TRAIT_STAKES,
 )
 from deconfounded.envs.support.errors import InputError
-
-PASSING = (
-    "Past actions tell a clone of the expert's next one, but what they tell passes, and is not in the world: pauses,"
-    " noise that lasts, or a memory of the expert's own. A clone that goes by its own past actions loses nothing by it."
-)
 
 
 class Figure(NamedTuple):
@@ -199,10 +195,9 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         return conclude("cannot tell", None, found, EXPLORE_FIRST)
     in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(_evidence(figures))
-    differ = figures.get("dynamics_differ")
+    differ, said = figures.get("dynamics_differ"), max(-in_trials.low, in_trials.value)
     nowhere = in_exploration.high < DIFFERS and differ is not None and differ.high == 0
-    if max(-in_trials.low, in_trials.value) < NEGLIGIBLE and (nowhere or gain.high < NEGLIGIBLE):
-        # what a latent explains where the dynamics differ nowhere is where its trial went
+    if said < NEGLIGIBLE and (nowhere or gain.high < NEGLIGIBLE):  # any gain is then from where a trial went
         return _silent(figures, conclude, more_exploration)
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")

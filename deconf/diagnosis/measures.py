@@ -96,8 +96,8 @@ class Findings(NamedTuple):
     naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
     are None, and the latent explains actions too, Eq. (7).
 
-    Only where a memory gains and the dynamics of expert trials say next to nothing, others are not None: trait_gain, the gain by a
-    trait of the trial that is inferred from the actions of its other half (`trait.py`), and the stakes of the trait.
+    Only where a memory gains and the dynamics of expert trials say next to nothing, others are not None: trait_gain,
+    the gain by a trait of the trial that is inferred from the actions of its other half (`trait.py`), and its stakes.
     """
 
     memory_gain: float
