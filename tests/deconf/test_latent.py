@@ -9,8 +9,8 @@ import torch
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.diagnosis import latent, measures
-from deconfounded.deconf.diagnosis.diagnose import NO_EVIDENCE
 from deconfounded.deconf.diagnosis.measures import Amounts, split
+from deconfounded.deconf.diagnosis.thresholds import NO_EVIDENCE
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.experts.rollout import Trials
