@@ -117,13 +117,13 @@ def diagnosed(case: Case, folder: Path) -> str:
     """Diagnose the world's logs, and keep the verdict, and whether it is right (None: it cannot tell)."""
     from deconfounded.benchmarks.diagnose import run
     from deconfounded.benchmarks.studies.validate import predicted
-    from deconfounded.deconf.diagnosis.diagnose import VARY_LATENT
+    from deconfounded.deconf.diagnosis.advice import VARY_LATENT
 
     demonstrated, explored = case.logs(folder)
     command = f"deconf foreign --cases {case.name}"
     diagnosis, _ = run([demonstrated], [explored], {}, 0, folder / "diagnosis", command)
-    alike = case.tier == 1 and diagnosis.next is VARY_LATENT
-    right = alike or (diagnosis.verdict, diagnosis.tier) == case.truth
+    harmless = diagnosis.next is VARY_LATENT or diagnosis.verdict == "nothing at stake"
+    right = (case.tier == 1 and harmless) or (diagnosis.verdict, diagnosis.tier) == case.truth
     write(
         case,
         verdict=diagnosis.verdict,
