@@ -53,7 +53,7 @@ def test_a_filter_does_as_well_as_the_expert() -> None:
     assert score(world.WorldExpert(made, score.theta)) == 1
     assert score(world.LinearFilter(made, 32, 1)) == pytest.approx(1, abs=0.1)
     lost = world.LinearFilter(made, 32, 1)
-    lost.gain = 0 * lost.gain  # it takes no evidence in
+    lost.effect = 0 * lost.effect  # it takes no evidence in
     assert score(lost) < 0.8
 
 

@@ -86,6 +86,7 @@ class GustyCart(ReversedCart):
     """The same in gusts, which hide for a while which way it turns: confounded, and Tier 2 suffices."""
 
     noise, gust = 0.02, 0.4
+    evidence = [1, 3]
 
 
 class MountainPower(World):

@@ -141,8 +141,8 @@ class Scorer:
 class LinearFilter(Agent):
     """A reference: the linear-Gaussian filter of theta, and the expert at its mean.
 
-    The next observation's columns `evidence` are W [1, s, a] + C theta + N(0, Sigma), fitted by least squares to n
-    trials of known thetas, half by the expert and half by the expert told another theta; theta is Gaussian.
+    The next observation's columns `evidence` are W [1, s, a] + C [theta, theta a] + N(0, Sigma), fitted by least
+    squares to n trials of known thetas, half by the expert and half by the expert told another theta; theta is Gaussian.
     """
 
     def __init__(self, world: World, n: int, seed: int) -> None:
@@ -150,20 +150,17 @@ class LinearFilter(Agent):
         theta = thetas(world, n, seed)
         told = np.where(np.arange(n)[:, None] % 2, theta, np.roll(theta, 1, 0))
         trials = roll_out(world, WorldExpert(world, told), theta, seed).trials
-        mask, by_step = trials.mask, np.broadcast_to(theta[:, None, None], (*trials.mask.shape, theta.shape[1]))
-        inputs = self._inputs(trials.obs[:, :, :-1][mask], trials.action[mask])
-        target = trials.obs[:, :, 1:][mask].astype(float)[:, self.columns]
-        both = np.concatenate([inputs, by_step[mask]], 1)
-        fit = np.linalg.lstsq(both, target, rcond=None)[0]
-        left = target - both @ fit
-        self.weight, effect = fit[: inputs.shape[1]], fit[inputs.shape[1] :]
-        self.gain = np.linalg.solve(np.atleast_2d(left.T @ left / len(left)), effect.T)  # Sigma^-1 C, [K, D]
-        self.information = effect @ self.gain
+        obs, action = trials.obs[:, :, :-1][trials.mask], trials.action[trials.mask]
+        by_step = theta[np.nonzero(trials.mask)[0]]
+        inputs = np.concatenate(
+            [_inputs(obs, action), (_ones(action)[:, :, None] * by_step[:, None]).reshape(len(obs), -1)], 1
+        )
+        target = trials.obs[:, :, 1:][trials.mask].astype(float)[:, self.columns]
+        fit = np.linalg.lstsq(inputs, target, rcond=None)[0]
+        left, effects = target - inputs @ fit, products[0].size
+        self.weight, self.effect = fit[:-effects], fit[-effects:].reshape(-1, theta.shape[1], len(self.columns))
+        self.precision = np.linalg.inv(np.atleast_2d(left.T @ left / len(left)))
         self.prior = np.linalg.inv(np.atleast_2d(np.cov(theta.T))), theta.mean(0)
-
-    @staticmethod
-    def _inputs(obs: Array, action: Array) -> Array:
-        return np.concatenate([np.ones((len(obs), 1)), obs.astype(float), action.astype(float)], 1)
 
     def begin(self, n: int) -> None:
         self._precision = np.tile(self.prior[0], (n, 1, 1))
@@ -175,6 +172,17 @@ class LinearFilter(Agent):
         return scaled(self.space, np.stack([np.asarray(self.world.expert(*pair), float) for pair in pairs]))
 
     def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:
-        rest = next_obs[:, self.columns] - self._inputs(obs, action) @ self.weight
-        self._total += alive[:, None] * (rest @ self.gain)
-        self._precision += alive[:, None, None] * self.information
+        rest = next_obs[:, self.columns] - _inputs(obs, action) @ self.weight
+        effect = np.tensordot(_ones(action), self.effect, 1) * alive[:, None, None]  # [N, D, K]
+        gain = effect @ self.precision
+        self._total += (gain @ rest[..., None])[..., 0]
+        self._precision += gain @ effect.swapaxes(1, 2)
+
+
+def _ones(action: Array) -> Array:
+    """[N, A] -> [N, 1 + A]."""
+    return np.concatenate([np.ones((len(action), 1)), action.astype(float)], 1)
+
+
+def _inputs(obs: Obs, action: Array) -> Array:
+    return np.concatenate([_ones(action), obs.astype(float)], 1)
