@@ -142,7 +142,7 @@ class LinearFilter(Agent):
     """A reference: the linear-Gaussian filter of theta, and the expert at its mean.
 
     The next observation's columns `evidence` are W [1, s, a] + C [theta, theta a] + N(0, Sigma), fitted by least
-    squares to n trials of known thetas, half by the expert and half by the expert told another theta; theta is Gaussian.
+    squares to n trials of known thetas, half by the expert and half by the expert told another; theta is Gaussian.
     """
 
     def __init__(self, world: World, n: int, seed: int) -> None:
@@ -151,10 +151,8 @@ class LinearFilter(Agent):
         told = np.where(np.arange(n)[:, None] % 2, theta, np.roll(theta, 1, 0))
         trials = roll_out(world, WorldExpert(world, told), theta, seed).trials
         obs, action = trials.obs[:, :, :-1][trials.mask], trials.action[trials.mask]
-        by_step = theta[np.nonzero(trials.mask)[0]]
-        inputs = np.concatenate(
-            [_inputs(obs, action), (_ones(action)[:, :, None] * by_step[:, None]).reshape(len(obs), -1)], 1
-        )
+        products = _ones(action)[:, :, None] * theta[np.nonzero(trials.mask)[0]][:, None]
+        inputs = np.concatenate([_inputs(obs, action), products.reshape(len(obs), -1)], 1)
         target = trials.obs[:, :, 1:][trials.mask].astype(float)[:, self.columns]
         fit = np.linalg.lstsq(inputs, target, rcond=None)[0]
         left, effects = target - inputs @ fit, products[0].size
