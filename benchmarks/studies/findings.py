@@ -46,6 +46,8 @@ def validated() -> str:
 def foreign() -> str:
     """The second table of docs/diagnose.md: what `deconf foreign` measured on simulators of others."""
     rows = kept(report.KEPT)
+    if not rows:
+        return "These worlds have not been measured with the present versions of methods and diagnosis."
     return f"{report.summary(rows)} ({_origins(rows)})\n\n{report.table(rows)}"
 
 
