@@ -21,7 +21,7 @@ lint: $(VENV)/installed
 	$(VENV)/bin/mypy
 
 docs: $(VENV)/installed  # the site, docs/_build/html/index.html
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m deconfounded.benchmarks.studies.site
+	OMP_NUM_THREADS=1 $(VENV)/bin/deconf site
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python >= 3.11 is needed')"

@@ -29,6 +29,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
     "table": ("benchmarks.studies.table", "make the records that are missing", RESUMED),
     "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),
+    "site": ("benchmarks.studies.site", "build the documentation site", NOTHING),
     "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper", RESUMED),
     "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
     "tune": ("benchmarks.studies.tune", "the baselines' tuning", REPEATED),

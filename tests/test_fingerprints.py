@@ -136,5 +136,5 @@ def test_what_is_said() -> None:
         "Undo that; or, if it is meant, raise `version` in its file in deconf/methods, which"
         " supersedes its records, and run `python -m tests.fingerprints --write method:naive_rnn`"
     )
-    assert "is v1 now, and its fingerprint" in fingerprints.problem(label, {**entry, "version": 0})
+    assert f"is v{entry['version']} now, and its fingerprint" in fingerprints.problem(label, {**entry, "version": 0})
     assert "has no fingerprint yet" in fingerprints.problem(label, None)

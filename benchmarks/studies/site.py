@@ -15,7 +15,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import ROOT, run_command
+from deconfounded.benchmarks.console import ROOT, Parser
 from deconfounded.benchmarks.studies import results, site_pages
 from deconfounded.benchmarks.studies.cards import DOCS
 from deconfounded.envs.support.files import write_atomically
@@ -239,8 +239,6 @@ def build(folder: Path) -> Path:
 
 
 def main() -> None:
+    """The command line."""
+    Parser(description=__doc__).parse_args()
     print(build(BUILD) / "index.html")
-
-
-if __name__ == "__main__":
-    run_command(main, "nothing was built")

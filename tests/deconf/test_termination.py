@@ -61,7 +61,6 @@ class Walker:
 
     theta_hat = torch.zeros(1, 3, 1)
     policy = SimpleNamespace(signature=SimpleNamespace(actions=0))
-    model = SimpleNamespace(dynamics=SimpleNamespace(sample=lambda obs, action, latent, draws: obs + action))
 
     def begin(self, n: int, rngs: Any) -> None:
         self.steps, self.farthest = 0.0, 0.0
@@ -72,6 +71,9 @@ class Walker:
     def remember(self, step: Batch) -> None:
         self.steps += float(step.mask.sum()) / 3
         self.farthest = max(self.farthest, float(step.next_obs.max()))
+
+    def next_obs(self, obs: torch.Tensor, action: torch.Tensor, draws: Draws) -> torch.Tensor:
+        return obs + action
 
     def point(self, obs: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
         return torch.ones_like(obs)
