@@ -64,7 +64,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"![score by episode]({task.name}.png)",
     ]
     if older := outdated(task, results):
-        parts.append(f"Of an older version, and not yet made again: {', '.join(older)}.")
+        parts.append(f"Of an older version, and not yet made again: {'; '.join(older)}.")
     if (DOCS / (link := f"records/superseded/{records.place(task.name)}")).exists():
         parts.append(f"Superseded, and not to be compared: [the records of earlier versions]({link}).")
     if (DOCS / f"{task.name}.webp").exists():
@@ -75,10 +75,12 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
 def outdated(task: envs.Task, results: dict[str, Any]) -> list[str]:
     """What of a task's results is of an older version than today's of the task or a method, and of which."""
     older = [f"the task, v{results['task_version']} of v{task.version}"] * (results["task_version"] != task.version)
-    for name, entry in results["methods"].items():
-        method = METHODS.get(entry["method"])
-        if method is not None and entry["version"] != method.version:
-            older.append(f"{name}, v{entry['version']} of v{method.version}")
+    methods = {entry["method"]: entry["version"] for entry in results["methods"].values()}
+    by_version: dict[tuple[int, int], list[str]] = {}
+    for name, version in methods.items():
+        if name in METHODS and version != METHODS[name].version:
+            by_version.setdefault((version, METHODS[name].version), []).append(name)
+    older += [f"{', '.join(names)}: v{was} of v{now}" for (was, now), names in by_version.items()]
     return older
 
 
@@ -115,7 +117,9 @@ def summary(found: index.Found) -> str:
         tier = "none" if task.tier is None else str(task.tier)
         rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
     methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
-    return markdown_table(("task", "tier needed", *methods, "seconds"), rows)
+    older = any(outdated(*of) for of in found)
+    note = "\n\nSome records are of older versions than today's; docs/results.md says which." if older else ""
+    return markdown_table(("task", "tier needed", *methods, "seconds"), rows) + note
 
 
 def controls(found: index.Found) -> str:
