@@ -47,37 +47,48 @@ class EvidenceRecorder(ExpertAgent):
 
     def begin(self, n: int) -> None:
         super().begin(n)
-        self.log_belief = self.grid.prior(n)
+        self.log_belief, self._steps = self.grid.prior(n), 0
         self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
         self.actions: list[Array] = []
-        self.beliefs: list[Array] = []  # [N, K], after each episode
+        self.beliefs: list[Array] = []  # [N, K], at the end of each episode
+        self.truths: list[Array] = []  # theta [N, L] then
+
+    def note(self) -> None:
+        """Keep the belief about the theta of an episode's last step, now that it is over."""
+        self.beliefs.append(np.exp(self._updated))
+        self.truths.append(self._theta)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
         if self.dynamics:
-            self.beliefs.append(np.exp(self.log_belief))
-            self.log_belief = self.grid.predict(self.log_belief)
+            self.note()
+            waited = self.grid.predict_steps(self.log_belief, self.env.task.horizon - self._steps)
+            self.log_belief = self.grid.predict(waited)
+        self._steps = 0
 
     def act(self, obs: NDArray[np.float32]) -> Array:
-        self._state = self.env.state
+        self._state, self._theta = self.env.state, self.env.theta.copy()
         return super().act(obs)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
-        true = self.grid.log_true(self._state, action, self.env.state)
+        true = self.grid.log_true(self._state, action, self.env.state, self._theta)
         self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
-        acted = self.expert.log_prob(obs, action, self.env.theta)
+        acted = self.expert.log_prob(obs, action, self._theta)
         self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
-        self.log_belief = np.where(alive[:, None], belief_update(self.log_belief, log_dynamics), self.log_belief)
+        self._updated = np.where(alive[:, None], belief_update(self.log_belief, log_dynamics), self.log_belief)
+        self.log_belief = self.grid.predict_steps(self._updated)
+        self._steps += 1
 
 
 def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, Array]:
     """Levels [J, L]; scores [J, J] of the expert under the row's theta, given the column's; mean returns [J, J].
 
-    Each row is scored by its own expert and its own random actions.
+    Each row is scored by its own expert and its own random actions. Theta does not switch meanwhile.
     """
+    task = task.without_switches()
     levels = np.unique(task.theta_grid(LEVELS), axis=0)
     j = len(levels)
     true = np.repeat(levels, j * trials, 0)
@@ -123,15 +134,17 @@ def certify(
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
 
     recorder = EvidenceRecorder(env, expert, thetas if isinstance(thetas, Grid) else Grid(env, expert, thetas))
-    _, best, truth = run_trials(env, recorder, EPISODES, SEED)  # thetas are the same in every run: seeds are shared
+    best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
+    recorder.note()
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
     if one <= zero:
         remedy = "train it first" if task.has_likelihood else "it must be better"
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; {remedy}")
     done(STAGES[0])
-    beliefs = [*recorder.beliefs, np.exp(recorder.log_belief)]
     policies = {"interventional": returns(ExactAgent(env, expert, False, thetas))}
-    static = {"static": returns(ExactAgent(env, expert, False, thetas, static=True))} if task.drifts else {}
+    static = {}
+    if task.drifts or task.switches:
+        static["static"] = returns(ExactAgent(env, expert, False, thetas, static=True))
     done(STAGES[1])
     policies |= {"conditional": returns(ExactAgent(env, expert, True, thetas)), **static}
     done(STAGES[2])
@@ -155,6 +168,7 @@ def certify(
     for name, (relation, bound) in THRESHOLDS.items():
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
+    known = recorder.beliefs, recorder.truths
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
     return {
@@ -167,7 +181,7 @@ def certify(
         "return_expert": one,
         **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
-        "inferability": [inferability(task, x, recorder.grid.theta, truth[:, i]) for i, x in enumerate(beliefs)],
+        "inferability": [inferability(task, x, recorder.grid.theta, y) for x, y in zip(*known, strict=True)],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
         "grid": len(recorder.grid.theta),

@@ -6,6 +6,7 @@ simulation (`Grid.log_dynamics`).
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,7 @@ class Grid:
     def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
         self.env, self.expert, self.theta = env, expert, env.task.theta_grid(k)
         self._transition = env.task.transition(k) if env.task.drifts else None
+        self._switching = env.task.switching(k) if env.task.switches else None
         self._simulator = env.task.simulator(len(self.theta))
         for i, theta in enumerate(self.theta):
             self._simulator.set_theta(i, theta)
@@ -58,9 +60,13 @@ class Grid:
 
     def predict(self, log_belief: Array) -> Array:
         """The log-belief [N, K] about the next episode's theta: the same, unless theta drifts."""
-        if self._transition is None:
+        return log_belief if self._transition is None else _mixed(log_belief, self._transition)
+
+    def predict_steps(self, log_belief: Array, steps: int = 1) -> Array:
+        """The log-belief [N, K] about theta so many steps later, with no evidence: the same, unless theta switches."""
+        if self._switching is None or not steps:
             return log_belief
-        return np.log(np.exp(log_belief) @ self._transition + 1e-300)
+        return _mixed(log_belief, np.linalg.matrix_power(self._switching, steps))
 
     def log_dynamics(self, state: Array, action: Array, next_state: Array, log_belief: Array | None = None) -> Array:
         """log p(s' | s, a, theta) [N, K]; state, next_state [N, S], action [N, A].
@@ -86,9 +92,15 @@ class Grid:
             log_prob[pruned] = np.take_along_axis(log_prob[pruned], nearest, -1)
         return log_prob
 
-    def log_true(self, state: Array, action: Array, next_state: Array) -> Array:
-        """log p(s' | s, a, theta) [N] under the environments' own theta."""
-        return log_next(self.env.simulator, state, action, next_state, self.env.theta)
+    def log_true(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
+        """log p(s' | s, a, theta) [N] under thetas [N, L] of the environments' own."""
+        for i in np.flatnonzero((theta != self._true.theta).any(-1)).tolist():
+            self._true.set_theta(i, theta[i])
+        return log_next(self._true, state, action, next_state, theta)
+
+    @cached_property
+    def _true(self) -> Simulator:
+        return self.env.task.simulator(self.env.n)
 
     def log_policy(self, obs: Array, action: Array) -> Array:
         """log pi_exp(a | s, theta) [N, K]; obs [N, O], action [N, A]."""
@@ -97,12 +109,18 @@ class Grid:
         return self.expert.log_prob(np.repeat(obs, k, 0), np.repeat(action, k, 0), thetas).reshape(n, k)
 
 
+def _mixed(log_belief: Array, transition: Array) -> Array:
+    """Log-belief [N, K] after a transition [K, K] of theta."""
+    return np.log(np.exp(log_belief) @ transition + 1e-300)
+
+
 class ExactAgent(Agent):
     """Samples theta from the posterior on a grid at every step, and acts as the expert under that theta.
 
     conditional: the posterior takes the agent's actions for evidence too, Eq. (3): the causal delusion. static: it
-    assumes the same theta in all episodes, even where theta drifts. The agent reads the environment's state, not its
-    theta.
+    assumes the same theta in all episodes, even where theta drifts or switches. Where theta switches, the posterior is
+    the filter of a hidden Markov model, which goes on after an episode's early end. The agent reads the environment's
+    state, not its theta.
     """
 
     def __init__(
@@ -113,13 +131,14 @@ class ExactAgent(Agent):
         self.grid = k if isinstance(k, Grid) else Grid(env, expert, k)
 
     def begin(self, n: int) -> None:
-        self.log_belief, self._first = self.grid.prior(n), True
+        self.log_belief, self._first, self._steps = self.grid.prior(n), True, 0
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         self._rng = Streams(rngs)
         if not (self._first or self.static):
-            self.log_belief = self.grid.predict(self.log_belief)
-        self._first = False
+            waited = self.grid.predict_steps(self.log_belief, self.env.task.horizon - self._steps)
+            self.log_belief = self.grid.predict(waited)
+        self._first, self._steps = False, 0
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
@@ -133,6 +152,9 @@ class ExactAgent(Agent):
         log_dynamics = self.grid.log_dynamics(self._state[alive], action[alive], self.env.state[alive], before)
         log_policy = self.grid.log_policy(obs[alive], action[alive]) if self.conditional else None
         self.log_belief[alive] = belief_update(before, log_dynamics, log_policy)
+        if not self.static:
+            self.log_belief = self.grid.predict_steps(self.log_belief)
+        self._steps += 1
 
     def features(self) -> NDArray[np.float32]:
         """The posterior mean of the encoded theta."""

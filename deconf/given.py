@@ -64,7 +64,10 @@ class Given:
 
     @property
     def theta(self) -> Array:
-        """The encoded theta [B, E, F] of the demonstrations' episodes, of about unit scale."""
+        """The encoded theta [B, E, F] of the demonstrations' episodes, of about unit scale.
+
+        Where theta switches within episodes, it is [B, E, T, F], that of each step.
+        """
         return self._ask("theta")
 
     def explore(self, agent: Agent | None = None, trials: int | None = None) -> Trials:
@@ -72,7 +75,7 @@ class Given:
         return self._ask("exploration", trials, agent=agent)
 
     def explore_with_theta(self, agent: Agent | None = None) -> tuple[Trials, Array]:
-        """Roll out an agent as in `explore`, with the encoded theta [B, E, F] of each episode."""
+        """Roll out an agent as in `explore`, with the encoded theta, as `theta` has it."""
         return self._ask("exploration with theta", None, agent=agent)
 
     def query(self, agent: Agent | None = None, trials: int | None = None) -> tuple[Trials, FloatArray]:

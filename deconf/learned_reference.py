@@ -131,6 +131,6 @@ class LearnedGrid(Grid):
         obs, next_obs = map(self.env.task.observe, (state, next_state))
         return self.dynamics.log_grid(obs, action, next_obs, self.theta)
 
-    def log_true(self, state: Array, action: Array, next_state: Array) -> Array:
+    def log_true(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         obs, next_obs = map(self.env.task.observe, (state, next_state))
-        return self.dynamics.log_prob(obs, action, next_obs, self.env.theta)
+        return self.dynamics.log_prob(obs, action, next_obs, theta)

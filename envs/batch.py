@@ -15,9 +15,10 @@ Seed = int | Sequence[int | None] | None
 
 
 class BatchEnv:
-    """N environments of one task; each has its own theta and three random streams (theta, start, noise).
+    """N environments of one task; each has its own theta and four random streams (theta, start, noise, switches).
 
-    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `action` [N, A], the last one
+    Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `path` [N, T + 1, L], where
+    theta switches: that of each step of the episode, and of the next episode's first; `action` [N, A], the last one
     taken, for pictures; `alive` [N], whether the episode goes on. An environment whose episode has ended keeps its row,
     has reward 0, and waits for `reset`.
     """
@@ -32,6 +33,7 @@ class BatchEnv:
         self.action = np.zeros((n, task.action_width))
         self._steps, self._all_rows = np.zeros(n, int), np.arange(n)
         self._noise: Array = np.zeros((n, 0, 0))
+        self.path: Array = np.zeros((n, task.horizon + 1 if task.switches else 0, len(task.latents)))
         self._streams: list[list[np.random.Generator]] = []
         self._space = task.observation_space
 
@@ -41,7 +43,7 @@ class BatchEnv:
         return self.simulator.theta
 
     def seed(self, seed: Seed) -> None:
-        """Environment i gets seed + i (or seed[i], or fresh entropy), and from it three independent streams."""
+        """Environment i gets seed + i (or seed[i], or fresh entropy), and from it four independent streams."""
         if seed is None:
             seed = [None] * self.n
         elif isinstance(seed, int | np.integer) and is_seed(seed):
@@ -54,9 +56,9 @@ class BatchEnv:
     def reset(self, seed: Seed = None, options: dict[str, Any] | None = None, where: Mask | None = None) -> Obs:
         """Start new episodes in all environments, or `where` [N]; returns observations [N, O].
 
-        options: `keep_theta`, True or a mask [N], keeps theta but for its drift, for the next episode of a trial; other
-        environments draw a new theta. `theta` [L] or [N, L] sets theta. Neither changes the start or the noise. Raises
-        InputError for a theta out of bounds and for an invalid mask.
+        options: `keep_theta`, True or a mask [N], keeps theta but for drift and switches, for the next episode of a
+        trial; other environments draw a new theta. `theta` [L] or [N, L] sets theta. Neither changes the start or the
+        noise. Raises InputError for a theta out of bounds and for an invalid mask.
         """
         options = {} if options is None else options
         if not isinstance(options, dict):
@@ -74,18 +76,21 @@ class BatchEnv:
         if seed is not None or not self._streams:
             self.seed(seed)
         rows = self._all_rows if where is None else np.flatnonzero(where)
-        theta_rng, start_rng, noise_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
-        new = ~keep[rows]
+        theta_rng, start_rng, noise_rng, switch_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
+        new, task = ~keep[rows], self.task
         for which, is_new in ((new, True), (~new, False)):
-            if not which.any() or not (is_new or self.task.drifts):
+            if not which.any() or not (is_new or task.drifts or task.switches):
                 continue
             drawing = Streams([rng for rng, draws in zip(theta_rng, which, strict=True) if draws])
-            if not is_new:
-                theta = self.task.drifted(self.theta[rows[which]], drawing)
+            if is_new:
+                theta = task.sample_theta(drawing) if forced is None else forced[rows]
             else:
-                theta = self.task.sample_theta(drawing) if forced is None else forced[rows]
+                theta = (self.path[:, -1] if task.switches else self.theta)[rows[which]]
+                theta = task.drifted(theta, drawing) if task.drifts else theta
             for i, row in zip(rows[which].tolist(), theta, strict=True):
                 self.simulator.set_theta(i, row)
+        if task.switches:
+            self.path[rows] = task.theta_path(self.theta[rows], Streams(switch_rng))
         start, noise = self.task.init_state(Streams(start_rng)), self.task.sample_noise(Streams(noise_rng))
         start = self.simulator.start(rows, start, noise)
         if first:
@@ -145,4 +150,8 @@ class BatchEnv:
         self.state = self.state.copy()  # agents may hold the array before
         self.state[on] = after
         self.alive = ~(over | terminated | truncated)
+        if task.switches:
+            now = self.path[self._all_rows, self._steps]
+            for i in np.flatnonzero((now != self.theta).any(-1)).tolist():
+                self.simulator.set_theta(i, now[i])
         return reward, terminated, truncated

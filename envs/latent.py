@@ -21,7 +21,8 @@ class Latent:
     distribution: `uniform` =U(low, high), `loguniform` =exp U(log low, log high), or `categorical`: the integers
     low..high, equally likely. drift: where it is not 0, the latent's quantile u = cdf(theta) walks at random from each
     episode of a trial to the next: u' = u + N(0, drift^2), reflected at 0 and 1, so that every episode's theta has the
-    distribution. Raises InputError for bounds that do not fit the distribution, and for an invalid drift.
+    distribution. switch: the probability that the latent is drawn anew after a step of an episode. Raises InputError
+    for bounds that do not fit the distribution, and for an invalid drift or switch.
     """
 
     name: str
@@ -30,9 +31,10 @@ class Latent:
     high: float
     distribution: Literal["uniform", "loguniform", "categorical"] = "uniform"
     drift: float = 0.0
+    switch: float = 0.0
 
     def __post_init__(self) -> None:
-        for part in ("low", "high", "drift"):
+        for part in ("low", "high", "drift", "switch"):
             if isinstance(value := getattr(self, part), bool) or not isinstance(value, int | float | np.number):
                 raise InputError(f"{part} of latent {self.name} was {value!r}; it must be a number")
         rules = {
@@ -49,6 +51,8 @@ class Latent:
         if not 0 <= self.drift <= 1 or (self.drift and self.distribution == "categorical"):
             right = "from 0 to 1, and 0 of a categorical latent"
             raise InputError(f"drift of {self.name} was {self.drift:g}; it must be {right}")
+        if not 0 <= self.switch < 1:
+            raise InputError(f"switch of {self.name} was {self.switch:g}; it must be from 0 to below 1, for each step")
 
     def ppf(self, u: Array) -> Array:
         """Quantiles: u in [0, 1) of any shape -> theta of the same shape."""
@@ -96,6 +100,21 @@ class Latent:
         ahead = ndtr((edges + images - u[:, None]) / self.drift)
         behind = ndtr((images - edges - u[:, None]) / self.drift)
         return np.diff(ahead, axis=-1).sum(0) - np.diff(behind, axis=-1).sum(0)
+
+    def switched(self, theta: Array, u: Array) -> Array:
+        """Theta [...] of the next step, by draws u from U(0, 1) of the same shape.
+
+        Where u is below `switch`, theta is drawn anew: u / switch, uniform too, is its quantile.
+        """
+        if not self.switch:
+            return theta
+        anew = u < self.switch
+        return np.where(anew, self.ppf(np.where(anew, u / self.switch, 0)), theta)
+
+    def switching(self, k: int) -> Array:
+        """Transition matrix [K, K] of `grid(k)`: P(bin of value j at the next step | value i)."""
+        k = self.features if self.distribution == "categorical" else k
+        return (1 - self.switch) * np.eye(k) + self.switch / k
 
     @property
     def features(self) -> int:

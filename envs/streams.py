@@ -50,5 +50,5 @@ def unseeded(rng: np.random.Generator) -> np.random.Generator:
 
 
 def generators(seed: int | None) -> list[np.random.Generator]:
-    """Three generators of one environment: for theta, start and noise. None: fresh entropy."""
-    return [np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(3)]
+    """Four generators of one environment: for theta, start, noise and theta's switches. None: fresh entropy."""
+    return [np.random.Generator(np.random.PCG64(child)) for child in np.random.SeedSequence(seed).spawn(4)]

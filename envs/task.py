@@ -6,13 +6,15 @@ Shape letters in the whole project:
     B trials         E episodes      T steps         K grid values of theta
     Z noise draws a step             D dimensions of a learned latent
 
-A *trial* is E episodes in a row under the same hidden theta, which may drift from episode to episode. A discrete action
-is one integer column, so that actions are always [N, A]. A task holds no state of its own: states, thetas and random
-streams are passed in.
+A *trial* is E episodes in a row under the same hidden theta, which may drift from episode to episode, or switch at
+random steps. A discrete action is one integer column, so that actions are always [N, A]. A task holds no state of its
+own: states, thetas and random streams are passed in.
 """
 
+import copy
 import inspect
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -186,6 +188,30 @@ class Task(ABC):
         normal = rng.standard_normal((rng.groups, len(self.latents)))
         return np.stack([lat.drifted(theta[:, i], normal[:, i]) for i, lat in enumerate(self.latents)], -1)
 
+    @property
+    def switches(self) -> bool:
+        """Whether theta changes within episodes."""
+        return any(lat.switch for lat in self.latents)
+
+    def without_switches(self) -> "Task":
+        """The same task, with a theta that holds still within episodes."""
+        if not self.switches:
+            return self
+        still = copy.copy(self)
+        still.__dict__["latents"] = tuple(replace(latent, switch=0.0) for latent in self.latents)
+        return still
+
+    def theta_path(self, theta: Array, rng: Streams) -> Array:
+        """Theta [N, T + 1, L] at each step of an episode that starts with theta [N, L], and after its last step.
+
+        It does not depend on what happens in the episode: one that ends early is waited out.
+        """
+        u, path = rng.random((rng.groups, self.horizon, len(self.latents))), [theta]
+        for t in range(self.horizon):
+            pairs = enumerate(self.latents)
+            path.append(np.stack([lat.switched(path[-1][:, i], u[:, t, i]) for i, lat in pairs], -1))
+        return np.stack(path, 1)
+
     def theta_grid(self, k: int) -> Array:
         """A grid of equally likely thetas [K, L]. Of a single latent it has k values, K = k.
 
@@ -201,6 +227,10 @@ class Task(ABC):
     def transition(self, k: int) -> Array:
         """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next episode | theta of this episode)."""
         return reduce(np.kron, (lat.transition(self._values_each(k)) for lat in self.latents))
+
+    def switching(self, k: int) -> Array:
+        """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next step | theta of this step)."""
+        return reduce(np.kron, (lat.switching(self._values_each(k)) for lat in self.latents))
 
     def encode_theta(self, theta: Array) -> Array:
         """Features [..., F] of theta [..., L], of about unit size, for experts and oracles alone."""

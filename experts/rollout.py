@@ -210,12 +210,22 @@ Seeds = int | Sequence[int]  # one for all trials, or one for each of equal grou
 
 
 def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
-    """Theta [N, E, L] of the trials that `run_trials` makes with these seeds, drawn once more."""
-    rng = Streams([generators(env_seed)[0] for env_seed in trial_seeds(n, seed)])
-    by_episode = [task.sample_theta(rng)]
-    for _ in range(1, episodes):
-        by_episode.append(task.drifted(by_episode[-1], rng) if task.drifts else by_episode[-1])
-    return np.stack(by_episode, 1)
+    """The theta of the roll-out that `run_trials` makes with these seeds, drawn once more."""
+    streams = [generators(env_seed) for env_seed in trial_seeds(n, seed)]
+    rng, switches = Streams([each[0] for each in streams]), Streams([each[3] for each in streams])
+    theta, hidden = task.sample_theta(rng), []
+    for e in range(episodes):
+        theta = task.drifted(theta, rng) if task.drifts and e else theta
+        if task.switches:
+            path = task.theta_path(theta, switches)
+            theta = path[:, -1]
+        hidden.append(path[:, :-1] if task.switches else theta)
+    return np.stack(hidden, 1)
+
+
+def of_steps(theta: Array, steps: int) -> Array:
+    """Theta of each step [B, E, T, L], from a roll-out's theta: of each episode [B, E, L], or of each step already."""
+    return np.repeat(theta[:, :, None], steps, 2) if theta.ndim == 3 else theta
 
 
 def _group_seeds(seed: Seeds) -> list[int]:
@@ -235,9 +245,11 @@ def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
 
 
 class Rollout(NamedTuple):
-    """A roll-out, N trials of E episodes: the trials, their returns [N, E], and the theta [N, E, L] of each episode.
+    """A roll-out, N trials of E episodes: the trials, their returns [N, E], and their theta.
 
-    Learners are handed `trials` alone; returns and theta are for scoring, and theta for methods that declare it.
+    theta is [N, E, L], that of each episode; or, where it switches, [N, E, T, L], that of each step, after an episode's
+    early end too. Learners are handed `trials` alone; returns and theta are for scoring, and theta for methods that
+    declare it.
     """
 
     trials: Trials
@@ -257,7 +269,7 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)
     returns = np.zeros((n, episodes))
-    hidden = np.zeros((n, episodes, len(task.latents)))
+    hidden = []
     action = np.zeros((n, episodes, task.horizon, task.action_width), np.float32)
     for e in range(episodes):
         if e == 0:
@@ -265,7 +277,7 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
             agent.begin(n)
         else:
             now = env.reset(options={"keep_theta": True})
-        hidden[:, e] = env.theta
+        hidden.append(env.path[:, :-1].copy() if task.switches else env.theta.copy())
         agent.reset([unseeded(np.random.default_rng([first, 1, e])) for first in seeds])  # not the environments' seeds
         obs[:, e, 0] = now
         for t in range(task.horizon):
@@ -281,4 +293,4 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
             if not env.alive.any():
                 obs[:, e, t + 2 :] = obs[:, e, t + 1 : t + 2]
                 break
-    return Rollout(Trials(obs, action, mask, task.n_actions), returns, hidden)
+    return Rollout(Trials(obs, action, mask, task.n_actions), returns, np.stack(hidden, 1))

@@ -20,7 +20,7 @@ from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved_agents
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, AgentWrapper, Trials, run_trials
+from deconfounded.experts.rollout import Agent, AgentWrapper, Trials, of_steps, run_trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 QUANTILE = 0.85  # of the first latent, in the trial of the video
@@ -162,7 +162,7 @@ def spaces(task: envs.Task) -> dict[str, int]:
 def evaluate(
     context: Context, agent: Agent, learned: bool, salt: str = "", filmed: bool = False
 ) -> tuple[dict[str, Array], Array, dict[str, Array]]:
-    """Deploy in all seeds' trials: theta [N, E, L], returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
+    """Deploy in all trials: theta [N, E, L] (at first), returns and Eq. (1) [N, E]; probes [S, E or 0]; a clip."""
     task, seeds = context.task, context.seeds
     # Learned agents go on for twice the episodes they were trained on.
     episodes = task.episodes * (2 if learned and task.episodes > 1 else 1)
@@ -170,7 +170,8 @@ def evaluate(
     streams = [stream(EVALUATION, seed, salt) for seed in seeds]
     trials, returns, theta = run_trials(context.env, recorder, episodes, streams)
     recorder.note()
-    encoded = task.encode_theta(theta)
+    at_end = theta[:, :, -1] if task.switches else theta
+    encoded = task.encode_theta(at_end)
     groups = map(context.rows, range(len(seeds)))
     probes = [[probe(x[rows], encoded[rows, e]) for e, x in enumerate(recorder.features_after)] for rows in groups]
     clip = {key: np.array(value) for key, value in recorder.clip.items()}
@@ -179,14 +180,15 @@ def evaluate(
     if "known" in clip:  # theta, as it can be read off at the end of the last episode
         clip["read"] = probes[0][task.episodes - 1][1](clip.pop("known"))
     r2 = np.array([[score for score, _ in each] for each in probes])
-    return {"theta": theta, "returns": returns, "objective": objective(context.expert, trials, theta)}, r2, clip
+    first = theta[:, :, 0] if task.switches else theta
+    return {"theta": first, "returns": returns, "objective": objective(context.expert, trials, theta)}, r2, clip
 
 
 def objective(expert: Expert, trials: Trials, theta: Array) -> Array:
-    """Eq. (1) [B, E]: how likely the expert that sees theta [B, E, L] finds the imitator's own actions, by episode."""
+    """Eq. (1) [B, E]: how likely the expert that sees a roll-out's theta finds an imitator's actions, by episode."""
     b, e, t = trials.mask.shape
     obs, action = (x.reshape(b * e * t, -1) for x in (trials.obs[:, :, :-1], trials.action))
-    log_expert = expert.log_prob(obs, action, np.repeat(theta.reshape(b * e, -1), t, 0)).reshape(b, e, t)
+    log_expert = expert.log_prob(obs, action, of_steps(theta, t).reshape(b * e * t, -1)).reshape(b, e, t)
     return imitation_objective(log_expert, trials.mask)
 
 

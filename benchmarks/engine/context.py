@@ -13,7 +13,17 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Rollout, Trials, joined, run_trials, thetas
+from deconfounded.experts.rollout import (
+    Agent,
+    ExpertAgent,
+    RandomAgent,
+    Rollout,
+    Trials,
+    joined,
+    of_steps,
+    run_trials,
+    thetas,
+)
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -97,7 +107,7 @@ class Context:
 
     @property
     def demonstrated_theta(self) -> Array:
-        """theta [B, E, L] of the demonstrations' episodes, drawn once more from their seeds: for the oracle alone."""
+        """The theta of the demonstrations' roll-out, drawn once more from their seeds: for the oracle alone."""
         n = self.preset.expert_trials * len(self.seeds)
         return thetas(self.task, n, self.task.episodes, [stream(DEMOS, seed, self.salt) for seed in self.seeds])
 
@@ -123,7 +133,7 @@ class Context:
         return self._roll_out(n or self.preset.explore_trials, agent, rngs).trials
 
     def explore_with_theta(self, agent: Agent | None, rngs: Sequence[np.random.Generator]) -> tuple[Trials, Array]:
-        """The same, and the encoded theta [B, E, F] of each episode."""
+        """The same, and the encoded theta of each episode, as of a roll-out."""
         trials, _, theta = self._roll_out(self.preset.explore_trials, agent, rngs)
         self.monitor.spend("thetas", [len(trials) // len(rngs)] * len(rngs))
         return trials, self.task.encode_theta(theta)
@@ -136,6 +146,7 @@ class Context:
         self.monitor.spend("queries", trials.mask.reshape(len(rngs), -1).sum(1).tolist())
         shape = trials.action.shape
         obs = trials.obs[:, :, :-1].reshape(len(trials), -1, trials.obs.shape[-1])
+        theta = of_steps(theta, shape[2]).reshape(len(trials), obs.shape[1], -1)
         random = Streams([np.random.default_rng(rng.integers(2**31)) for rng in rngs])
-        labels = [self.expert.act(obs[:, t], theta[:, t // shape[2]], random) for t in range(obs.shape[1])]
+        labels = [self.expert.act(obs[:, t], theta[:, t], random) for t in range(obs.shape[1])]
         return trials, np.stack(labels, 1).reshape(shape).astype(np.float32)

@@ -16,7 +16,7 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.rollout import Trials, of_steps
 
 
 @dataclass(frozen=True)
@@ -69,16 +69,16 @@ def train(
 ) -> MemorylessAgent:
     """Clone the expert's action at each step; trials are in as many equal groups as there are generators in rng.
 
-    For the oracle alone: theta [B, E, F], the encoded theta of each episode, and `side`, which returns that of the
-    environments that the agent acts in [N, F].
+    For the oracle alone: theta [B, E, F], the encoded theta of each episode, or [B, E, T, F], of each step, and `side`,
+    which returns that of the environments that the agent acts in [N, F].
     """
     rngs, signature, monitor = as_generators(rng), Signature.of(trials), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
     scales = Scales.of(signature, data)
     features = scales.obs(data.obs)
     if theta is not None:
-        by_episode = torch.as_tensor(theta).to(features).reshape(*features.shape[:2], *theta.shape[1:])
-        features = torch.cat([features, by_episode.repeat_interleave(trials.mask.shape[2], 2)], -1)
+        by_step = torch.as_tensor(of_steps(theta, trials.mask.shape[2])).to(features)
+        features = torch.cat([features, by_step.reshape(*features.shape[:-1], -1)], -1)
     policy = ActionHead(features.shape[-1], config.width, scales, draws)
     agent = MemorylessAgent(policy, scales, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)

@@ -28,7 +28,7 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.rollout import Agent, Trials, of_steps
 
 Explore = Callable[[Agent | None], tuple[Trials, Array]]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.
@@ -156,8 +156,8 @@ def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: 
 
 
 def per_step(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
-    """theta [B, E, F] of episodes -> [S, B, T, F], at each step as `Batch.of` joins them."""
-    repeated = np.repeat(theta[:, :, None], trials.mask.shape[2], 2).astype(np.float32)
+    """theta [B, E, F] of episodes, or [B, E, T, F] -> [S, B, T, F], at each step as `Batch.of` joins them."""
+    repeated = of_steps(theta, trials.mask.shape[2]).astype(np.float32)
     return Batch.of(Trials(trials.obs, repeated, trials.mask), seeds, device).action
 
 

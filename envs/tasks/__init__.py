@@ -10,7 +10,7 @@ from deconfounded.envs.registry import register
 SUITE = (
     *("bandit", "tilted_cartpole", "slippery_cartpole", "heavy_payload", "icy_road", "slippery_walker", "hidden_goal"),
     *("forked_path", "rolling_deck", "icy_stop", "weak_thruster", "dragged_sled", "cheetah_speed", "ant_goal"),
-    *("curling", "swapped_lander", "windy_drone"),
+    *("curling", "swapped_lander", "windy_drone", "gusty_drone"),
 )
 
 for _name in SUITE:  # a task's class has its file's name, in camel case
