@@ -20,7 +20,7 @@ from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.registry import TASKS, closest, get, make, make_dm, make_vec, names, register
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
-from deconfounded.envs.tasks import SUITE
+from deconfounded.envs.tasks import HARD, SUITE
 
-__all__ = ["SUITE", "TASKS", "BatchEnv", "DmEnv", "GymEnv", "GymVectorEnv", "InputError", "Latent"]
+__all__ = ["HARD", "SUITE", "TASKS", "BatchEnv", "DmEnv", "GymEnv", "GymVectorEnv", "InputError", "Latent"]
 __all__ += ["MujocoTask", "Task", "check_task", "closest", "get", "make", "make_dm", "make_vec", "names", "register"]

@@ -259,13 +259,19 @@ def of_diagnosis(name: str) -> Numbers:
     }
 
 
+NAMES = [*envs.SUITE, *envs.HARD]
 Kind = tuple[Callable[[str], Numbers], Callable[[str], int], list[str], str]
 KINDS: dict[str, Kind] = {
-    "task": (of_task, lambda name: envs.get(name).version, list(envs.SUITE), "`version` of its class in envs/tasks"),
+    "task": (
+        of_task,
+        lambda name: envs.get(name).version,
+        NAMES,
+        "`version` of its class in envs/tasks",
+    ),
     "expert": (
         of_expert,
         lambda name: policy.version(envs.get(name)),
-        list(envs.SUITE),
+        NAMES,
         "`version` in its card under assets/experts (of a closed form, of its task)",
     ),
     "method": (

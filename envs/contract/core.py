@@ -76,11 +76,13 @@ def privileged_view(task: Task) -> None:
 
 
 def keep_theta(task: Task) -> None:
-    """A trial keeps its theta, but for drift, with a new start or noise; the next trial draws a new theta."""
+    """A trial keeps its theta, but for drift and switches, with new start or noise; the next one has a new theta."""
     batch = BatchEnv(task, 16)
     batch.reset(1)
     theta = batch.theta.copy()
     first = [batch.step(action)[0] for action in actions(task, 16, 3)]
+    if task.switches:
+        theta = batch.path[:, -1].copy()
     batch.reset(options={"keep_theta": True})
     for i, latent in enumerate(task.latents):
         before, after = theta[:, i], batch.theta[:, i]
