@@ -19,8 +19,7 @@ from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import normalise
-from deconfounded.deconf.equations import belief_update
-from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.exact import ExactAgent, Grid, grid_of
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -50,12 +49,12 @@ class EvidenceRecorder(ExpertAgent):
         self.log_belief, self._steps = self.grid.prior(n), 0
         self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
         self.actions: list[Array] = []
-        self.beliefs: list[Array] = []  # [N, K], at the end of each episode
+        self.estimates: list[Array] = []  # of theta [N, L], at the end of each episode
         self.truths: list[Array] = []  # theta [N, L] then
 
     def note(self) -> None:
-        """Keep the belief about the theta of an episode's last step, now that it is over."""
-        self.beliefs.append(np.exp(self._updated))
+        """Keep the estimate of the theta of an episode's last step, now that it is over."""
+        self.estimates.append(self.grid.estimate(self._updated))
         self.truths.append(self._theta)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
@@ -78,7 +77,8 @@ class EvidenceRecorder(ExpertAgent):
         self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
         acted = self.expert.log_prob(obs, action, self._theta)
         self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
-        self._updated = np.where(alive[:, None], belief_update(self.log_belief, log_dynamics), self.log_belief)
+        updated = self.grid.updated(self.log_belief, self._state, obs, log_dynamics)
+        self._updated = np.where(alive.reshape(-1, *[1] * (updated.ndim - 1)), updated, self.log_belief)
         self.log_belief = self.grid.predict_steps(self._updated)
         self._steps += 1
 
@@ -133,7 +133,7 @@ def certify(
     def returns(agent: Agent) -> Array:
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
 
-    recorder = EvidenceRecorder(env, expert, thetas if isinstance(thetas, Grid) else Grid(env, expert, thetas))
+    recorder = EvidenceRecorder(env, expert, thetas if isinstance(thetas, Grid) else grid_of(env, expert, thetas))
     best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
     recorder.note()
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
@@ -168,7 +168,7 @@ def certify(
     for name, (relation, bound) in THRESHOLDS.items():
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
-    known = recorder.beliefs, recorder.truths
+    known = recorder.estimates, recorder.truths
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
     return {
@@ -181,7 +181,7 @@ def certify(
         "return_expert": one,
         **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
-        "inferability": [inferability(task, x, recorder.grid.theta, y) for x, y in zip(*known, strict=True)],
+        "inferability": [inferability(task, x, y) for x, y in zip(*known, strict=True)],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
         "grid": len(recorder.grid.theta),
@@ -190,14 +190,14 @@ def certify(
     }
 
 
-def inferability(task: envs.Task, belief: Array, grid: Array, truth: Array) -> dict[str, float]:
-    """How well the exact posterior of expert trials [N, K] knows theta: R^2 of its mean, or accuracy if categorical."""
+def inferability(task: envs.Task, estimate: Array, truth: Array) -> dict[str, float]:
+    """How well estimates [N, L] from expert trials agree with theta: R^2, or accuracy of a categorical latent."""
     inferable = {}
     for i, latent in enumerate(task.latents):
         if latent.distribution == "categorical":
-            inferable[latent.name] = float((grid[belief.argmax(-1), i] == truth[:, i]).mean())
+            inferable[latent.name] = float((estimate[:, i] == truth[:, i]).mean())
         else:
-            residual = belief @ grid[:, i] - truth[:, i]
+            residual = estimate[:, i] - truth[:, i]
             inferable[latent.name] = float(1 - (residual**2).mean() / truth[:, i].var())
     return inferable
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from deconfounded.deconf.equations import belief_update
 from deconfounded.envs import BatchEnv, MujocoTask
+from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.task import Simulator
 from deconfounded.experts.policy import Expert, sample_rows
@@ -102,11 +103,78 @@ class Grid:
     def _true(self) -> Simulator:
         return self.env.task.simulator(self.env.n)
 
+    def acting(self, log_belief: Array, state: Array) -> Array:
+        """Log-belief [N, K] about what acts in states [N, S]."""
+        return log_belief
+
+    def updated(
+        self, log_belief: Array, state: Array, obs: Array, log_dynamics: Array, log_policy: Array | None = None
+    ) -> Array:
+        """The log-belief after steps from states [N, S] and observations [N, O], by likelihoods [N, K]."""
+        return belief_update(log_belief, log_dynamics, log_policy)
+
+    def sample(self, log_belief: Array, rng: Streams) -> Array:
+        """Thetas [N, L] drawn from beliefs."""
+        return self.theta[sample_rows(np.exp(log_belief), rng)]
+
+    def estimate(self, log_belief: Array) -> Array:
+        """Thetas [N, L]: of each latent the posterior mean; of a categorical one its value in the likeliest theta."""
+        likeliest, mean = self.theta[log_belief.argmax(-1)], np.exp(log_belief) @ self.theta
+        return np.where([lat.distribution == "categorical" for lat in self.env.task.latents], likeliest, mean)
+
+    def features(self, log_belief: Array) -> Array:
+        """The posterior mean [N, F] of the encoded theta."""
+        return np.exp(log_belief) @ self.env.task.encode_theta(self.theta)
+
     def log_policy(self, obs: Array, action: Array) -> Array:
         """log pi_exp(a | s, theta) [N, K]; obs [N, O], action [N, A]."""
         n, k = len(obs), len(self.theta)
         thetas = np.tile(self.theta, (n, 1))
         return self.expert.log_prob(np.repeat(obs, k, 0), np.repeat(action, k, 0), thetas).reshape(n, k)
+
+
+class PatchGrid(Grid):
+    """Beliefs of a task of patches, whose posterior factorises: log-beliefs are [N, L, K], about each patch.
+
+    Thetas of the grid have all patches alike. A step is evidence of the patch that acted; an action, of the one that
+    the expert heeds.
+    """
+
+    def __init__(self, env: BatchEnv, expert: Expert, k: int) -> None:
+        super().__init__(env, expert, k)
+        assert isinstance(env.task, PatchedTask)
+        self.task = env.task
+
+    def prior(self, n: int) -> Array:
+        return np.repeat(super().prior(n)[:, None], self.theta.shape[1], 1)
+
+    def acting(self, log_belief: Array, state: Array) -> Array:
+        return log_belief[np.arange(len(state)), self.task.patch(state)]
+
+    def updated(
+        self, log_belief: Array, state: Array, obs: Array, log_dynamics: Array, log_policy: Array | None = None
+    ) -> Array:
+        new, rows = log_belief.copy(), np.arange(len(state))
+        for patch, log_prob in ((self.task.patch(state), log_dynamics), (self.task.heeded(obs), log_policy)):
+            if log_prob is not None:
+                new[rows, patch] = belief_update(new[rows, patch], log_prob)
+        return new
+
+    def sample(self, log_belief: Array, rng: Streams) -> Array:
+        drawn = [sample_rows(np.exp(log_belief[:, i]), rng) for i in range(log_belief.shape[1])]
+        return self.theta[np.stack(drawn, -1), np.arange(len(drawn))]
+
+    def estimate(self, log_belief: Array) -> Array:
+        return np.exp(log_belief) @ self.theta[:, 0]
+
+    def features(self, log_belief: Array) -> Array:
+        encoded = self.task.latents[0].encode(self.theta[:, 0])
+        return (np.exp(log_belief) @ encoded).reshape(len(log_belief), -1)
+
+
+def grid_of(env: BatchEnv, expert: Expert, k: int) -> Grid:
+    """The grid of k values that fits a task."""
+    return (PatchGrid if isinstance(env.task, PatchedTask) else Grid)(env, expert, k)
 
 
 def _mixed(log_belief: Array, transition: Array) -> Array:
@@ -128,7 +196,7 @@ class ExactAgent(Agent):
     ) -> None:
         """k: the grid, or how many values it has."""
         self.env, self.expert, self.conditional, self.static = env, expert, conditional, static
-        self.grid = k if isinstance(k, Grid) else Grid(env, expert, k)
+        self.grid = k if isinstance(k, Grid) else grid_of(env, expert, k)
 
     def begin(self, n: int) -> None:
         self.log_belief, self._first, self._steps = self.grid.prior(n), True, 0
@@ -142,20 +210,20 @@ class ExactAgent(Agent):
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
-        index = sample_rows(np.exp(self.log_belief), self._rng)
-        return self.expert.act(obs, self.grid.theta[index], self._rng)
+        return self.expert.act(obs, self.grid.sample(self.log_belief, self._rng), self._rng)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        before = self.log_belief[alive]
-        log_dynamics = self.grid.log_dynamics(self._state[alive], action[alive], self.env.state[alive], before)
+        before, state = self.log_belief[alive], self._state[alive]
+        acting = self.grid.acting(before, state)
+        log_dynamics = self.grid.log_dynamics(state, action[alive], self.env.state[alive], acting)
         log_policy = self.grid.log_policy(obs[alive], action[alive]) if self.conditional else None
-        self.log_belief[alive] = belief_update(before, log_dynamics, log_policy)
+        self.log_belief[alive] = self.grid.updated(before, state, obs[alive], log_dynamics, log_policy)
         if not self.static:
             self.log_belief = self.grid.predict_steps(self.log_belief)
         self._steps += 1
 
     def features(self) -> NDArray[np.float32]:
         """The posterior mean of the encoded theta."""
-        return (np.exp(self.log_belief) @ self.env.task.encode_theta(self.grid.theta)).astype(np.float32)
+        return self.grid.features(self.log_belief).astype(np.float32)

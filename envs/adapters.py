@@ -29,7 +29,7 @@ def _array(action: Any) -> NDArray[Any]:
 
 
 def _observation_space(task: Task, privileged: bool) -> spaces.Box:
-    base, more = task.observation_space, np.ones(task.theta_width if privileged else 0, np.float32)
+    base, more = task.observation_space, np.ones(task.seen_width if privileged else 0, np.float32)
     return spaces.Box(np.append(base.low, -more), np.append(base.high, more))
 
 

@@ -111,10 +111,10 @@ class BatchEnv:
         return mask if mask.shape else np.full(self.n, mask)
 
     def observe(self) -> Obs:
-        """Observations [N, O] of the present states; the privileged view appends the encoded theta."""
+        """Observations [N, O] of the present states; the privileged view appends what experts see of theta."""
         obs = self.task.observe(self.state).astype(np.float32).clip(self._space.low, self._space.high)
         if self.privileged:
-            obs = np.concatenate([obs, self.task.encode_theta(self.theta).astype(np.float32)], -1)
+            obs = np.concatenate([obs, self.task.seen_theta(obs, self.theta).astype(np.float32)], -1)
         return obs
 
     def step(self, action: object) -> tuple[Obs, Array, Mask, Mask]:

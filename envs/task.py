@@ -236,6 +236,19 @@ class Task(ABC):
         """Features [..., F] of theta [..., L], of about unit size, for experts and oracles alone."""
         return np.concatenate([lat.encode(theta[..., i]) for i, lat in enumerate(self.latents)], -1)
 
+    def seen_theta(self, obs: Array, theta: Array) -> Array:
+        """Features [N, F'] of theta [N, L] that experts are given at observations [N, O]; by default all."""
+        return self.encode_theta(theta)
+
+    @property
+    def seen_width(self) -> int:
+        """F', the width of `seen_theta`."""
+        return self.theta_width
+
+    def acting_theta(self, theta: Array, state: Array) -> Array:
+        """Those of the latents [N, L] that act on a step from states [N, S]; by default all."""
+        return theta
+
     def check_theta(self, theta: object, n: int) -> Array:
         """Any array-like -> [N, L]. Raises InputError for a wrong shape or a value out of bounds."""
         try:

@@ -78,7 +78,7 @@ class BoxExpert(Expert):
 
 
 class NetworkExpert(BoxExpert):
-    """An expert whose mean is a tanh network of the observation and the encoded theta."""
+    """An expert whose mean is a tanh network of the observation and of what it sees of theta."""
 
     def __init__(self, task: Task, weights: dict[str, NDArray[np.float32]]) -> None:
         super().__init__(task)
@@ -86,7 +86,7 @@ class NetworkExpert(BoxExpert):
 
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
         w, last = self.weights, len(self.weights) // 2 - 1
-        rows = np.concatenate([obs, self.task.encode_theta(theta)], -1).astype(np.float32)
+        rows = np.concatenate([obs, self.task.seen_theta(obs, theta)], -1).astype(np.float32)
         hidden = rows.reshape(groups, -1, rows.shape[1])
         for i in range(last):
             hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
@@ -169,7 +169,7 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
         weights = load_file(file)
     except (SafetensorError, OSError) as error:
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
-    width = len(task.observation) + task.theta_width
+    width = len(task.observation) + task.seen_width
     for i in range(max(len(weights) // 2, 1)):
         weight, bias = weights.get(f"{i}.weight"), weights.get(f"{i}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:

@@ -66,12 +66,12 @@ def rollout_equals_single_steps(task: MujocoTask) -> None:
     """The thread pool gives the states of mj_step on the whole model, without a warm start at a control step."""
     batch, size = BatchEnv(task, 3), mujoco.mj_stateSize(task.model, STATE.value)  # without the readings
     batch.reset(4)
-    models = [task.edited(task.model, theta) for theta in batch.theta]
-    datas, state = [mujoco.MjData(model) for model in models], np.zeros(size)
+    state = np.zeros(size)
     for action in actions(task, 3, 12):
         outcome, control = batch.simulator.outcome(batch.state, action), task.control(action[:, None])[:, 0]
-        for i, (model, data) in enumerate(zip(models, datas, strict=True)):
-            mujoco.mj_resetData(model, data)
+        for i, theta in enumerate(task.acting_theta(batch.theta, batch.state)):
+            model = task.edited(task.model, theta)
+            data = mujoco.MjData(model)
             mujoco.mj_setState(model, data, batch.state[i, :size], STATE.value)
             data.ctrl[:] = control[i]
             for _ in range(task.substeps):

@@ -15,6 +15,8 @@ Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m.
 m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
 """
 
+from typing import ClassVar
+
 import mujoco
 import numpy as np
 from gymnasium import spaces
@@ -44,10 +46,11 @@ class IcyRoad(MujocoTask):
     """Joints x, y, z, yaw of the chassis, two that steer, and one for each wheel."""
 
     name = "icy_road"
-    latents = (Latent("grip", "", 0.1, 0.6, "loguniform"),)
+    latents: ClassVar[tuple[Latent, ...]] = (Latent("grip", "", 0.1, 0.6, "loguniform"),)
     horizon = 200
     substeps = 5
     expert_noise = 0.02
+    stretch = WAVE  # m, of the road, on which episodes start
     process_noise = {
         **{"x": (0.003, 0.045), "y": (0.003, 0.045), "z": (4e-4, 0.05), "yaw": (0.006, 0.12)},
         **{joint: (0.002, 0.05) for joint in ("steer_left", "steer_right")},
@@ -80,7 +83,7 @@ class IcyRoad(MujocoTask):
         return np.concatenate([STEERING * action[..., [0, 0]], TORQUE * action[..., [1, 1, 1, 1]]], -1)
 
     def init_state(self, rng: Streams) -> Array:
-        x, offset, turn, speed = rng.uniform((0, -0.1, -0.1, 0.7), (WAVE, 0.1, 0.1, 1.0))
+        x, offset, turn, speed = rng.uniform((0, -0.1, -0.1, 0.7), (self.stretch, 0.1, 0.1, 1.0))
         y, direction, _ = road(x)
         yaw = turn + direction
         rolling = {wheel: (0.0, speed / RADIUS) for wheel in WHEELS}
