@@ -1,0 +1,84 @@
+"""Tasks of patches: which latent acts, and beliefs that factorise over patches."""
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.deconf.equations import belief_update
+from deconfounded.deconf.exact import Grid, PatchGrid
+from deconfounded.envs.contract.probe import actions
+from deconfounded.envs.streams import Array
+from deconfounded.envs.tasks.patchy_road import PatchyRoad
+from deconfounded.experts import policy
+
+RNG = np.random.default_rng(0)
+
+
+def drive(task: PatchyRoad, steps: int) -> list[tuple[Array, Array, Array, Array]]:
+    """State, observation, action and next state of random driving, straight on, in eight environments."""
+    env, rows = envs.BatchEnv(task, 8), []
+    obs = env.reset(2)
+    for action in actions(task, 8, steps) * (0.1, 1):
+        before, seen = env.state, obs
+        obs = env.step(action)[0]
+        rows.append((before, seen, action, env.state))
+    return rows
+
+
+def test_the_present_patch_alone_acts() -> None:
+    """Outcomes are those of icy_road with the patch's grip; the other patches' grips change no bit."""
+    task, icy = PatchyRoad(), envs.get("icy_road")
+    theta = task.sample_theta(envs.streams.Streams(RNG.spawn(8)))
+    for state, _, action, _ in drive(task, 3):
+        patch = task.patch(state)
+        own = np.take_along_axis(theta, patch[:, None], -1)
+        outcome = task.outcome(state, action, theta)
+        np.testing.assert_array_equal(outcome, icy.outcome(state, action, own))
+        np.testing.assert_array_equal(outcome, task.outcome(state, action, np.where(theta == own, theta, 0.3)))
+    assert len(np.unique(patch)) > 2
+
+
+def test_one_model_serves_rows_in_several_patches() -> None:
+    """Rows of one environment in all patches are as they are alone."""
+    task = PatchyRoad()
+    theta = np.geomspace(0.1, 0.6, 6)
+    simulator = task.simulator(1)
+    simulator.set_theta(0, theta)
+    state, _, action, _ = drive(task, 1)[0]
+    together = simulator.outcome(state, action, np.zeros(8, int))
+    np.testing.assert_array_equal(together, task.outcome(state, action, np.tile(theta, (8, 1))))
+
+
+def test_the_expert_heeds_the_patch_a_metre_ahead() -> None:
+    """All around the circuit, from the observation alone; its network is icy_road's."""
+    task = PatchyRoad()
+    x = np.arange(0.05, 24, 0.1)
+    state = task.state(x=(x, 1.0))
+    heeded = task.heeded(task.observe(state).astype(np.float32))
+    np.testing.assert_array_equal(heeded, (np.floor((x + 1) / 4) % 6).astype(int))
+    theta = np.tile(np.geomspace(0.1, 0.6, 6), (len(x), 1))
+    obs = task.observe(state)
+    icy = policy.load(envs.get("icy_road")).mean(obs[:, :-2], theta[0, heeded][:, None])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(policy.load(task).mean(obs, theta), icy, atol=1e-5)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("conditional", [False, True])
+def test_the_factorised_posterior_is_the_joint_one(conditional: bool) -> None:
+    """Two grips of six patches: marginals of the joint posterior over 64 thetas, after 25 steps."""
+    task = PatchyRoad()
+    expert, env = policy.load(task), envs.BatchEnv(task, 8)
+    factored, joint = PatchGrid(env, expert, 2), Grid(env, expert, 2)
+    values = factored.theta[:, 0]
+    joint.theta = np.stack(np.meshgrid(*[values] * 6, indexing="ij"), -1).reshape(-1, 6)
+    joint._simulator = task.simulator(64)
+    for i, theta in enumerate(joint.theta):
+        joint._simulator.set_theta(i, theta)
+    beliefs, whole = factored.prior(8), np.full((8, 64), -np.log(64))
+    for state, obs, action, following in drive(task, 25):
+        log_policy = [grid.log_policy(obs, action) if conditional else None for grid in (factored, joint)]
+        likely = factored.log_dynamics(state, action, following)
+        beliefs = factored.updated(beliefs, state, obs, likely, log_policy[0])
+        whole = belief_update(whole, joint.log_dynamics(state, action, following), log_policy[1])
+    high = joint.theta == values[1]
+    np.testing.assert_allclose(np.exp(beliefs)[..., 1], np.exp(whole) @ high, atol=1e-4)  # single precision
+    assert np.ptp(np.exp(beliefs)[..., 1]) > 0.5
