@@ -39,6 +39,7 @@ SOME = ["task:ant_goal", "expert:ant_goal", "method:deconfounded_gru", "method:n
 def test_the_same_on_another_cpu() -> None:
     """With two threads and the kernels of a CPU without vector extensions."""
     code = f"""
+import torch
 from tests.fingerprints import kept, problem
 torch.set_num_threads(2)
 assert torch.backends.cpu.get_cpu_capability() == "DEFAULT"

@@ -26,10 +26,6 @@ from deconfounded.benchmarks.studies.foreign.world import (
     explorer,
     task,
 )
-from deconfounded.deconf.methods import deconfounded, memoryless_bc, naive_rnn
-from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
-from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_json
 from deconfounded.experts.rollout import Agent, RandomAgent, Rollout
@@ -75,9 +71,26 @@ class Bench:
         return f"{self.returns[name][-1]:.4g}"
 
 
+def _naive_rnn(bench: Bench) -> Agent:
+    from deconfounded.deconf.methods import naive_rnn  # torch takes seconds
+    from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+
+    return naive_rnn.train(bench.demonstrated.trials, RecurrentConfig(), rng())
+
+
+def _blind(bench: Bench) -> Agent:
+    from deconfounded.deconf.methods import memoryless_bc
+
+    return memoryless_bc.train(bench.demonstrated.trials, memoryless_bc.MemorylessConfig(), rng())
+
+
 def _oracle(bench: Bench) -> Agent:
+    from deconfounded.deconf.methods import memoryless_bc
+
     trials, theta = bench.demonstrated.trials, bench.encoded(bench.demonstrated.theta)
-    return memoryless_bc.train(trials, MemorylessConfig(), rng(), theta, lambda: bench.encoded(bench.scorer.theta))
+    return memoryless_bc.train(
+        trials, memoryless_bc.MemorylessConfig(), rng(), theta, lambda: bench.encoded(bench.scorer.theta)
+    )
 
 
 def rng() -> np.random.Generator:
@@ -86,8 +99,10 @@ def rng() -> np.random.Generator:
 
 
 def _deconfounded(bench: Bench) -> Agent:
+    from deconfounded.deconf.methods import deconfounded
+
     explore = explorer(bench.case.world, EXPLORED, np.random.default_rng(SEED + 1))
-    return deconfounded.train(bench.demonstrated.trials, explore, DeconfoundedConfig(), rng())
+    return deconfounded.train(bench.demonstrated.trials, explore, deconfounded.DeconfoundedConfig(), rng())
 
 
 AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
@@ -95,10 +110,10 @@ AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
     "expert": lambda bench: WorldExpert(bench.case.world, bench.scorer.theta),
     "told another": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
     "filter": lambda bench: LinearFilter(bench.case.world, TRIALS, SEED) if bench.case.world.evidence else None,
-    "naive_rnn": lambda bench: naive_rnn.train(bench.demonstrated.trials, RecurrentConfig(), rng()),
+    "naive_rnn": _naive_rnn,
 }
 LATER: dict[str, Callable[[Bench], Agent | None]] = {
-    "blind_bc": lambda bench: memoryless_bc.train(bench.demonstrated.trials, MemorylessConfig(), rng()),
+    "blind_bc": _blind,
     "oracle_bc": _oracle,
     "deconfounded": _deconfounded,
 }
