@@ -35,6 +35,7 @@ from deconfounded.deconf.diagnosis.thresholds import (
     STAKES,
     TRAIT_SHARE,
     TRAIT_STAKES,
+    UNUSED,
 )
 from deconfounded.envs.support.errors import InputError
 
@@ -163,7 +164,7 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if memory.low < -MISFIT:
         found = "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
         return conclude("cannot tell", None, found, MORE_TRIALS)
-    unused = in_exploration is not None and figures["latent_gain"].low > max(memory.high, 0) + NEGLIGIBLE
+    unused = in_exploration is not None and figures["latent_gain"].low > (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
     if memory.low <= NEGLIGIBLE and not unused:
         if memory.high > NEGLIGIBLE:
             return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
