@@ -59,7 +59,7 @@ class TestTrials:
                     one = env.step(action[i])
                     np.testing.assert_array_equal(one[0], obs[i])
                     assert one[1:4] == (reward[i], terminated[i], truncated[i])
-                if ended[i] // episodes < 9 and not task.drifts:  # see test_drift.py
+                if ended[i] // episodes < 9 and not (task.drifts or task.switches):  # see test_drift.py
                     np.testing.assert_array_equal(vec.batch.theta[i], drawn[i][ended[i] // episodes])
             over = terminated | truncated
             ended += over
@@ -85,7 +85,7 @@ class TestTrials:
         for all_kept, none_kept, one, other in zip(kept, drawn, mixed, again, strict=True):
             np.testing.assert_array_equal(one, np.where(mask[:, None, None], all_kept, none_kept))
             np.testing.assert_array_equal(one, other)
-        for i in range(0 if task.drifts else n):
+        for i in range(0 if task.drifts or task.switches else n):
             own = thetas(task, 5 + i, 3)
             np.testing.assert_array_equal(mixed[1][i], own[:2] if mask[i] else own[1:])
 
@@ -98,11 +98,11 @@ class TestTrials:
         first = vec.batch.theta.copy()
         ended, over = np.zeros(2, int), np.zeros(2, bool)
         own = thetas(task, 3, 2), thetas(task, 4, 3)
-        assert task.drifts or np.array_equal(first, [own[0][0], own[1][1]])
+        assert task.drifts or task.switches or np.array_equal(first, [own[0][0], own[1][1]])
         for action in flat(task, 2, task.horizon + 1):
             *_, terminated, truncated, _ = vec.step(action)
             for i in np.flatnonzero(over & (ended == 1)):
-                assert task.drifts or np.array_equal(vec.batch.theta[i], own[i][1])
+                assert task.drifts or task.switches or np.array_equal(vec.batch.theta[i], own[i][1])
             over = terminated | truncated
             ended += over
         assert ended.all()
