@@ -48,7 +48,7 @@ def foreign() -> str:
     rows = kept(report.KEPT)
     if not rows:
         return "These worlds have not been measured with the present versions of methods and diagnosis."
-    return f"{report.summary(rows)} ({_origins(rows)})\n\n{report.table(rows)}"
+    return f"{report.summary(rows)} ({_origins(rows)})\n\n{report.table(rows)}".lstrip()
 
 
 def noises() -> str:
