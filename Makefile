@@ -21,6 +21,7 @@ lint: $(VENV)/installed
 	$(VENV)/bin/mypy
 
 docs: $(VENV)/installed  # the site, docs/_build/html/index.html
+	$(VENV)/bin/pip install -q -c constraints.txt --config-settings editable_mode=compat -e .[docs]
 	OMP_NUM_THREADS=1 $(VENV)/bin/deconf site
 
 $(VENV)/installed: pyproject.toml constraints.txt
