@@ -16,7 +16,7 @@ from deconfounded.deconf.exact import Grid
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, run_trials
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, of_steps, run_trials
 
 HELD_OUT = 4  # every so many-th trial fits the noise, not the mean
 SHRINKAGE = 0.05  # of the residuals' covariance to its diagonal: what is nearly deterministic is what the fit misses
@@ -99,7 +99,7 @@ def steps(rollouts: list[Rollout], which: Mask) -> tuple[Array, Array, Array, Ar
     parts = []
     for trials, _, hidden in rollouts:
         mask = trials.mask[which]
-        theta = np.repeat(hidden[which][:, :, None], mask.shape[2], 2)
+        theta = of_steps(hidden[which], mask.shape[2])
         of = trials.obs[which, :, :-1], trials.action[which], trials.obs[which, :, 1:], theta
         parts.append([x[mask].astype(float) for x in of])
     obs, action, next_obs, theta = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -112,8 +112,8 @@ def calibrated(dynamics: LearnedDynamics, rollouts: list[Rollout], which: Mask) 
     score = np.zeros(len(EXPONENTS))
     for rollout in rollouts:
         for b in np.flatnonzero(which):
-            one = np.arange(len(which)) == b
-            obs, action, next_obs, theta = steps([rollout], one)
+            trial = np.arange(len(which)) == b
+            obs, action, next_obs, theta = steps([rollout], trial)
             true = dynamics.log_prob(obs, action, next_obs, theta)
             nats = (dynamics.log_grid(obs, action, next_obs, decoys) - true[:, None]).cumsum(0)
             score -= [np.logaddexp.reduce(np.insert(e * nats, 0, 0, 1), 1).mean() for e in EXPONENTS]

@@ -106,9 +106,11 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
         better: dict[str, Figure] = {}
         for episode in EPISODES:
             own = {task: at(scores, name, task, episode) for task in scores[name]}
-            found = statistics.over_tasks(statistics.iqm, {task: np.array([*of.values()]) for task, of in own.items()})
-            assert found is not None
-            mean[episode] = found
+            average = statistics.over_tasks(
+                statistics.iqm, {task: np.array([*of.values()]) for task, of in own.items()}
+            )
+            assert average is not None
+            mean[episode] = average
             for other in against if name in methods else ():
                 theirs = {task: at(scores, other, task, episode) for task in own if task in scores[other]}
                 pairs = {task: sorted(set(own[task]) & set(of)) for task, of in theirs.items()}

@@ -176,8 +176,8 @@ def method_page(name: str, found: index.Found) -> str:
     used = "; ".join(f"*{kind}*, {uses[kind]}" for kind in method.uses) or "nothing"
     parts += [f"Tier: {method.tier}. It uses {used}. Version {method.version}."]
     if method.deployments:
-        ways = ", ".join(f"`{name}_{way}`" for way in method.deployments)
-        parts += [f"Its agent is also scored in another deployment: {ways}."]
+        deployments = ", ".join(f"`{name}_{way}`" for way in method.deployments)
+        parts += [f"Its agent is also scored in another deployment: {deployments}."]
     asked = "" if name in DEFAULT else f" --methods {name}"
     parts += [f"```bash\ndeconf run --task slippery_cartpole{asked}\n```", "## Results", _scores(name, found)]
     items = [item for item in _bullets(baselines, name) if item.startswith(f"- `{name}`")]

@@ -100,23 +100,22 @@ class EvidenceBelief(Belief):
         self.out = Mlp(2 * self.features + 1, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
 
-    def _innovation(self, batch: Batch) -> Tensor:
-        """The scaled change [..., O] of transitions, less its expectation."""
-        inputs = [self.inputs.obs(batch.obs), self.inputs.action(batch.action)]
-        return self.change(batch.next_obs - batch.obs) - self.expected(torch.cat(inputs, -1))
+    def _innovation(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        """Scaled observations and actions of transitions, and the scaled change [..., O] less its expectation."""
+        inputs = self.inputs.obs(batch.obs), self.inputs.action(batch.action)
+        return *inputs, self.change(batch.next_obs - batch.obs) - self.expected(torch.cat(inputs, -1))
 
     def innovation_loss(self, steps: Batch) -> Tensor:
-        return masked_mean(self._innovation(steps).square().sum(-1), steps.mask)
+        return masked_mean(self._innovation(steps)[2].square().sum(-1), steps.mask)
 
     def _terms(self, batch: Batch) -> Tensor:
         """Increments of the memory [..., M], one a transition: its evidence and a count of 1; 0 where the mask is 0."""
         with torch.no_grad():
-            innovation = self._innovation(batch)
-            action = self.inputs.action(batch.action)
+            obs, action, innovation = self._innovation(batch)
             direct = [innovation]
             if self.products:
                 direct.append((action[..., None] * innovation[..., None, :]).flatten(-2))
-            inputs = torch.cat([self.inputs.obs(batch.obs), action, *direct], -1)
+            inputs = torch.cat([obs, action, *direct], -1)
         evidence = self.whiten(torch.cat([self.evidence(inputs), *direct], -1), batch.mask)
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)

@@ -163,14 +163,16 @@ def measure(
         rollouts = _rollouts(explanation, learned_env, recurrent, trajectories(episodes), amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else _differ(trials, explore)
-    found = Findings(memory, *in_dynamics, explanation.action_evidence, explanation.exploration_fit, differ, *rollouts)
+    findings = Findings(
+        memory, *in_dynamics, explanation.action_evidence, explanation.exploration_fit, differ, *rollouts
+    )
     if explore is not None and memory > CLEAR and (explanation.expert_evidence or 0.0) < CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, present, Signature.of(train), amounts.cloning, draws)
         stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)
-        found = found._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
+        findings = findings._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
     report(1)
-    return found
+    return findings
 
 
 def _differ(expert: Trials, explore: Trials) -> float | None:

@@ -148,8 +148,8 @@ class LinearFilter(Agent):
     def __init__(self, world: World, n: int, seed: int) -> None:
         self.world, self.space, self.columns = world, task(world).facts.space, list(world.evidence)
         theta = thetas(world, n, seed)
-        told = np.where(np.arange(n)[:, None] % 2, theta, np.roll(theta, 1, 0))
-        trials = roll_out(world, WorldExpert(world, told), theta, seed).trials
+        assumed = np.where(np.arange(n)[:, None] % 2, theta, np.roll(theta, 1, 0))
+        trials = roll_out(world, WorldExpert(world, assumed), theta, seed).trials
         obs, action = trials.obs[:, :, :-1][trials.mask], trials.action[trials.mask]
         products = _ones(action)[:, :, None] * theta[np.nonzero(trials.mask)[0]][:, None]
         inputs = np.concatenate([_inputs(obs, action), products.reshape(len(obs), -1)], 1)
