@@ -1,10 +1,19 @@
 """What tests share."""
 
+import contextlib
+import io
+import signal
+import sys
 from dataclasses import asdict
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
+from unittest import mock
 
+from deconfounded import __main__
+from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.local import Here
 from deconfounded.benchmarks.engine.presets import Preset
 
 FEW = {"rounds": 2, "inference_updates": 2, "inference_batch": 4, "imitation_updates": 2, "final_updates": 2}
@@ -38,6 +47,25 @@ def tiny_preset() -> Preset:
     """Two or three updates of each kind, on four trials."""
     configs = {name: asdict(METHODS[name].config(values)) for name, values in PLAIN.items()}
     return Preset(seeds=3, expert_trials=4, explore_trials=4, eval_trials=4, query_trials=4, configs=configs)
+
+
+def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
+    """The command `deconf ARGS`, run in a folder, but in this process, jobs and all: a process takes seconds to begin."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    with contextlib.ExitStack() as stack:
+        for context in (contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)):
+            stack.enter_context(context)
+        stack.enter_context(mock.patch.object(sys, "argv", ["deconf", *args]))
+        stack.enter_context(mock.patch.object(commands, "engine", lambda *_: Here()))
+        try:
+            __main__.main()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else 1
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+    return CompletedProcess(args, code, out.getvalue(), err.getvalue())
 
 
 def processes(mark: str, *starts: str) -> list[tuple[int, str]]:

@@ -34,7 +34,7 @@ from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
 from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
-from tests.tools import tiny_preset
+from tests.tools import deconf, tiny_preset
 
 ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
@@ -61,19 +61,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def deconf(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
+def deconf_process(folder: Path, *args: str) -> subprocess.CompletedProcess[str]:
     environ = {**os.environ, "MUJOCO_GL": "off", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "deconfounded", *args]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
 
 
 @pytest.mark.slow
-def test_run_play_score(folder: Path) -> None:
+def test_run_play_score(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
     assert len([line for line in (folder / "my_rnn.py").read_text().splitlines() if line]) <= 60
+    monkeypatch.setenv("MUJOCO_GL", "off")
     small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=8", "blind_bc.updates=5")
     mine = ("--task", BENT, "--expert", "linear.py:control")
-    done = deconf(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small)
+    done = deconf_process(folder, "run", *mine, "--methods", "my_rnn.py:fit", "blind_bc", *small)
     assert done.returncode == 0, done.stderr
     run = folder / "results" / "bent_cartpole-smoke"
     results = json.loads((run / "results.json").read_text())
