@@ -156,10 +156,13 @@ def digest(files: Iterable[Path], name: str = "") -> str:
 
 def content(file: Path) -> bytes:
     """A file's bytes; of a Python file its syntax tree without docstrings, which comments and layout do not change."""
-    text = file.read_bytes()
-    if file.suffix != ".py":
-        return text
-    tree = ast.parse(text)
+    return _code(file, file.stat().st_mtime_ns) if file.suffix == ".py" else file.read_bytes()
+
+
+@cache
+def _code(file: Path, changed: int) -> bytes:
+    """The content of a Python file; `changed` as above."""
+    tree = ast.parse(file.read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
             node.body = node.body[1:]

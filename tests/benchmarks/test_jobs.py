@@ -36,11 +36,12 @@ def settings(name: str, fresh: bool) -> Any:
     return replace(preset("smoke", envs.get(name), "cpu"), **amounts, configs=configs)
 
 
+TOYS = Path(__file__).parents[1] / "toys.py"
 KINDS = (
-    (BenchmarkJob, "slippery_cartpole", "deconfounded", False),
-    (BenchmarkJob, "slippery_cartpole", "naive_rnn", False),
-    (FigureJob, "bandit", "deconfounded_gru", True),
-    (FigureJob, "bandit", "naive_rnn", True),
+    (BenchmarkJob, "Push", "deconfounded", False),
+    (BenchmarkJob, "Push", "naive_rnn", False),
+    (FigureJob, "Arms", "deconfounded_gru", True),
+    (FigureJob, "Arms", "naive_rnn", True),
 )
 
 
@@ -52,7 +53,8 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         patch.setattr(paper, "POINTS", 8)
         patch.setattr(jobs, "SAVE_EVERY_S", 0.0)
         patch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-        job: jobs.Job = kind(task, settings(task, fresh), method, (0, 1), tmp_path_factory.mktemp("whole"))
+        named, folder = f"{TOYS}:{task}", tmp_path_factory.mktemp("whole")
+        job: jobs.Job = kind(named, settings(named, fresh), method, (0, 1), folder, f"{TOYS}:control")
         job.run()
         yield job
 
@@ -101,6 +103,7 @@ def test_interrupted_training_goes_on(
 def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From jobs to figures and table: exact curves by their closed forms, budgets by the settings."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(paper, "POINTS", 4)
     task, methods = envs.get("bandit"), ("naive_rnn", "deconfounded")
     for method in methods:
         FigureJob("bandit", settings("bandit", False), method, (0, 1), tmp_path).run()
@@ -109,9 +112,9 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [(method, seed) for method, seed, _ in finished] == [
         ("deconfounded", 0), ("deconfounded", 1), ("naive_rnn", 0), ("naive_rnn", 1)
     ]  # fmt: skip
-    references = paper.exact(task, 4000)
-    assert references["interventional"]["pulls"] == pytest.approx(54.1, abs=0.6)
-    assert references["conditional"]["online"][[0, 9, 99]] == pytest.approx([0.2, 0.306, 0.333], abs=0.03)
+    references = paper.exact(task, 1000)  # test_bandit.py has more
+    assert references["interventional"]["pulls"] == pytest.approx(54.1, abs=1.5)
+    assert references["conditional"]["online"][[0, 9, 99]] == pytest.approx([0.2, 0.306, 0.333], abs=0.05)
     assert references["expert"]["loss"] == pytest.approx(-0.6 * np.log(0.6) - 0.4 * np.log(0.1))
     found = paper.summarise(finished, references)
     assert found["deconfounded"]["budget"] == {"expert_trials": 8, "exploration_trials": 20}
