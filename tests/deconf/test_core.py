@@ -503,8 +503,9 @@ class TestMethods:
         "method",
         [name for name, about in METHODS.items() if about.learned and name != "deconfounded_gru"] + ["paper"],
     )
-    def test_seeds_do_not_touch_each_other(self, name: str, method: str) -> None:
+    def test_seeds_do_not_touch_each_other(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """A seed's agent acts alike, bit for bit, trained alone and as the second of three."""
+        monkeypatch.setattr(type(envs.get(name)), "horizon", 25)
         settings = tiny_preset()
         if method == "paper":  # deconfounded as in that preset: its belief, fresh trials each round
             method = "deconfounded"
