@@ -45,7 +45,8 @@ torch.set_num_threads(2)
 assert torch.backends.cpu.get_cpu_capability() == "DEFAULT"
 print(*filter(None, (problem(label, kept()[label]) for label in {SOME})), sep="\\n")
 """
-    other = {"ATEN_CPU_CAPABILITY": "default", "OPENBLAS_CORETYPE": "Haswell", "OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "PASSIVE"}
+    other = {"ATEN_CPU_CAPABILITY": "default", "OPENBLAS_CORETYPE": "Haswell"}
+    other |= {"OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": "PASSIVE"}  # threads that wait do not spin
     root = Path(__file__).resolve().parents[1]
     environ = {**os.environ, **other, "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, "-c", code], env=environ, cwd=root, capture_output=True, text=True)

@@ -50,14 +50,14 @@ def tiny_preset() -> Preset:
 
 
 def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
-    """The command `deconf ARGS`, run in a folder, but in this process, jobs and all: a process takes seconds to begin."""
+    """The command `deconf ARGS`, run in a folder, but in this process, jobs and all: others take seconds to begin."""
     out, err, code = io.StringIO(), io.StringIO(), 0
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with contextlib.ExitStack() as stack:
         for context in (contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)):
             stack.enter_context(context)
         stack.enter_context(mock.patch.object(sys, "argv", ["deconf", *args]))
-        stack.enter_context(mock.patch.object(commands, "engine", lambda *_: Here()))
+        stack.enter_context(mock.patch.object(commands, "engine", return_value=Here()))
         try:
             __main__.main()
         except SystemExit as ended:

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from deconfounded.deconf import methods, wire
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods import naive_rnn
+from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
@@ -145,8 +146,9 @@ def test_loop_of_readme(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_task_from_outside(folder: Path) -> None:
+def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is known by its name from then on, to gymnasium too; its weights are looked for beside it."""
+    monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=20))
     task = envs.get(f"{folder}/{BENT}")
     assert task.name == "bent_cartpole"
     assert task.reference == f"{folder}/{BENT}"
@@ -155,7 +157,7 @@ def test_task_from_outside(folder: Path) -> None:
     with pytest.raises(envs.InputError, match=r"run `deconf train --task .*bent_cartpole.py:BentCartpole`"):
         policy.load(task)
     expert = policy.load(task, f"{folder}/linear.py:control")
-    result = certify.certify(task, expert, trials=8, grid=5)
+    result = certify.certify(task, expert, trials=4, grid=3)
     assert result["return_expert"] > 2 * result["return_random"]
 
 
@@ -598,6 +600,7 @@ class TestSaved:
     def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        monkeypatch.setattr(type(envs.get(task)), "horizon", 25)
         (tmp_path / "jobs").mkdir()
         for method in ("deconfounded", "naive_rnn", "deconfounded_discrete", "blind_bc"):
             job = BenchmarkJob(task, tiny_preset(), method, (0, 1), tmp_path / "jobs")
