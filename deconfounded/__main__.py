@@ -24,6 +24,8 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "play": ("benchmarks.play", "run a saved agent in one environment", NOTHING),
     "score": ("benchmarks.score", "score a saved agent on fresh thetas, or on another range", NOTHING),
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),
+    "push": ("benchmarks.push", "share an agent or a Minari data set on the Hugging Face hub", NOTHING),
+    "pull": ("benchmarks.pull", "fetch an agent or a data set from the hub", NOTHING),
     "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
     "compare": ("benchmarks.compare", "compare methods over seeds and tasks: tables and figures for a paper", NOTHING),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),

@@ -30,11 +30,11 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
         raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
     if cls.__module__.startswith(outside.PREFIX) and (source := outside.source(cls)) is not None:
         code = source.read_bytes()
-    settings, arrays = agent.state()
+    settings, named = agent.state()
     about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
-        content = to_bytes(arrays)
+        content = to_bytes(named)
         described = as_json(file, sealed({**about, "arrays": hashlib.sha256(content).hexdigest()}))
     except InputError:
         raise
@@ -59,6 +59,17 @@ def describe(folder: Path) -> dict[str, Any]:
     return about
 
 
+def arrays(folder: Path, about: dict[str, Any]) -> bytes:
+    """The file of an agent's arrays; about: its agent.json. Raises InputError if it is damaged or missing."""
+    try:
+        content = (folder / ARRAYS).read_bytes()
+    except OSError as error:
+        raise InputError(f"{folder / ARRAYS} cannot be read: {error.strerror}") from None
+    if hashlib.sha256(content).hexdigest() != about["arrays"]:
+        raise InputError(f"{folder / ARRAYS} is damaged, or of another agent; run the benchmark again")
+    return content
+
+
 def load(folder: Path | str) -> Agent:
     """Load the agent in a folder, ready for `begin`. Raises InputError if it is missing or damaged.
 
@@ -72,10 +83,7 @@ def load(folder: Path | str) -> Agent:
         cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
         if not (inspect.isclass(cls) and issubclass(cls, Agent)):
             raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
-        content = (folder / ARRAYS).read_bytes()
-        if hashlib.sha256(content).hexdigest() != about["arrays"]:
-            raise InputError(f"{folder / ARRAYS} is damaged, or of another agent; run the benchmark again")
-        return cls.from_state(about["settings"], from_bytes(content))
+        return cls.from_state(about["settings"], from_bytes(arrays(folder, about)))
     except InputError:
         raise
     except Exception as error:  # any error of the class's own `from_state`

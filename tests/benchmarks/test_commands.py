@@ -75,6 +75,8 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--methods", "gone.py:fit"), "there is no file gone.py"),
     (("play", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
     (("score", "--agent", "nowhere", "--task", "bandit"), "nowhere holds no agent.json"),
+    (("push", "nowhere", "me/x"), "nowhere holds no agent.json, and 0 Minari data sets"),
+    (("pull", "x"), "repository was 'x'; it must be OWNER/NAME"),
     (
         ("verify", "bandit", "random", "0", "--records", "nowhere.jsonl"),
         "records nowhere.jsonl cannot be read: No such file",

@@ -143,6 +143,8 @@ diagnose --data sets/deconf/bandit/expert24s0-v0
 check --task bandit
 certify --task bandit
 train --task slippery_cartpole --steps 64
+push --help
+pull --help
 play --agent results/bandit-smoke/agents/blind_bc-0 --task bandit
 """
 

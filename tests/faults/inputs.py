@@ -128,6 +128,8 @@ ODD: dict[str, tuple[tuple[str, ...], dict[str, tuple[str, ...]]]] = {  # comman
         },
     ),
     "verify": ((), {"record": ("", "nowhere.json", "{folder}", "{file}", "{junk}", "/proc/none")}),
+    "push": (("{agent}",), {"repo": ("", "me", "me/", "me/a b", "../x", "me/a/b", "datasets/")}),
+    "pull": (("--out", "{folder}"), {"repo": ("", "me", "me/", "me/a b", "../x", "me/a/b", "datasets/")}),
     "report": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
     "publish": ((), {"run": ("", "nowhere", "{file}", "{folder}", "/proc/none")}),
     "performance": (
