@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 
-.PHONY: setup demo test quick lint docs
+.PHONY: setup demo test quick lint docs notebooks
 
 setup: $(VENV)/installed
 
@@ -23,6 +23,10 @@ lint: $(VENV)/installed
 docs: $(VENV)/installed  # the site, docs/_build/html/index.html
 	$(VENV)/bin/pip install -q -c constraints.txt --config-settings editable_mode=compat -e .[docs]
 	OMP_NUM_THREADS=1 $(VENV)/bin/deconf site
+
+notebooks: $(VENV)/installed  # the tutorials as docs/tutorials/*.ipynb
+	$(VENV)/bin/pip install -q -c constraints.txt jupytext
+	$(VENV)/bin/jupytext --from md:myst --to ipynb docs/tutorials/*.md
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python >= 3.11 is needed')"

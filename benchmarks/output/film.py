@@ -1,5 +1,8 @@
 """The film of a run: agents side by side under one theta, and under each what it believes of theta as time goes by."""
 
+import base64
+import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +13,7 @@ from PIL import Image, ImageDraw
 
 from deconfounded import envs
 from deconfounded.envs.streams import Array
+from deconfounded.experts.rollout import Agent, run_trials
 
 WIDTH, HEIGHT, HEAD, STRIP = 320, 240, 30, 80  # of a pane, px; a strip for each latent, under its label
 FRAMES = 240  # of a whole film, at most
@@ -99,15 +103,35 @@ class Pane:
         draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
 
 
-def frames(task: envs.Task, clips: Clips) -> list[Any]:
-    """Pictures of the first and the last episode of a trial, all agents side by side.
+class Film:
+    """Pictures [H, W, 3], which notebooks show as an animation."""
+
+    def __init__(self, pictures: Sequence[NDArray[Any]], rate: float) -> None:
+        """rate: pictures a second."""
+        self.pictures: list[Any] = list(pictures)
+        self.rate = rate
+
+    def webp(self) -> bytes:
+        """The animation as a .webp file."""
+        buffer, (first, *others) = io.BytesIO(), map(Image.fromarray, self.pictures)
+        times = {"duration": round(1000 / self.rate), "loop": 0}
+        first.save(buffer, "webp", save_all=True, append_images=others, quality=40, **times)
+        return buffer.getvalue()
+
+    def _repr_html_(self) -> str:
+        data = base64.b64encode(self.webp()).decode()
+        return f'<img alt="animation of agents side by side" src="data:image/webp;base64,{data}">'
+
+
+def film(task: envs.Task, clips: Clips, most: int = FRAMES) -> Film:
+    """The first and the last episode of a trial, all agents side by side; most: pictures.
 
     Raises InputError where no GL works.
     """
     panes = [Pane(task, name, clip) for name, clip in clips.items()]
     episodes = min(len(pane.starts) for pane in panes)
     longest = {e: max(pane.row(e, task.horizon)[0] - pane.starts[e] for pane in panes) for e in (0, episodes - 1)}
-    stride = max(1, -(-sum(longest.values()) // FRAMES))
+    stride = max(1, -(-sum(longest.values()) // most))
     pictures = []
     for e in longest:
         truth = panes[0].clip["theta"][e]
@@ -121,12 +145,22 @@ def frames(task: envs.Task, clips: Clips) -> list[Any]:
             head = f"{task.name}: hidden {named}, episode {e + 1} of {episodes}"
             ImageDraw.Draw(whole).text((8, 7), head, fill=INK, font_size=18)
             pictures.append(np.asarray(whole))
-    return pictures
+    return Film(pictures, frame_rate(task) / stride)
 
 
 def write(task: envs.Task, clips: Clips, file: Path) -> None:
     """The film as .mp4. Raises InputError where no GL works."""
-    imageio.mimsave(file, frames(task, clips), fps=frame_rate(task), quality=7, macro_block_size=2)
+    imageio.mimsave(file, film(task, clips).pictures, fps=frame_rate(task), quality=7, macro_block_size=2)
+
+
+def record(env: envs.BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None) -> dict[str, Any]:
+    """The clip of an agent's first trial; theta [N, L]: None: drawn from p(theta)."""
+    from deconfounded.benchmarks.engine.benchmark import Recorder
+
+    recorder = Recorder(agent, env, filmed=True)
+    hidden = run_trials(env, recorder, episodes, seed, theta).theta[recorder.trial]
+    clip = {key: np.array(value) for key, value in recorder.clip.items() if key != "known"}
+    return {**clip, "theta": hidden[:, 0] if env.task.switches else hidden}
 
 
 def decoded(task: envs.Task, features: Array) -> Array:

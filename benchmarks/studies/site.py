@@ -3,7 +3,7 @@
 Its sources are staged in docs/_build/source: the pages of docs/, CONTRIBUTING and CHANGELOG, with their links resolved,
 and a page for each task, method and module (site_pages.py). A paragraph that is only a link to a section of README or
 CONTRIBUTING is replaced by that section. Sphinx then builds with warnings as errors, and every link of the result is
-checked. Nothing is trained.
+checked. The tutorials are executed, which trains what they train; nothing else is trained.
 """
 
 import os
@@ -26,6 +26,7 @@ CONTENTS: dict[
     str, dict[str, str | None]
 ] = {  # caption: page: its file, from the root of the repository; None: it is generated
     "First steps": {"start": "docs/start.md", "concepts": "docs/concepts.md"},
+    "Tutorials": {f"tutorials/{name}": f"docs/tutorials/{name}.md" for name in ("bandit", "lander", "logs")},
     "Benchmark": {
         **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "baselines": "docs/baselines.md"},
         **{"paper": "docs/paper.md", "spectrum": "docs/spectrum.md", "speed": "docs/speed.md"},
@@ -33,7 +34,8 @@ CONTENTS: dict[
     "How to": {
         **{"environments": "docs/environments.md", "own_task": "docs/own_task.md", "own_method": "docs/own_method.md"},
         **{"worlds": "docs/worlds.md", "core": "docs/core.md", "diagnose": "docs/diagnose.md"},
-        **{"deploy": "docs/deploy.md", "cluster": "docs/cluster.md", "submit": "docs/submit.md"},
+        **{"deploy": "docs/deploy.md", "sharing": "docs/sharing.md"},
+        **{"cluster": "docs/cluster.md", "submit": "docs/submit.md"},
     },
     "Reference": {"commands": None, "api/index": None},
     "Project": {
@@ -47,6 +49,7 @@ ELSEWHERE = {  # what a link to another file of the repository becomes
     **{"README.md": "index", "docs/tasks.md": "tasks/index", "docs/certificates": "tasks/index"},
     **{"docs/records": "records", "deconf/methods": "methods/index"},
 }
+NOTEBOOK = "\nThis page as a notebook, with its outputs: {{nb-download}}`{}.ipynb`.\n"  # at the end of a tutorial
 FENCE = re.compile(r"^(```+|~~~+).*?^\1\s*?$", re.S | re.M)
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\[\]]*\])*\])\(([^()\s]+)\)")
 SECTION = re.compile(r"^\[[^\]\n]+\]\(([^()\s#]*(?:README|CONTRIBUTING)\.md)#([\w-]+)\)\n", re.M)
@@ -148,8 +151,10 @@ class Site:
         """Stage all pages, and the interactive page of results beside them."""
         found = results.published()
         for file, page in PAGES.items():
-            text = (ROOT / file).read_text("utf-8")
-            self.stage(page, text + _contents() if file == HOME else text, file)
+            text = (ROOT / file).read_text("utf-8") + (_contents() if file == HOME else "")
+            if page.startswith("tutorials/"):
+                text += NOTEBOOK.format(page.removeprefix("tutorials/"))
+            self.stage(page, text, file)
         for page, text in site_pages.pages(found).items():
             self.stage(page, text, "docs/generated.md")
         shutil.copytree(DOCS, self.extra / "interactive", ignore=_not_shown, dirs_exist_ok=True)
@@ -220,8 +225,11 @@ def dead_links(folder: Path) -> list[str]:
     return dead
 
 
-def build(folder: Path) -> Path:
-    """Stage and build the site in a folder; returns that of its html. Raises InputError for warnings and dead links."""
+def build(folder: Path, execute: bool = True) -> Path:
+    """Stage and build the site in a folder; returns that of its html. Raises InputError for warnings and dead links.
+
+    execute: the tutorials, so that pages show their outputs.
+    """
     try:
         from sphinx.cmd.build import main as sphinx
     except ModuleNotFoundError:
@@ -231,7 +239,8 @@ def build(folder: Path) -> Path:
     site, html = Site(folder), folder / "html"
     site.write()
     places = ["-c", str(DOCS / "site"), "-d", str(folder / "doctrees"), str(site.source), str(html)]
-    if sphinx(["-W", "--keep-going", "-q", "-E", "-D", f"html_extra_path={site.extra}", *places]):
+    options = ["-D", f"html_extra_path={site.extra}", "-D", f"nb_execution_mode={'force' if execute else 'off'}"]
+    if sphinx(["-W", "--keep-going", "-q", "-E", *options, *places]):
         raise envs.InputError("Sphinx had warnings, see above")
     if dead := dead_links(html):
         raise envs.InputError(f"{len(dead)} links lead nowhere: {'; '.join(dead[:20])}")

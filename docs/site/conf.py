@@ -9,7 +9,7 @@ from deconfounded import __version__
 
 project, author, copyright = "Deconfounded imitation", "The deconfounded-imitation contributors", "Apache-2.0"
 version = release = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.viewcode", "sphinx_copybutton"]
 html_theme, html_title = "furo", "Deconfounded imitation"
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}
@@ -23,6 +23,9 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = False  # of gymnasium and dm_env, which are written in another markup
 viewcode_follow_imported_members = False
+nb_execution_in_temp = nb_execution_raise_on_error = True
+nb_execution_timeout = 600  # seconds a cell
+copybutton_selector = "div:not(.output) > div.highlight pre"
 copybutton_exclude = ".linenos, .gp, .go"
 
 
