@@ -29,7 +29,8 @@ def check(folder: Path, kind: str) -> str:
     about = saved_agents.describe(folder)
     saved_agents.arrays(folder, about)
     own = ", in agent.py, which comes with it" * about["class"].startswith(f"{saved_agents.CODE}:")
-    return f"{about.get('method', 'an agent')} of {about.get('task', 'data from outside')}, class {about['class']}{own}"
+    named = f"{about.get('method', 'an agent')} of {about.get('task', 'data from outside')}, class {about['class']}"
+    return repr(named)[1:-1] + own  # control characters, which a terminal would obey, are escaped
 
 
 def main() -> None:
