@@ -23,7 +23,7 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_inherit_docstrings = False  # of gymnasium and dm_env, which are written in another markup
 viewcode_follow_imported_members = False
-nb_execution_in_temp = nb_execution_raise_on_error = True
+nb_execution_in_temp = nb_execution_raise_on_error = nb_execution_show_tb = True
 nb_execution_timeout = 600  # seconds a cell
 copybutton_selector = "div:not(.output) > div.highlight pre"
 copybutton_exclude = ".linenos, .gp, .go"
