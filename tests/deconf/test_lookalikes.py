@@ -18,10 +18,10 @@ from deconfounded.experts.rollout import Trials
 
 SMALL = Amounts(
     candidates=16,
-    rollouts=96,
-    cloning=MemorylessConfig(updates=400, width=32),
-    naive=RecurrentConfig(updates=250, width=32),
-    exploring=DeconfoundedConfig(inference_updates=400, inference_rate=3e-3, width=32, latent=2),
+    rollouts=48,
+    cloning=MemorylessConfig(updates=200, width=32),
+    naive=RecurrentConfig(updates=130, width=32),
+    exploring=DeconfoundedConfig(inference_updates=200, inference_rate=5e-3, width=32, latent=2),
 )
 NOISE = 0.1
 
