@@ -54,7 +54,7 @@ class EvidenceRecorder(ExpertAgent):
 
     def note(self) -> None:
         """Keep the estimate of the theta of an episode's last step, now that it is over."""
-        self.estimates.append(self.grid.estimate(self._updated))
+        self.estimates.append(self.grid.mean(self._updated))
         self.truths.append(self._theta)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:

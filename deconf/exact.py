@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from deconfounded.deconf.core.deployment import Way, acted_on
 from deconfounded.deconf.equations import belief_update
 from deconfounded.envs import BatchEnv, MujocoTask
 from deconfounded.envs.patches import PatchedTask
@@ -117,10 +118,15 @@ class Grid:
         """Thetas [N, L] drawn from beliefs."""
         return self.theta[sample_rows(np.exp(log_belief), rng)]
 
-    def estimate(self, log_belief: Array) -> Array:
+    def mode(self, log_belief: Array) -> Array:
+        """Thetas [N, L]: the likeliest of the grid."""
+        return self.theta[log_belief.argmax(-1)]
+
+    def mean(self, log_belief: Array) -> Array:
         """Thetas [N, L]: of each latent the posterior mean; of a categorical one its value in the likeliest theta."""
-        likeliest, mean = self.theta[log_belief.argmax(-1)], np.exp(log_belief) @ self.theta
-        return np.where([lat.distribution == "categorical" for lat in self.env.task.latents], likeliest, mean)
+        mean = np.exp(log_belief) @ self.theta
+        categorical = [lat.distribution == "categorical" for lat in self.env.task.latents]
+        return np.where(categorical, self.mode(log_belief), mean)
 
     def features(self, log_belief: Array) -> Array:
         """The posterior mean [N, F] of the encoded theta."""
@@ -164,7 +170,10 @@ class PatchGrid(Grid):
         drawn = [sample_rows(np.exp(log_belief[:, i]), rng) for i in range(log_belief.shape[1])]
         return self.theta[np.stack(drawn, -1), np.arange(len(drawn))]
 
-    def estimate(self, log_belief: Array) -> Array:
+    def mode(self, log_belief: Array) -> Array:
+        return self.theta[log_belief.argmax(-1), 0]
+
+    def mean(self, log_belief: Array) -> Array:
         return np.exp(log_belief) @ self.theta[:, 0]
 
     def features(self, log_belief: Array) -> Array:
@@ -183,12 +192,12 @@ def _mixed(log_belief: Array, transition: Array) -> Array:
 
 
 class ExactAgent(Agent):
-    """Samples theta from the posterior on a grid at every step, and acts as the expert under that theta.
+    """Takes theta from the posterior on a grid, and acts as the expert under that theta.
 
-    conditional: the posterior takes the agent's actions for evidence too, Eq. (3): the causal delusion. static: it
-    assumes the same theta in all episodes, even where theta drifts or switches. Where theta switches, the posterior is
-    the filter of a hidden Markov model, which goes on after an episode's early end. The agent reads the environment's
-    state, not its theta.
+    way: how it takes theta (`core/deployment.py`); at first drawn at every step. conditional: the posterior takes the
+    agent's actions for evidence too, Eq. (3): the causal delusion. static: it assumes the same theta in all episodes,
+    even where theta drifts or switches. Where theta switches, the posterior is the filter of a hidden Markov model,
+    which goes on after an episode's early end. The agent reads the environment's state, not its theta.
     """
 
     def __init__(
@@ -196,6 +205,7 @@ class ExactAgent(Agent):
     ) -> None:
         """k: the grid, or how many values it has."""
         self.env, self.expert, self.conditional, self.static = env, expert, conditional, static
+        self.way: Way = "step"
         self.grid = k if isinstance(k, Grid) else grid_of(env, expert, k)
 
     def begin(self, n: int) -> None:
@@ -207,10 +217,12 @@ class ExactAgent(Agent):
             waited = self.grid.predict_steps(self.log_belief, self.env.task.horizon - self._steps)
             self.log_belief = self.grid.predict(waited)
         self._first, self._steps = False, 0
+        self._theta: Array | None = None
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         self._state = self.env.state
-        return self.expert.act(obs, self.grid.sample(self.log_belief, self._rng), self._rng)
+        self._theta = acted_on(self.grid, self.way, self.log_belief, self._rng, self._theta)
+        return self.expert.act(obs, self._theta, self._rng)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]

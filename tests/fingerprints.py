@@ -300,11 +300,11 @@ def version(label: str) -> int:
 
 
 def moved(before: Numbers, now: Numbers, tolerance: float = TOLERANCE) -> list[str]:
-    """Which numbers differ: `reward was 1.2, is 1.3`."""
+    """Which numbers differ: `reward was 1.2, is 1.3`. What had none is not among them: see `added`."""
     changes = []
-    for key in dict.fromkeys([*before, *now]):
-        was, today = before.get(key), now.get(key)
-        if was is None or today is None or len(was) != len(today):
+    for key, was in before.items():
+        today = now.get(key)
+        if today is None or len(was) != len(today):
             changes.append(f"{key} was {was}, is {today}")
             continue
         size = max(1e-9, *map(abs, was))
@@ -313,6 +313,11 @@ def moved(before: Numbers, now: Numbers, tolerance: float = TOLERANCE) -> list[s
                 changes.append(f"{key} was {x:.9g}, is {y:.9g}")
                 break
     return changes
+
+
+def added(before: Numbers, now: Numbers) -> list[str]:
+    """What has numbers now and had none: another deployment of an agent, say, which changes no record that is kept."""
+    return [key for key in now if key not in before]
 
 
 def libraries() -> dict[str, str]:
@@ -333,18 +338,31 @@ def problem(label: str, entry: dict[str, Any] | None) -> str:
     if entry is None:
         return f"{label} has no fingerprint yet: {renew}"
     try:
-        changes, today = moved(entry["numbers"], numbers(label), tolerance), version(label)
+        now, today = numbers(label), version(label)
     except envs.InputError as error:  # weights that are not those of their card, say
         return f"{label} of {entry['since']} cannot be computed: {error}"
     if today != entry["version"]:
         return f"{label} is v{today} now, and its fingerprint, of {entry['since']}, is of v{entry['version']}: {renew}"
+    changes, new = moved(entry["numbers"], now, tolerance), added(entry["numbers"], now)
     if not changes:
-        return ""
+        return f"{label} has no fingerprint yet of {', '.join(new)}: {renew}" if new else ""
     more = f" and {len(changes) - 1} more" if len(changes) > 1 else ""
     return (
         f"{label} v{today} does otherwise than since {entry['since']}: {changes[0]}{more}. Undo that; or, if it is"
         f" meant, raise {where}, which supersedes its records, and {renew}"
     )
+
+
+def renewed(label: str, entry: dict[str, Any] | None) -> dict[str, Any] | None:
+    """The fingerprint to keep: of a new version, or with what had no numbers; None where numbers moved without one."""
+    now = numbers(label)
+    if entry is None or entry["version"] != version(label):
+        today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
+        return {"version": version(label), "since": today, "libraries": libraries(), "numbers": now}
+    tolerance = SINGLE if label.startswith("expert:") else TOLERANCE
+    if moved(entry["numbers"], now, tolerance):
+        return None
+    return {**entry, "numbers": entry["numbers"] | {key: now[key] for key in added(entry["numbers"], now)}}
 
 
 def main() -> None:
@@ -359,10 +377,8 @@ def main() -> None:
         entry = entries.get(label)
         if not (said := problem(label, entry)):
             continue
-        if {label, "all"} & set(wanted) and (entry is None or entry["version"] != version(label)):
-            today = datetime.datetime.now(tz=datetime.UTC).date().isoformat()
-            of = {"version": version(label), "since": today, "libraries": libraries()}
-            entries[label] = {**of, "numbers": numbers(label)}
+        if {label, "all"} & set(wanted) and (again := renewed(label, entry)):
+            entries[label] = again
             print(f"{label}: written")
             continue
         problems += 1

@@ -140,3 +140,7 @@ def test_what_is_said() -> None:
     )
     assert f"is v{entry['version']} now, and its fingerprint" in fingerprints.problem(label, {**entry, "version": 0})
     assert "has no fingerprint yet" in fingerprints.problem(label, None)
+    less = {**entry, "numbers": {name: of for name, of in entry["numbers"].items() if name != key}}
+    assert fingerprints.problem(label, less).startswith(f"{label} has no fingerprint yet of {key}: run `python -m")
+    assert fingerprints.renewed(label, less)["numbers"][key] == pytest.approx(entry["numbers"][key], rel=1e-6)  # type: ignore[index]
+    assert fingerprints.renewed(label, other) is None

@@ -62,8 +62,12 @@ class LatentModel(nn.Module, ABC):
         """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
 
     @abstractmethod
-    def point(self, belief: Tensor) -> Tensor:
-        """A point estimate, for probes: the belief's mean, or its probabilities."""
+    def mode(self, belief: Tensor) -> Tensor:
+        """The likeliest theta_hat [..., D]."""
+
+    @abstractmethod
+    def mean(self, belief: Tensor) -> Tensor:
+        """The mean [..., D] of theta_hat: of one-hot values their probabilities."""
 
     @abstractmethod
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
@@ -109,7 +113,10 @@ class VariationalModel(LatentModel):
         mean, std = belief.chunk(2, -1)
         return reparametrise(mean, std, draws.normal(*mean.shape[1:]))
 
-    def point(self, belief: Tensor) -> Tensor:
+    def mode(self, belief: Tensor) -> Tensor:
+        return self.mean(belief)
+
+    def mean(self, belief: Tensor) -> Tensor:
         return belief.chunk(2, -1)[0]
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
@@ -169,7 +176,10 @@ class DiscreteModel(LatentModel):
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
         return F.one_hot(sample_index(belief, draws), self.latent).float()
 
-    def point(self, belief: Tensor) -> Tensor:
+    def mode(self, belief: Tensor) -> Tensor:
+        return F.one_hot(belief.argmax(-1), self.latent).float()
+
+    def mean(self, belief: Tensor) -> Tensor:
         return belief
 
     def forget(self, memory: Tensor) -> Tensor:

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
+from deconfounded.deconf.core.deployment import Way, acted_on, deployments
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
@@ -63,11 +64,11 @@ class DeconfoundedConfig(Configuration):
 
 
 class DeconfoundedAgent(LearnedAgent):
-    """Algorithm 2, posterior sampling. resample: draw theta_hat at every step, or once an episode."""
+    """Algorithm 2, posterior sampling. way: how it takes theta_hat from its belief (`core/deployment.py`)."""
 
-    def __init__(self, model: LatentModel, policy: ActionHead, resample: Literal["step", "episode"] = "step") -> None:
+    def __init__(self, model: LatentModel, policy: ActionHead, way: Way = "step") -> None:
         super().__init__(policy)
-        self.model, self.resample = model, resample
+        self.model, self.way = model, way
 
     @staticmethod
     def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "DeconfoundedAgent":
@@ -79,12 +80,12 @@ class DeconfoundedAgent(LearnedAgent):
     def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         sizes = (shape["model"], shape["latent"], shape["width"])
         agent = cls.new(*sizes, scales, draws)
-        agent.resample = shape["resample"]
+        agent.way = shape["way"]
         return agent
 
     def shape(self) -> dict[str, Any]:
         model = self.model
-        return {"model": model.kind, "latent": model.latent, "width": model.width, "resample": self.resample}
+        return {"model": model.kind, "latent": model.latent, "width": model.width, "way": self.way}
 
     def parts(self) -> dict[str, nn.Module]:
         return {"model": self.model, "policy": self.policy}
@@ -100,8 +101,8 @@ class DeconfoundedAgent(LearnedAgent):
 
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] for the next action."""
-        if self._latent is None or self.resample == "step":
-            self._latent = self.model.sample(self.model.belief(self._memory), self._draws)
+        belief = self.model.belief(self._memory)
+        self._latent = acted_on(self.model, self.way, belief, self._draws, self._latent)
         return self._latent
 
     def choose(self, obs: Tensor) -> Tensor:
@@ -126,8 +127,8 @@ class DeconfoundedAgent(LearnedAgent):
 
     @torch.no_grad()
     def features(self) -> NDArray[np.float32]:
-        point = self.model.point(self.model.belief(self._memory))
-        return point.flatten(0, 1).cpu().numpy()
+        mean = self.model.mean(self.model.belief(self._memory))
+        return mean.flatten(0, 1).cpu().numpy()
 
 
 class Explorer(DeconfoundedAgent):
@@ -271,16 +272,11 @@ def large(config: DeconfoundedConfig) -> dict[str, Any]:
     return {"inference_updates": round(1.6 * config.inference_updates), "inference_rate": 2e-3}
 
 
-def per_episode(agent: DeconfoundedAgent) -> DeconfoundedAgent:
-    """The agent with theta_hat drawn once an episode."""
-    return DeconfoundedAgent(agent.model, agent.policy, "episode")
-
-
 USES = ("demonstrations", "exploration")
 SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
     "smoke": {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100},
     "smoke_bandit": {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800},
-    "deployments": {"episode": per_episode},
+    "deployments": deployments("episode", "mode"),  # the mean of a Gaussian is its mode
 }
 
 

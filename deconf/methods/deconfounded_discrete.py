@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
@@ -23,9 +24,10 @@ ON_BANDIT = DeconfoundedConfig(
     random_share=1.0,
 )
 PAPER = replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40)
+DEPLOYED = {**SHARED, "deployments": deployments("episode", "mode", "mean")}
 
 
-@uses(*USES, version=2, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **SHARED)
+@uses(*USES, version=2, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **DEPLOYED)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the discrete model."""
     return deconfounded.fit(given)

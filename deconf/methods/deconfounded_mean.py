@@ -63,7 +63,7 @@ class MeanAgent(DeconfoundedAgent):
         return MeanAgent(model, ActionHead(scales.signature.obs + latent, width, scales, draws))
 
     def latent(self) -> Tensor:
-        return self.model.point(self.model.belief(self._memory))
+        return self.model.mean(self.model.belief(self._memory))
 
     def choose(self, obs: Tensor) -> Tensor:
         return self.policy.sample(torch.cat([_scaler(self.model)(obs), self.latent()], -1), self._draws)

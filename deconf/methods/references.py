@@ -5,7 +5,9 @@ The exact policies hold the posterior of theta on a grid: `conditional` takes it
 """
 
 from dataclasses import dataclass
+from typing import Any
 
+from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.given import Given
@@ -25,13 +27,16 @@ def _exact(given: Given, conditional: bool) -> ExactAgent:
     return ExactAgent(env, expert, conditional, given.config.grid)
 
 
-@uses("environment", cost=1, exact=True, on_control=ExactConfig(), on_bandit=ExactConfig(0), smoke={"grid": 9})
+EXACT: dict[str, Any] = {"exact": True, "on_control": ExactConfig(), "on_bandit": ExactConfig(0), "smoke": {"grid": 9}}
+
+
+@uses("environment", cost=1, **EXACT)
 def conditional(given: Given) -> ExactAgent:
     """The exact conditional policy: the optimum of naive cloning."""
     return _exact(given, True)
 
 
-@uses("environment", cost=1, exact=True, on_control=ExactConfig(), on_bandit=ExactConfig(0), smoke={"grid": 9})
+@uses("environment", cost=4, **EXACT, deployments=deployments("episode", "mode", "mean"))
 def interventional(given: Given) -> ExactAgent:
     """The exact interventional policy, by posterior sampling: the optimum of deconfounded imitation."""
     return _exact(given, False)

@@ -542,7 +542,7 @@ class TestMethods:
         )
         rng = np.random.default_rng(0)
         agent = deconfounded.train(trials, explorer("tilted_cartpole", 32, rng), config, rng)
-        mean = agent.model.point(final_belief(agent.model, Batch.of(trials, 1)))[0]
+        mean = agent.model.mean(final_belief(agent.model, Batch.of(trials, 1)))[0]
         inputs = np.c_[mean.numpy(), np.ones(len(mean))]
         residual = theta - inputs @ np.linalg.lstsq(inputs, theta, rcond=None)[0]
         assert 1 - (residual**2).mean() / theta.var() > 0.5

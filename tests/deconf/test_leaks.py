@@ -16,6 +16,7 @@ from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.models import DiscreteModel, LatentModel, VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.methods import (
@@ -253,15 +254,19 @@ class TestLatents:
 
     def test_deployment_draws_theta_hat(self, kind: str) -> None:
         """Over 400 empty histories it has the prior's mean and std, and another value at the next step."""
-        model, _, _, agent = make(kind)
+        *_, agent = make(kind)
         agent.begin(800)
         agent.reset([np.random.default_rng(i) for i in range(2)])
         first, second = agent.latent(), agent.latent()
         assert (first != second).any()
-        per_episode = DeconfoundedAgent(model, agent.policy, "episode")
-        per_episode.begin(800)
-        per_episode.reset([np.random.default_rng(i) for i in range(2)])
-        assert torch.equal(per_episode.latent(), per_episode.latent())
+        for way, deploy in deployments("episode", "mode", "mean").items():
+            other = deploy(agent)
+            other.begin(800)
+            other.reset([np.random.default_rng(i) for i in range(2)])
+            held = other.latent()
+            assert torch.equal(held, other.latent())
+            assert (held == held[:, :1]).all() == (way != "episode"), "it is drawn anew in each trial"
+            assert (other.model, agent.way) == (agent.model, "step")
         mean, std = (1 / 3, (2 / 9) ** 0.5) if kind == "discrete" else (None, None)
         if kind == "evidence":
             mean, std = 0.0, 1.0

@@ -219,7 +219,7 @@ def test_a_small_effect_is_learned_beside_large_ones() -> None:
         batch = data.beginnings(update, 0.25).draw_trials(16, streams)
         model.learn(optimizer, batch, 256, 1e-3 * min(1, update / 150), streams)
     with torch.no_grad():
-        inferred = model.point(model.belief(model.final_memory(fresh)))[0].double().numpy()
+        inferred = model.mean(model.belief(model.final_memory(fresh)))[0].double().numpy()
     inputs = np.concatenate([inferred, np.ones((200, 1))], 1)
     left = theta[100:] - inputs[100:] @ np.linalg.lstsq(inputs[:100], theta[:100], rcond=None)[0]
     assert 1 - (left**2).mean() / theta[100:].var() > 0.45
