@@ -1,8 +1,9 @@
 """Compare the methods of runs with others, over seeds and tasks: `deconf compare results/*-default`
 
-Differences by seed, interquartile means and probabilities of improvement, in the first and the last episode of a trial;
-the others are of the runs given, or of the records that come with the package. A method from outside has thetas of its
-own, and shares no more than a seed's number with them. Written to --out: csv, LaTeX (booktabs), pdf and png.
+Differences by seed and interquartile means, of the first and the last score of a trial and of its regret, and
+probabilities of improvement in the last episode. The others are of the runs given, or of the records that come with the
+package. A method from outside has thetas of its own, and shares no more than a seed's number with them. Written to
+--out: csv, LaTeX (booktabs), pdf and png.
 """
 
 from pathlib import Path

@@ -17,6 +17,7 @@ from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import records, scoring, statistics
 from deconfounded.benchmarks.output.pictures import colours, panels
 from deconfounded.benchmarks.output.records import Record
+from deconfounded.benchmarks.output.scoring import MEASURES, measured
 from deconfounded.benchmarks.output.statistics import Figure
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
@@ -24,7 +25,6 @@ from deconfounded.envs.support.files import check_folder, write_atomically
 
 Scores = Mapping[str, Mapping[str, Mapping[int, Array]]]
 """By method, task and seed: scores [E] of the episodes of a trial."""
-EPISODES = {"first": 0, "last": -1}
 
 
 def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[str, dict[int, Array]]]:
@@ -69,14 +69,14 @@ class Row:
     method: str
     task: str
     n: int  # seeds; over tasks, tasks
-    score: dict[str, Figure]  # of EPISODES: the mean; over tasks the interquartile mean
-    minus: dict[str, dict[str, Figure]]  # by EPISODES and the other, paired by seed
+    score: dict[str, Figure]  # of MEASURES: the mean; over tasks the interquartile mean
+    minus: dict[str, dict[str, Figure]]  # by MEASURES and the other, paired by seed
     better: dict[str, Figure]  # probability of improvement over the other in the last episode; over tasks
 
 
-def at(scores: Scores, method: str, task: str, episode: str) -> dict[int, float]:
-    """Of an episode of EPISODES, by seed."""
-    return {seed: float(values[EPISODES[episode]]) for seed, values in scores[method].get(task, {}).items()}
+def at(scores: Scores, method: str, task: str, measure: str) -> dict[int, float]:
+    """One of MEASURES, by seed."""
+    return {seed: float(measured(values)[measure]) for seed, values in scores[method].get(task, {}).items()}
 
 
 def of_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -> list[Row]:
@@ -85,14 +85,14 @@ def of_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -> 
     for task in dict.fromkeys(task for name in methods for task in scores[name]):
         for name in (name for name in dict.fromkeys([*methods, *against]) if task in scores[name]):
             mean: dict[str, Figure] = {}
-            minus: dict[str, dict[str, Figure]] = {episode: {} for episode in EPISODES}
-            for episode in EPISODES:
-                own = at(scores, name, task, episode)
-                mean[episode] = Figure(np.asarray(np.mean(list(own.values()))), None, len(own))
+            minus: dict[str, dict[str, Figure]] = {measure: {} for measure in MEASURES}
+            for measure in MEASURES:
+                own = at(scores, name, task, measure)
+                mean[measure] = Figure(np.asarray(np.mean(list(own.values()))), None, len(own))
                 for other in against if name in methods else ():
-                    pairs = statistics.paired(own, at(scores, other, task, episode)) if other != name else None
+                    pairs = statistics.paired(own, at(scores, other, task, measure)) if other != name else None
                     if pairs is not None:
-                        minus[episode][other] = pairs
+                        minus[measure][other] = pairs
             made.append(Row(name, task, len(scores[name][task]), mean, minus, {}))
     return made
 
@@ -102,17 +102,17 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
     made = []
     for name in dict.fromkeys([*methods, *against]):
         mean: dict[str, Figure] = {}
-        minus: dict[str, dict[str, Figure]] = {episode: {} for episode in EPISODES}
+        minus: dict[str, dict[str, Figure]] = {measure: {} for measure in MEASURES}
         better: dict[str, Figure] = {}
-        for episode in EPISODES:
-            own = {task: at(scores, name, task, episode) for task in scores[name]}
+        for measure in MEASURES:
+            own = {task: at(scores, name, task, measure) for task in scores[name]}
             average = statistics.over_tasks(
                 statistics.iqm, {task: np.array([*of.values()]) for task, of in own.items()}
             )
             assert average is not None
-            mean[episode] = average
+            mean[measure] = average
             for other in against if name in methods else ():
-                theirs = {task: at(scores, other, task, episode) for task in own if task in scores[other]}
+                theirs = {task: at(scores, other, task, measure) for task in own if task in scores[other]}
                 pairs = {task: sorted(set(own[task]) & set(of)) for task, of in theirs.items()}
                 pairs = {task: seeds for task, seeds in pairs.items() if seeds}
                 if other == name or not pairs:
@@ -121,10 +121,10 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
                     task: np.array([own[task][seed] - theirs[task][seed] for seed in seeds])
                     for task, seeds in pairs.items()
                 }
-                minus[episode][other] = statistics.mean_difference(differences)
+                minus[measure][other] = statistics.mean_difference(differences)
                 both = [{task: np.array([*of[task].values()]) for task in pairs} for of in (own, theirs)]
                 improvement = statistics.over_tasks(statistics.improvement, *both)
-                if improvement is not None and episode == "last":
+                if improvement is not None and measure == "last":
                     lone = (
                         min(len(runs) for of in both for runs in of.values()) == 1
                     )  # which no bootstrap can draw anew
@@ -146,15 +146,15 @@ def signed(figure: Figure | None, sign: bool = True) -> str:
 
 def tables(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str]) -> dict[str, list[list[str]]]:
     """The tables by name, of cells: a head, then rows."""
-    differences = [f"{episode} - {other}" for other in against for episode in EPISODES]
-    first = [["task", "method", "seeds", *EPISODES, *differences]]
+    differences = [f"{measure} - {other}" for other in against for measure in MEASURES]
+    first = [["task", "method", "seeds", *MEASURES, *differences]]
     for row in by_task:
-        cells = [signed(row.minus[episode].get(other)) for other in against for episode in EPISODES]
+        cells = [signed(row.minus[measure].get(other)) for other in against for measure in MEASURES]
         first.append([row.task, row.method, str(row.n), *(signed(x, False) for x in row.score.values()), *cells])
     better = [f"P(better than {other})" for other in against]
-    second = [["method", "tasks", *(f"IQM, {episode}" for episode in EPISODES), *differences, *better]]
+    second = [["method", "tasks", *(f"IQM, {measure}" for measure in MEASURES), *differences, *better]]
     for row in over:
-        cells = [signed(row.minus[episode].get(other)) for other in against for episode in EPISODES]
+        cells = [signed(row.minus[measure].get(other)) for other in against for measure in MEASURES]
         cells += [signed(row.better.get(other), False) for other in against]
         second.append([row.method, str(row.n), *(signed(x, False) for x in row.score.values()), *cells])
     return {"tasks": first, "over_tasks": second}
@@ -168,7 +168,8 @@ def notes(scores: Scores) -> str:
     )
     return (
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
-        " come with the package. Differences are paired by seed; their 95% intervals are Student's, over tasks Welch's."
+        " come with the package. Regret is the expert's score less the method's, summed over the episodes; less is"
+        " better. Differences are paired by seed; their 95% intervals are Student's, over tasks Welch's."
         f" IQM is the interquartile mean of all runs; its interval, and that of P, is a stratified bootstrap{held}."
     )
 
@@ -238,7 +239,8 @@ def write(scores: Scores, methods: Sequence[str], against: Sequence[str], folder
     for name, table in made.items():
         write_atomically(folder / f"{name}.csv", as_csv(table))
         write_atomically(folder / f"{name}.tex", as_latex(table, said))
-        dropped = [f"first - {other}" for other in against] + ["seeds", "IQM, first", "first"]
+        dropped = [f"{measure} - {other}" for measure in ("regret", "first") for other in against]
+        dropped += ["seeds", "IQM, regret", "IQM, first", "regret", "first"]
         shown.append((scoring.plain_table(table[0], table[1:]), scoring.plain_table(table[0], table[1:], dropped)))
     write_atomically(folder / "comparison.txt", "\n\n".join([*(whole for whole, _ in shown), said]) + "\n")
     picture(by_task, over, against, folder / "comparison.png")

@@ -9,7 +9,10 @@ const text = (s) => String(s).replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`)
 const breakable = (name) => text(name).replaceAll("_", "_<wbr>");
 const swatch = (name) => `<span class="swatch" style="background:${D.methods[name].colour}"></span>`;
 const where = (task, method) => D.rows.find((r) => r.task === task && r.method === method);
-const dash = (name) => (name.endsWith("_episode") ? "2 3" : "exact reference".includes(D.methods[name].kind) ? "6 4" : "");
+const MEASURES = { last: "Score in the last episode", first: "Score in the first episode", regret: "Regret, summed over episodes" };
+const measured = (r, measure) => (r && measure !== "last" ? r[measure] : r); // of a row: its value and interval
+const iqm = (f, measure) => (measure === "last" ? f.iqm : f[measure]);
+const dash = (name) => (D.methods[name].deployment ? "2 3" : "exact reference".includes(D.methods[name].kind) ? "6 4" : "");
 const extent = (xs) => [Math.min(...xs), Math.max(...xs)];
 const tierOf = Object.fromEntries(D.tasks.map((t) => [t.name, t.tier]));
 
@@ -134,11 +137,13 @@ let pinned = null;
 function fill(r) {
   const minus = Object.entries(r.minus).map(([other, f]) => `<tr><td>vs ${text(other)}<td>${signed(f.value)}<td class="soft">${range(f.interval)}<td class="soft">${seeds(f.n)}</tr>`);
   card.innerHTML = `<button aria-label="close">\u2715</button><h3>${text(r.method)} <span class="soft">on ${text(r.task)}</span></h3>
-    <table><tr><td>score<td><b>${two(r.value)}</b><td class="soft">${range(r.interval)}<td class="soft">${seeds(r.n)}</tr>${minus.join("")}</table>
+    <table><tr><td>score<td><b>${two(r.value)}</b><td class="soft">${range(r.interval)}<td class="soft">${seeds(r.n)}</tr>
+      <tr><td>first episode<td>${two(r.first.value)}<td class="soft">${range(r.first.interval)}</tr>
+      <tr><td>regret<td>${two(r.regret.value)}<td class="soft">${range(r.regret.interval)}</tr>${minus.join("")}</table>
     <p class="soft">score by episode${r.trained > 1 ? ", beside the exact policies" : ""}</p><div class="a"></div>
     ${Object.keys(r.curve).map((kind, i) => `<p class="soft">${text(kind)} loss, over the share of training</p><div class="l${i}"></div>`).join("")}
     <p class="soft">${text(r.data || "no data")}; ${r.cpu} s of CPU a seed</p><p><code class="run">${text(r.command)}</code></p>`;
-  const beside = D.rows.filter((x) => x.task === r.task && ["exact"].includes(D.methods[x.method].kind) && x !== r);
+  const beside = D.rows.filter((x) => x.task === r.task && D.methods[x.method].kind === "exact" && !D.methods[x.method].deployment && x !== r);
   adaptation(card.querySelector(".a"), [...beside, r], { still: true, h: 120, strong: r.method });
   Object.keys(r.curve).forEach((kind, i) => learning(card.querySelector(`.l${i}`), kind, [r], { still: true, h: 90 }));
 }
@@ -183,10 +188,10 @@ const form = at("filter");
 const order = { matrix: { by: "", down: true }, all: { by: "task", down: false } };
 
 function chosen() {
-  const { task, tier, method, kind } = Object.fromEntries(new FormData(form));
+  const { task, tier, method, kind, measure } = Object.fromEntries(new FormData(form));
   const tasks = D.tasks.map((t) => t.name).filter((t) => (!task || t === task) && (!tier || tierOf[t] === tier));
   const methods = Object.keys(D.methods).filter((m) => (!method || m === method) && (!kind || D.methods[m].tier === kind));
-  return { tasks, methods, tier, rows: D.rows.filter((r) => tasks.includes(r.task) && methods.includes(r.method)) };
+  return { tasks, methods, tier, measure, rows: D.rows.filter((r) => tasks.includes(r.task) && methods.includes(r.method)) };
 }
 
 const heading = (table, key, label, cls = "") => {
@@ -201,9 +206,10 @@ const sorter = (value, down) => (a, b) => {
   return (x < y ? -1 : 1) * (down ? -1 : 1);
 };
 
-function matrix({ tasks, methods, tier }) {
-  const over = D.over[tier].methods, { by, down } = order.matrix;
-  const value = (m) => (by ? where(by, m)?.value : over[m]?.iqm?.value);
+function matrix({ tasks, methods, tier, measure }) {
+  const over = D.over[tier].methods, { by } = order.matrix, down = order.matrix.down !== (measure === "regret"); // less is better
+  const value = (m) => (by ? measured(where(by, m), measure)?.value : over[m] && iqm(over[m], measure)?.value);
+  const share = (r) => (measure === "regret" ? 1 - r.regret.value / r.trained : measured(r, measure).value);
   const whole = (m) => over[m]?.tasks === D.over[tier].tasks.length;
   const shown = methods.filter((m) => tasks.some((t) => where(t, m))).sort(sorter(value, down));
   if (!by) shown.sort((a, b) => whole(b) - whole(a)); // what was run on some tasks alone is not to be compared
@@ -215,13 +221,14 @@ function matrix({ tasks, methods, tier }) {
   for (const m of shown) {
     const o = over[m];
     out += `<tr><th scope="row"><span class="name">${swatch(m)}<span>${breakable(m)}<span class="tier">${D.methods[m].tier}</span></span></span></th>`;
-    out += o ? `<td class="first${whole(m) ? "" : " soft"}">${two(o.iqm.value)}<small>${whole(m) ? range(o.iqm.interval) : `${o.tasks} of ${D.over[tier].tasks.length} tasks`}</small></td>` : `<td class="first"></td>`;
+    out += o ? `<td class="first${whole(m) ? "" : " soft"}">${two(iqm(o, measure).value)}<small>${whole(m) ? range(iqm(o, measure).interval) : `${o.tasks} of ${D.over[tier].tasks.length} tasks`}</small></td>` : `<td class="first"></td>`;
     for (const t of tasks) {
-      const r = where(t, m);
-      out += r ? `<td class="open ${first(t)}" tabindex="0" data-task="${text(t)}" data-method="${text(m)}" style="background:color-mix(in srgb, var(--accent) ${Math.round(38 * Math.min(Math.max(r.value, 0), 1))}%, transparent)">${two(r.value)}<small>${r.interval ? range(r.interval) : "one seed"}</small></td>` : `<td class="${first(t)}"></td>`;
+      const r = where(t, m), f = measured(r, measure);
+      out += r ? `<td class="open ${first(t)}" tabindex="0" data-task="${text(t)}" data-method="${text(m)}" style="background:color-mix(in srgb, var(--accent) ${Math.round(38 * Math.min(Math.max(share(r), 0), 1))}%, transparent)">${two(f.value)}<small>${f.interval ? range(f.interval) : "one seed"}</small></td>` : `<td class="${first(t)}"></td>`;
     }
     out += "</tr>";
   }
+  at("what").textContent = MEASURES[measure];
   at("matrix").innerHTML = out + "</tbody>";
 }
 
@@ -231,6 +238,10 @@ const COLUMNS = [
   ["tier", "tier", (r) => D.methods[r.method].tier, (r) => text(D.methods[r.method].tier)],
   ["value", "score", (r) => r.value, (r) => two(r.value), "open"],
   ["low", "interval", (r) => r.interval && r.interval[0], (r) => range(r.interval) + (r.interval ? ` (${r.held}%)` : "")],
+  ["first", "first episode", (r) => r.first.value, (r) => two(r.first.value)],
+  ["first low", "interval", (r) => r.first.interval && r.first.interval[0], (r) => range(r.first.interval)],
+  ["regret", "regret", (r) => r.regret.value, (r) => two(r.regret.value)],
+  ["regret low", "interval", (r) => r.regret.interval && r.regret.interval[0], (r) => range(r.regret.interval)],
   ["n", "seeds", (r) => r.n, (r) => r.n],
   ...D.compared.map((other) => [`vs ${other}`, `vs ${other}`, (r) => r.minus[other]?.value, (r) => (r.minus[other] ? `${signed(r.minus[other].value)} <span class="soft">(${r.minus[other].interval ? range(r.minus[other].interval) : ""}${r.minus[other].n < r.n ? `, ${seeds(r.minus[other].n)}` : ""})</span>` : "")]),
   ["r2", "theta R2", (r) => r.r2.at(-1), (r) => (r.r2.length ? two(r.r2.at(-1)) : "")],
@@ -251,7 +262,7 @@ function all({ rows }) {
 
 // ---- over tasks ---------------------------------------------------------------------------------------------------
 
-function overTasks({ methods, tier }) {
+function overTasks({ methods, tier, measure }) {
   const { tasks, methods: found } = D.over[tier], whole = (f) => f.tasks === tasks.length;
   const names = Object.keys(D.methods).filter((m) => methods.includes(m) && found[m] && D.methods[m].kind !== "reference");
   const entry = (m, f, k) => ({ name: m + (k < tasks.length ? ` (${k})` : ""), colour: D.methods[m].colour, value: f.value, interval: f.interval, faint: k < tasks.length, said: `${m} ${two(f.value)}, ${range(f.interval)}, ${f.n} runs on ${k} of ${tasks.length} tasks` });
@@ -260,7 +271,9 @@ function overTasks({ methods, tier }) {
   if (names.length) at("over-what").textContent += `, ${runs[0] === runs[1] ? runs[0] : runs.join(" to ")} runs a method, a run being a seed of a task.` +
     (few ? " A method that was run on some of the tasks is faint, with their number in brackets, and not to be compared with the others." : "");
   const best = names.slice().sort((a, b) => whole(found[b]) - whole(found[a]) || found[b].iqm.value - found[a].iqm.value);
-  dots(at("iqm"), best.map((m) => entry(m, found[m].iqm, found[m].tasks)), { x: [-0.05, 1.05], label: "interquartile mean of each method" });
+  const means = best.map((m) => entry(m, iqm(found[m], measure), found[m].tasks)), high = Math.max(1, ...means.map((r) => r.value));
+  at("iqm").previousElementSibling.textContent = `Interquartile mean: ${MEASURES[measure].toLowerCase()}`;
+  dots(at("iqm"), means, { x: [-0.05 * high, 1.05 * high], label: "interquartile mean of each method" });
   dots(at("improvement"), best.filter((m) => found[m].improvement).map((m) => entry(m, found[m].improvement, found[m].improvement.tasks)), { x: [0, 1], label: "probability of improvement over each method" });
   const series = best.map((m) => ({
     name: m, colour: D.methods[m].colour, dash: dash(m), f: found[m], points: D.thresholds.map((t, i) => [t, found[m].profile.value[i]]),
@@ -277,7 +290,7 @@ function draw(details) {
   details.dataset.drawn = "yes";
   adaptation(details.querySelector(".adaptation"), rows, { h: 290 });
   const box = details.querySelector(".learning");
-  const trained = rows.filter((r) => !r.method.endsWith("_episode")); // the same agent, deployed otherwise
+  const trained = rows.filter((r) => !D.methods[r.method].deployment); // the same agent, deployed otherwise
   const kinds = [...new Set(trained.flatMap((r) => Object.keys(r.curve)))];
   box.innerHTML = kinds.map((kind) => `<figure><h3>${text(kind[0].toUpperCase() + kind.slice(1))} loss</h3><div></div></figure>`).join("");
   kinds.forEach((kind, i) => learning(box.children[i].lastElementChild, kind, trained.filter((r) => r.curve[kind]), { h: 200 }));

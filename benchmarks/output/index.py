@@ -42,11 +42,17 @@ def template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None)
     return made.get_template(name)
 
 
+def measured(methods: dict[str, Any], measure: str) -> dict[str, dict[int, float]]:
+    """The `methods` of results.json -> one of scoring.MEASURES, by method and seed."""
+    zero, one = (methods[name]["reference"] for name in REFERENCES)
+    scores = {name: scoring.normalise(np.array(entry["return"]), zero, one) for name, entry in methods.items()}
+    values = {name: scoring.measured(of)[measure].tolist() for name, of in scores.items()}
+    return {name: dict(zip(methods[name]["seeds"], of, strict=True)) for name, of in values.items()}
+
+
 def last_scores(methods: dict[str, Any]) -> dict[str, dict[int, float]]:
     """The `methods` of results.json -> score in the last episode, by method and seed."""
-    zero, one = (methods[name]["reference"] for name in REFERENCES)
-    last = {name: scoring.normalise(np.array(entry["return"])[:, -1], zero, one) for name, entry in methods.items()}
-    return {name: dict(zip(methods[name]["seeds"], scores.tolist(), strict=True)) for name, scores in last.items()}
+    return measured(methods, "last")
 
 
 def _short(values: Any) -> Any:
@@ -70,7 +76,9 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "method": name,
         "n": len(entry["seeds"]),
         "value": entry["score_last"],
-        "interval": None if entry["ci95"] is None else _short(entry["ci95"]),
+        "interval": entry["ci95"] and _short(entry["ci95"]),
+        "first": {"value": entry["score_first"], "interval": entry["ci95_first"] and _short(entry["ci95_first"])},
+        "regret": {"value": entry["regret"], "interval": entry["ci95_regret"] and _short(entry["ci95_regret"])},
         "held": round(100 * scoring.coverage(len(entry["seeds"]))),
         "scores": entry["score"] + entry.get("score_beyond", []),
         "band": entry["band"],
@@ -85,13 +93,18 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
     }
 
 
-def over_tasks(scores: dict[str, dict[str, dict[int, float]]], tasks: list[str]) -> dict[str, Any]:
-    """What scores by task, method and seed come to over tasks: of each method, on those where it was run."""
+def _runs(scores: Scores, tasks: Sequence[str]) -> dict[str, dict[str, Array]]:
+    """By method and task, on those where it was run: an array of seeds."""
     runs: dict[str, dict[str, Array]] = {}
     for task in tasks:
         for name, by_seed in scores[task].items():
             runs.setdefault(name, {})[task] = np.array(list(by_seed.values()))
-    methods = {}
+    return runs
+
+
+def over_tasks(scores: Scores, tasks: Sequence[str]) -> dict[str, Any]:
+    """What scores by task, method and seed come to over tasks: of each method, on those where it was run."""
+    methods, runs = {}, _runs(scores, tasks)
     for name, by_task in runs.items():
         methods[name] = {
             "tasks": len(by_task),
@@ -150,24 +163,33 @@ def certified(found: Found, certificates: Mapping[str, Any]) -> dict[str, dict[s
 
 def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str]) -> dict[str, Any]:
     """All that the page shows, for json."""
-    rows, tasks, scores = [], [], {}
+    rows, tasks = [], []
+    scores: dict[str, dict[str, dict[str, dict[int, float]]]] = {measure: {} for measure in scoring.MEASURES}
     tiers: dict[str, list[str]] = {}
     methods: dict[str, dict[str, str]] = {}
     hues = colours(entry["method"] for _, results in found for entry in results["methods"].values())
     for task, results in found:
         described = about(docs, task, results, certificates.get(task.name))
         tasks.append({**described, "command": command(task, results)})
-        scores[task.name] = last_scores(results["methods"])
+        for measure, by_task in scores.items():
+            by_task[task.name] = measured(results["methods"], measure)
         for key in ("", described["tier"]):
             tiers.setdefault(key, []).append(task.name)
         for name, entry in results["methods"].items():
-            made = row(task, name, entry, scores[task.name])
+            made = row(task, name, entry, scores["last"][task.name])
             rows.append({**made, "command": command(task, results, name)})
-            kind = "exact" if name in EXACT else "reference" if name in REFERENCES else entry["tier"]
+            kind = "exact" if entry["method"] in EXACT else "reference" if name in REFERENCES else entry["tier"]
             hue = "var(--ink)" if name == "expert" else hues[entry["method"]]
-            methods.setdefault(name, {"tier": entry["tier"], "kind": kind, "colour": hue})
+            methods.setdefault(
+                name, {"tier": entry["tier"], "kind": kind, "colour": hue, "deployment": entry["deployment"]}
+            )
     rank = {name: i for i, name in enumerate(labels(METHODS))}
     order = sorted(methods, key=lambda name: rank.get(name, len(rank)))
+    over = {key: over_tasks(scores["last"], names) for key, names in tiers.items()}
+    for key, names in tiers.items():
+        for measure in ("first", "regret"):
+            for name, by_task in _runs(scores[measure], names).items():
+                over[key]["methods"][name][measure] = _as_json(statistics.over_tasks(statistics.iqm, by_task))
     return {
         "tasks": sorted(tasks, key=lambda task: (task["tier"] == "none", task["tier"])),
         "methods": {name: methods[name] for name in order},
@@ -175,7 +197,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
         "compared": COMPARED,
         "note": NOTE,
         "answers": answers(certified(found, certificates)),
-        "over": {key: over_tasks(scores, names) for key, names in tiers.items()},
+        "over": over,
         "thresholds": _short(THRESHOLDS),
     }
 

@@ -22,6 +22,18 @@ def normalise(returns: Array, random: float, expert: float) -> Array:
     return (returns - random) / (expert - random)
 
 
+MEASURES = ("first", "last", "regret")
+
+
+def measured(scores: Array) -> dict[str, Array]:
+    """Scores of a trial's episodes [..., E] -> MEASURES [...].
+
+    They are the scores of the first and of the last episode; and the regret, the expert's score (1) less the agent's,
+    summed over the episodes: less is better.
+    """
+    return dict(zip(MEASURES, (scores[..., 0], scores[..., -1], (1 - scores).sum(-1)), strict=True))
+
+
 def bootstrap(values: Array) -> Array | None:
     """Percentile-bootstrap intervals [..., 2] of means over seeds, of values [S, ...]; None for a single seed.
 
@@ -43,9 +55,10 @@ def coverage(seeds: int) -> float:
     return float(((low <= 0) & (high >= 0)).mean())
 
 
-def interval(ends: Sequence[float] | None, seeds: int) -> str:
-    """An interval as tables show it, with its coverage: `0.31 to 0.42 (75%)`."""
-    return "-" if ends is None else f"{' to '.join(map(two_decimals, ends))} ({coverage(seeds):.0%})"
+def interval(ends: Sequence[float] | None, seeds: int = 0) -> str:
+    """An interval as tables show it, and with its coverage if seeds are given: `0.31 to 0.42 (75%)`."""
+    held = f" ({coverage(seeds):.0%})" if seeds else ""
+    return "-" if ends is None else " to ".join(map(two_decimals, ends)) + held
 
 
 def fewest_to_most(counts: Sequence[int]) -> str:
@@ -97,15 +110,20 @@ def summarise(
     for name, seeds in by_method.items():
         returns = stacked(name, "returns")
         scores = normalise(returns, random, expert)
-        band = bootstrap(scores)
+        measures = measured(scores[:, :episodes])
+        intervals = bootstrap(np.column_stack([scores, measures["regret"]]))
+        band = None if intervals is None else intervals[:-1]
         methods[name] = {
             "method": seeds[0]["method"],
             "deployment": seeds[0]["deployment"],
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
             "score": scores[:, :episodes].mean(0).round(4).tolist(),
-            "score_last": round(float(scores[:, episodes - 1].mean()), 4),
+            **{f"score_{end}": round(float(measures[end].mean()), 4) for end in ("first", "last")},
+            "regret": round(float(measures["regret"].mean()), 4),
             "ci95": None if band is None else band[episodes - 1].tolist(),
+            "ci95_first": None if band is None else band[0].tolist(),
+            "ci95_regret": None if intervals is None else intervals[-1].tolist(),
             "band": None if band is None else band.round(4).tolist(),
             "objective": stacked(name, "objective")[:, :episodes].mean(0).round(3).tolist(),
             "theta_r2": stacked(name, "theta_r2")[:, :episodes].mean(0).round(4).tolist(),
@@ -188,9 +206,13 @@ INTERVALS = (
     "Intervals: percentile bootstrap over seeds; in brackets the share of cases in which one of so many seeds holds the"
     " mean, if scores are normal."
 )
-DROPPED = ("data, a seed", "theta R2 of each episode", "CPU s, a seed", "Eq. (1)", "return", "tier", "interval")
+DROPPED = (
+    *("data, a seed", "theta R2 of each episode", "CPU s, a seed", "Eq. (1)", "return", "tier"),
+    *("interval of regret", "interval of first", "interval", "regret", "first"),
+)
 COLUMNS = (
-    *("method", "tier", "return", "score of each episode", "last", "interval"),
+    *("method", "tier", "return", "score of each episode", "first", "interval of first", "last", "interval"),
+    *("regret", "interval of regret"),
     *("Eq. (1)", "theta R2 of each episode", "data, a seed", "CPU s, a seed"),
 )
 
@@ -210,10 +232,13 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     lines: list[tuple[str, ...]] = []
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
         scores, r2 = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
-        scored = (f"{np.mean(entry['return'], 0)[-1]:.1f}", scores, two_decimals(entry["score_last"]))
+        returned = f"{np.mean(entry['return'], 0)[-1]:.1f}"
         costs = (budget(entry["budget"]), f"{entry['cpu_s']:.0f}")
-        ends = interval(entry["ci95"], len(entry["seeds"]))
-        lines.append((name, entry["tier"], *scored, ends, f"{entry['objective'][-1]:,.0f}", r2, *costs))
+        first = (two_decimals(entry["score_first"]), interval(entry["ci95_first"]))
+        last = (two_decimals(entry["score_last"]), interval(entry["ci95"], len(entry["seeds"])))
+        regret = (two_decimals(entry["regret"]), interval(entry["ci95_regret"]))
+        objective = f"{entry['objective'][-1]:,.0f}"
+        lines.append((name, entry["tier"], returned, scores, *first, *last, *regret, objective, r2, *costs))
     return lines
 
 

@@ -25,7 +25,7 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of
-from deconfounded.benchmarks.studies import cards, findings, gap, results, spectrum, validate
+from deconfounded.benchmarks.studies import cards, findings, gap, headroom, results, spectrum, validate
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS
 from deconfounded.envs.support.files import write_atomically
 
@@ -131,6 +131,7 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
         DOCS / "results.md": results.results_page(found, certified),
+        DOCS / "headroom.md": headroom.page(found, certified),
         **{file: _filled(file, of) for file, of in tables.items()},
     }
 
@@ -142,9 +143,10 @@ def write() -> str:
     """
     by_task = results.published()
     for file, text in texts(by_task).items():
-        if file.read_text(encoding="utf-8") != text:
+        if not file.exists() or file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
     redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(by_task)])
+    redraw(DOCS / "headroom.png", headroom.picture, headroom.points(by_task, cards.certified()))
     redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
     return results.summary(by_task)

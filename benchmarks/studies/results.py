@@ -92,7 +92,9 @@ Made by `deconf publish` from the [records](records) alone, of which each is of 
 tree had uncommitted changes. Scores: 0 = random actions,
 1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that
 sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-*Twice as long*: the last score in a trial of twice as many episodes as in training. """
+*First* and *last* are the scores of these episodes; *regret* is the expert's score less the agent's, summed over the
+episodes of a trial (less is better). *Twice as long*: the last score in a trial of twice as many episodes as in
+training. """
     head += scoring.INTERVALS
     parts = [head, in_short(found, certified), *(section(*of) for of in found), gap.section(gaps(found))]
     return "\n\n".join(part for part in parts if part) + "\n"

@@ -28,8 +28,9 @@ CONTENTS: dict[
     "First steps": {"start": "docs/start.md", "concepts": "docs/concepts.md"},
     "Tutorials": {f"tutorials/{name}": f"docs/tutorials/{name}.md" for name in ("bandit", "lander", "logs")},
     "Benchmark": {
-        **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "baselines": "docs/baselines.md"},
-        **{"paper": "docs/paper.md", "spectrum": "docs/spectrum.md", "speed": "docs/speed.md"},
+        **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "headroom": "docs/headroom.md"},
+        **{"baselines": "docs/baselines.md", "paper": "docs/paper.md", "spectrum": "docs/spectrum.md"},
+        **{"speed": "docs/speed.md"},
     },
     "How to": {
         **{"environments": "docs/environments.md", "own_task": "docs/own_task.md", "own_method": "docs/own_method.md"},

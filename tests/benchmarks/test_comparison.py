@@ -208,6 +208,10 @@ class TestComparison:
         assert row.minus["last"]["naive_rnn"].n == 3
         over = comparison.over_tasks(scores, ["mine"], ["naive_rnn"])[0]
         assert over.score["last"].value == pytest.approx(0.6)
+        assert row.score["regret"].value == pytest.approx(5 * (1 - 0.6))  # curling's trials have five episodes
+        theirs = comparison.at(scores, "naive_rnn", "curling", "regret")
+        mean = np.mean([theirs[seed] for seed in range(3)])
+        assert row.minus["regret"]["naive_rnn"].value == pytest.approx(2 - mean)
         said = comparison.write(scores, ["mine"], ["naive_rnn"], tmp_path)
         assert "last - naive_rnn" in said
         tex = (tmp_path / "tasks.tex").read_text()

@@ -174,7 +174,9 @@ def test_a_number_in_results_is_its_method_s(some: Found) -> None:
             cells = dict(zip(head, row, strict=True))
             last, value = expected[name][row[0]]
             assert float(cells["last"]) == pytest.approx(last, abs=0.0051), (name, row[0])
-            assert cells["score of each episode"].split()[-1] == cells["last"]
+            episodes = cells["score of each episode"].split()
+            assert (episodes[0], episodes[-1]) == (cells["first"], cells["last"])
+            assert float(cells["regret"]) == pytest.approx(sum(1 - float(score) for score in episodes), abs=0.031)
             assert float(cells["return"].replace(",", "")) == pytest.approx(value, abs=0.051)
         scores = [float(row[head.index("last")]) for row in rows]
         assert scores == sorted(scores, reverse=True)
@@ -185,7 +187,8 @@ def entry(first: float, last: float) -> dict[str, Any]:
     """A method's part of results.json that scores `first` in the first episode and `last` in the second."""
     return {
         **{"method": "x", "deployment": "", "tier": "1", "budget": {}, "cpu_s": 1.0, "ci95": [last - 0.1, last + 0.1]},
-        **{"score": [first, last], "score_last": last, "theta_r2": [0.0, 0.5], "objective": [-9.0, -5.0]},
+        **{"score": [first, last], "score_first": first, "score_last": last, "regret": 2 - first - last},
+        **{"ci95_first": [first - 0.1, first], "ci95_regret": None, "theta_r2": [0.0, 0.5], "objective": [-9.0, -5.0]},
         **{"return": [[10 * first, 10 * last], [10 * first, 10 * last]], "seeds": [0, 1], "band": None},
     }
 
@@ -201,6 +204,8 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
         "0.70 to 0.90 (51%)",
         "-5",
     )
+    beside = ("first", "interval of first", "regret", "interval of regret")
+    assert [best[key] for key in beside] == ["0.20", "0.10 to 0.20", "1.00", "-"]
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
     about |= {"versions": dict.fromkeys(("python", "mujoco", "torch"), "1"), "eval_trials": 4, "episodes": 2}
     text = run_report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
@@ -238,6 +243,10 @@ def test_episodes_beyond_training_move_no_score() -> None:
     summary = scoring.summarise(by_method, 2)["other"]
     assert (summary["score"], summary["score_last"], summary["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
     assert summary["ci95"] == pytest.approx([0.4, 0.6])
+    assert (summary["score_first"], summary["ci95_first"]) == (0.2, pytest.approx([0.2, 0.2]))
+    assert summary["regret"] == pytest.approx(0.8 + 0.5)
+    assert summary["ci95_regret"] == pytest.approx([0.8 + 0.4, 0.8 + 0.6])
+    assert scoring.summarise(by_method, 2)["expert"]["regret"] == 0
 
 
 def test_rows_csv_is_row_by_row_what_came_of_it() -> None:

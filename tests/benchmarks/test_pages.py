@@ -17,7 +17,7 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
-from deconfounded.benchmarks.studies import cards, findings, gap, publish, results, tune
+from deconfounded.benchmarks.studies import cards, findings, gap, headroom, publish, results, tune
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -227,6 +227,64 @@ class TestOutcome:
         assert "one (0.90) inferred" in scoring.outcome({**lone, "one": entry(0.9, None)})
 
 
+def scored(method: str, first: float, last: float, tier: str = "2", deployment: str = "") -> dict[str, Any]:
+    """What `headroom` reads of an agent with two seeds and two episodes, where a return is a score."""
+    about = {
+        "method": method,
+        "deployment": deployment,
+        "tier": tier,
+        "seeds": [0, 1],
+        "reference": int(method == "expert"),
+    }
+    return {**about, "score_first": first, "score_last": last, "return": [[first, last]] * 2}
+
+
+class TestHeadroom:
+    METHODS = {
+        **{"random": scored("random", 0, 0, "reference"), "expert": scored("expert", 1, 1, "reference")},
+        **{"interventional": scored("interventional", 0.8, 0.98, "reference")},
+        **{"interventional_mode": scored("interventional", 0.85, 0.9, "reference", "mode")},
+        **{"a": scored("a", 0.6, 0.9), "a_mode": scored("a", 0.7, 0.8, deployment="mode")},
+        **{"b": scored("b", 0.1, 0.95, "3"), "c": scored("c", 0.99, 0.99, "sees theta")},
+    }
+
+    def test_of_a_task(self) -> None:
+        """Each method once, in the better deployment of the episode; who sees theta is no competitor."""
+        first, last, without = (headroom.headroom(self.METHODS, *of) for of in (("first",), ("last",), ("last", "12")))
+        assert first == headroom.Headroom(("interventional_mode", 0.85), [("a_mode", 0.7), ("b", 0.1)])
+        assert last == headroom.Headroom(("interventional", 0.98), [("b", 0.95), ("a", 0.9)])
+        assert first is not None
+        assert last is not None
+        assert without is not None
+        assert (first.left, last.solved, without.solved) == (pytest.approx(0.15), True, False)
+        assert headroom.headroom({"a": self.METHODS["a"]}, "last") is None
+
+    def test_page(self) -> None:
+        """Certified tasks alone are counted; and it is time when enough are solved without queries."""
+        better = {**self.METHODS, "a": scored("a", 0.6, 0.96)}
+        tasks = [envs.get(name) for name in ("curling", "icy_road", "hidden_goal")]
+        found = [
+            (task, {"methods": methods}) for task, methods in zip(tasks, (self.METHODS, better, better), strict=True)
+        ]
+        certified = {name: {"verdict": "passed"} for name in ("curling", "icy_road")}
+        text = headroom.page(found, certified)
+        assert "- 1 of 2 tasks are solved (50%) in the last episode, of those without queries." in text
+        assert "- 2 of 2 tasks are solved (100%) in the last episode, of all theta-blind methods." in text
+        assert "**It is time.**" in text
+        assert "not yet time" in headroom.page(found[:1], certified)
+        ceilings = "| curling | 0.85, mode | 0.70 a_mode (2) | 0.10 b | 0.15 | 0.98 | 0.95 b (3) | 0.90 a | solved |"
+        assert ceilings in text
+        assert "hidden_goal" not in text
+        assert "| a | 2 | 0.60 (0.60 to 0.60) | 0.93 (0.93 to 0.93) | 0.47 (0.47 to 0.47) |" in text
+
+    def test_picture(self, tmp_path: Path) -> None:
+        found = [(envs.get("curling"), {"methods": self.METHODS})]
+        made = headroom.points(found, {"curling": {"verdict": "passed"}})
+        assert made == [("curling", {"first": (0.85, [0.7, 0.1]), "last": (0.98, [0.95, 0.9])})]
+        headroom.picture(made, tmp_path / "headroom.png")
+        assert (tmp_path / "headroom.png").stat().st_size > 5000
+
+
 @pytest.fixture(scope="module")
 def made() -> dict[str, Any]:
     """What docs/index.html shows."""
@@ -253,6 +311,12 @@ class TestIndex:
             zero, one = means["random"].mean(), means["expert"].mean()
             last = (means[row["method"]][:, -1].mean() - zero) / (one - zero)
             assert row["value"] == pytest.approx(last, abs=1e-4)
+            scores = (means[row["method"]].mean(0) - zero) / (one - zero)
+            assert row["first"]["value"] == pytest.approx(scores[0], abs=1e-4)
+            assert row["regret"]["value"] == pytest.approx(len(scores) - scores.sum(), abs=1e-3)
+            for measure in ("first", "regret"):
+                low, high = row[measure]["interval"]
+                assert low - 1e-4 <= row[measure]["value"] <= high + 1e-4
             assert f"--task {row['task']}" in row["command"]
         values = {(row["task"], row["method"]): row for row in made["rows"]}
         for (task, _), row in values.items():
@@ -344,10 +408,26 @@ class TestInABrowser:
         seen.evaluate(click)
         assert [values[name] for name in seen.evaluate(CELLS.format(task))] == [values[name] for name in expected[::-1]]
         seen.evaluate("document.querySelector('#all button[data-key=cpu]').click()")
-        cells = "[...document.querySelectorAll('#all tbody tr')].map(row => row.cells[13].textContent)"
+        cells = "[...document.querySelectorAll('#all tbody tr')].map(row => row.cells[17].textContent)"
         cpu = [float(text) for text in seen.evaluate(cells)]
         assert cpu == sorted(cpu, reverse=True)
         assert len(cpu) == len(made["rows"])
+
+    def test_other_figures(self, seen: "Page", made: dict[str, Any], errors: list[str]) -> None:
+        """The matrix shows them, with the best first: of regret the least."""
+        task = made["tasks"][0]["name"]
+        for measure in ("first", "regret"):
+            choose(seen, measure=measure)
+            values = {row["method"]: row[measure]["value"] for row in made["rows"] if row["task"] == task}
+            seen.evaluate(f"document.querySelector('#matrix button[data-key={task}]').click()")
+            shown = [values[name] for name in seen.evaluate(CELLS.format(task))]
+            assert sorted(shown) in (shown, shown[::-1])
+            assert (shown[0] < shown[-1]) == (measure == "regret")
+            over = made["over"][""]["methods"]["deconfounded"][measure]["value"]
+            assert f"{over:.2f}" in seen.evaluate("document.getElementById('matrix').textContent")
+            seen.evaluate("document.querySelector('#matrix button[data-key=\"\"]').click()")
+            seen.evaluate("document.querySelector('#matrix button[data-key=\"\"]').click()")
+        assert errors == []
 
     def test_filters(self, seen: "Page", made: dict[str, Any], errors: list[str]) -> None:
         tiers = {task["name"]: task["tier"] for task in made["tasks"]}

@@ -1,0 +1,166 @@
+"""docs/headroom.md: what the best methods leave to gain on each task, and how many tasks are solved."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from deconfounded.benchmarks.output import index, statistics
+from deconfounded.benchmarks.output.pictures import panels
+from deconfounded.benchmarks.output.scoring import MEASURES, two_decimals
+from deconfounded.benchmarks.studies.cards import markdown_table
+from deconfounded.envs.streams import Array
+
+EXACT = "interventional"
+NEAR = 0.03  # of the ceiling: then a task is solved
+SHARE = 0.5  # of the tasks, solved in the last episode without queries: then the suite is to be made harder
+BEST = 5  # methods, whose spread is shown
+ENDS = {"first": "the first episode", "last": "the last episode"}
+BLIND = {"123": "of all theta-blind methods", "12": "of those without queries"}  # by tiers
+
+
+class Headroom(NamedTuple):
+    """Of a task and an episode: the exact reference, and the best methods of some tiers, in their best deployments."""
+
+    ceiling: tuple[str, float]
+    best: list[tuple[str, float]]  # at most BEST, best first
+
+    @property
+    def left(self) -> float:
+        """What is left to gain."""
+        return self.ceiling[1] - self.best[0][1]
+
+    @property
+    def solved(self) -> bool:
+        return self.left <= NEAR + 1e-9
+
+
+def headroom(methods: dict[str, Any], end: str, tiers: str = "123") -> Headroom | None:
+    """From the `methods` of results.json, of the score of an episode of ENDS; None without reference or methods."""
+    best: dict[str, tuple[str, float]] = {}
+    for name, entry in methods.items():
+        if entry["method"] == EXACT or entry["tier"] in tiers:
+            held = best.setdefault(entry["method"], (name, entry[f"score_{end}"]))
+            best[entry["method"]] = max(held, (name, entry[f"score_{end}"]), key=lambda agent: agent[1])
+    ceiling = best.pop(EXACT, None)
+    ranked = sorted(best.values(), key=lambda agent: -agent[1])[:BEST]
+    return Headroom(ceiling, ranked) if ceiling and ranked else None
+
+
+def of_tasks(found: index.Found, certified: dict[str, Any], end: str, tiers: str = "123") -> dict[str, Headroom]:
+    """By name, of the tasks whose certificate is passed."""
+    passed = {name for name, one in certified.items() if one["verdict"] == "passed"}
+    made = {task.name: headroom(results["methods"], end, tiers) for task, results in found if task.name in passed}
+    return {name: one for name, one in made.items() if one}
+
+
+def page(found: index.Found, certified: dict[str, Any]) -> str:
+    """docs/headroom.md."""
+    head = f"""# Headroom
+
+What is left to gain, and when the suite is to be made harder. Made by `deconf publish` from the [records](records)
+alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
+deployment: a posterior over theta, by the true dynamics. *Best* is the best method without theta in training (its tier
+in brackets), chosen after the fact, task by task; the *fifth* tells how far the five best lie apart, each in its best
+deployment. A task is *solved* where the best comes within {NEAR:g} of the ceiling. The ceiling is no bound: posterior
+sampling is not the best use of a belief.
+
+The suite is to be made harder when {SHARE:.0%} of its tasks are solved in the last episode, without queries."""
+    shares = {(end, tiers): of_tasks(found, certified, end, tiers) for end in ENDS for tiers in BLIND}
+    if not shares["last", "12"]:
+        return f"{head}\n\nNo task has the records for it.\n"
+    lines = [f"- {_solved(of)} in {ENDS[end]}, {BLIND[tiers]}." for (end, tiers), of in shares.items()]
+    solved = np.mean([one.solved for one in shares["last", "12"].values()])
+    verdict = "**It is time.**" if solved >= SHARE else "It is not yet time, by this rule."
+    first, last = (shares[end, "123"] for end in ENDS)
+    rows = [(name, *_cells(first[name], found), *_cells(last[name], found)) for name in last]
+    columns = [f"{end}: {what}" for end in ENDS for what in ("ceiling", "best", "fifth", "left")]
+    table = markdown_table(("task", *columns), rows)
+    picture = "![ceiling and the five best methods on each task](headroom.png)"
+    return "\n\n".join([head, "\n".join(lines), verdict, picture, table, deployments(found, certified)]).rstrip() + "\n"
+
+
+def _solved(of: dict[str, Headroom]) -> str:
+    names = [name for name, one in of.items() if one.solved]
+    return f"{len(names)} of {len(of)} tasks are solved ({len(names) / len(of):.0%})"
+
+
+def _cells(one: Headroom, found: index.Found) -> list[str]:
+    tiers = {name: entry["tier"] for _, results in found for name, entry in results["methods"].items()}
+    best, fifth = one.best[0], one.best[-1]
+    ceiling = f"{two_decimals(one.ceiling[1])}{one.ceiling[0].removeprefix(EXACT).replace('_', ', ')}"
+    cells = [ceiling, f"{two_decimals(best[1])} {best[0]} ({tiers[best[0]]})", f"{two_decimals(fifth[1])} {fifth[0]}"]
+    return [*cells, "solved" if one.solved else two_decimals(one.left)]
+
+
+def _mean(runs: list[Array]) -> Array:
+    """The mean over tasks of means over seeds [...], of runs of each task [..., S]."""
+    return np.mean([of.mean(-1) for of in runs], 0)
+
+
+def deployments(found: index.Found, certified: dict[str, Any]) -> str:
+    """Its part on ways of deploying one belief: means over the tasks where all ways of a method were run."""
+    passed = {name for name, one in certified.items() if one["verdict"] == "passed"}
+    ways: dict[str, dict[str, None]] = {}
+    for _, results in found:
+        for name, entry in results["methods"].items():
+            ways.setdefault(entry["method"], {})[name] = None
+    rows = []
+    for names in (of for of in ways.values() if len(of) > 1):
+        having = [results["methods"] for task, results in found if task.name in passed]
+        having = [methods for methods in having if set(names) <= set(methods)]
+        for name in names if having else ():
+            figures = []
+            for measure in MEASURES:
+                runs = {str(i): np.array([*index.measured(of, measure)[name].values()]) for i, of in enumerate(having)}
+                figure = statistics.over_tasks(_mean, runs)
+                assert figure is not None
+                low, high = figure.interval or ("", "")
+                ends = f" ({two_decimals(low)} to {two_decimals(high)})" if figure.interval else ""
+                figures.append(two_decimals(figure.value) + ends)
+            rows.append((name, str(len(having)), *figures))
+    if not rows:
+        return ""
+    text = """## Ways of deploying one belief
+
+One training, and one belief. Under the method's own name the latent is drawn at every step; `_episode`: once an
+episode, from the belief at its start; `_mode`: the likeliest value; `_mean`: the belief's mean. Of a category the exact
+policy takes the mode for the mean, and the learned one the probabilities; a Gaussian's mean is its mode. Means over the
+tasks where all of a method's ways were run, with 95% intervals of a stratified bootstrap."""
+    return "\n\n".join([text, markdown_table(("agent", "tasks", *MEASURES), rows)])
+
+
+Points = Sequence[tuple[str, dict[str, tuple[float, list[float]]]]]
+"""Of each task, by episode of ENDS: the ceiling and the best scores."""
+
+
+def points(found: index.Found, certified: dict[str, Any]) -> Points:
+    """What the picture shows; tasks with most left in the first episode at the top."""
+    ends = {end: of_tasks(found, certified, end) for end in ENDS}
+    names = sorted(ends["first"], key=lambda name: -ends["first"][name].left)
+    return [(name, {end: _scores(of[name]) for end, of in ends.items()}) for name in names]
+
+
+def _scores(one: Headroom) -> tuple[float, list[float]]:
+    return one.ceiling[1], [score for _, score in one.best]
+
+
+def picture(made: Points, file: Path, mark: str = "") -> None:
+    """A row a task, a panel an episode: the ceiling, the zone where it is solved, and the five best methods."""
+    size, blue, green = (9, 1.2 + 0.3 * len(made)), "tab:blue", "#2ca02c"
+    with panels(file, 1, len(ENDS), size=size, mark=mark, sharey=True) as [row]:
+        for panel, (end, said) in zip(row, ENDS.items(), strict=True):
+            for y, (_, by_end) in enumerate(made):
+                ceiling, (first, *others) = by_end[end]
+                labels = (None,) * 3 if y else ("ceiling: exact", "next four", "best theta-blind")
+                panel.barh(y, 2 * NEAR, left=ceiling - NEAR, height=0.8, color=green, alpha=0.18)
+                panel.vlines(ceiling, y - 0.4, y + 0.4, color=green, lw=2, label=labels[0])
+                panel.hlines(y, min(others, default=first), first, color=blue, lw=1.2)
+                panel.plot(others, [y] * len(others), "o", ms=3.5, mfc="w", color=blue, label=labels[1])
+                panel.plot(first, y, "o", ms=6, color=blue, label=labels[2])
+            panel.set(title=f"score in {said}", xlim=(0.3, 1.12), ylim=(len(made) - 0.5, -0.5))
+            panel.grid(axis="x", color="0.92")
+            panel.set_axisbelow(True)
+        row[0].set_yticks(range(len(made)), [name for name, _ in made])
+        row[0].legend(loc="lower left", frameon=False, fontsize=8)
