@@ -12,6 +12,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
+from deconfounded.benchmarks.engine.protocols import STANDARD, amounts
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import check_folder
 
@@ -34,7 +35,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
     made.add_argument("--resume", action="store_true", help="run what is not finished in the output folder")
-    made.set_defaults(expert=None, salt="", track=None, debug=False)  # of run.py alone
+    made.set_defaults(expert=None, salt="", track=None, debug=False, protocol=STANDARD)  # of run.py alone
     return made
 
 
@@ -76,13 +77,14 @@ def about(
     changes: Sequence[str],
     expert: str | None,
     salt: str,
+    protocol: str = STANDARD,
 ) -> dict[str, Any]:
     """What a folder is for, so that no other run writes there. Each job checks the rest that its results depend on."""
     ours = {method: values for method, values in settings.configs.items() if method not in METHODS.outside}
     made_of = {"task": task.name, "task_version": task.version, "reference": task.reference, "preset": name}
     made_of |= {"set": list(changes), "settings": {**asdict(settings), "configs": ours}}
     made_of |= {"versions": identity.versions(), **identity.expert(task, expert)}
-    return {"kind": kind.__name__, **made_of, "salt": salt, "episodes": task.episodes}
+    return {"kind": kind.__name__, **made_of, "salt": salt, "episodes": task.episodes, **identity.named(protocol)}
 
 
 def engine(cluster: str | None, debug: bool = False) -> "Engine":
@@ -114,11 +116,11 @@ def run(
     from deconfounded.benchmarks.engine.scheduler import run_all
 
     know_guests(folder / "jobs")  # whose amounts are settings too
-    settings = changed(preset(args.preset, task, args.device), args.set)
+    settings = changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set)
     seeds = args.seeds or settings.seeds
     catalogue.check(args.preset, (), seeds, ())
     own = args.expert, args.salt
-    described = about(kind, task, args.preset, settings, args.set, *own)
+    described = about(kind, task, args.preset, settings, args.set, *own, args.protocol)
     with locked(folder):
         prepare(folder, described, args.resume)
         track = args.track is not None
@@ -128,6 +130,7 @@ def run(
                 guest=catalogue.guest(name),
                 track=track,
                 walled=not args.debug,
+                protocol=args.protocol,
             )
             for name in methods
         ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import job_files
+from deconfounded.benchmarks.engine.protocols import STANDARD, applied
 from deconfounded.envs.support.files import read_sealed
 
 
@@ -18,6 +19,7 @@ def main() -> None:
     try:
         about = read_sealed(folder / "settings.json")
         task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
+        task = applied(about.get("protocol_name", STANDARD), task)
     except (OSError, KeyError):
         raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
     finished = job_files.left_in(folder / "jobs")

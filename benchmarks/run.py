@@ -24,6 +24,8 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import COMMON
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, EXACT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.identity import named
+from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD, amounts, applied
 from deconfounded.experts import policy
 
 
@@ -37,6 +39,8 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")
     parser.add_argument("--track", choices=["tensorboard"], help="log losses during training, in the run's folder")
     parser.add_argument("--salt", default="", help="any text: evaluation draws other thetas by it")
+    protocols = "; ".join(f"{name}: {text}" for name, text in PROTOCOLS.items())
+    parser.add_argument("--protocol", default=STANDARD, help=protocols)
     parser.add_argument("--debug", action="store_true", help="run in this process, for a debugger; keeps nothing")
     args = parser.parse_args()
     if args.list:
@@ -44,6 +48,7 @@ def main() -> None:
     if (args.task is None) == (args.tasks is None):
         raise envs.InputError(f"--task is missing, or given with --tasks; there are {', '.join(envs.names())}")
     tasks = [envs.get(args.task)] if args.task is not None else published.tasks(args.tasks)
+    tasks = [applied(args.protocol, task) for task in tasks]
     opaque = next((task.name for task in tasks if not task.has_likelihood), None)
     possible = [name for name in METHODS if name not in EXACT or opaque is None]
     if refused := [name for name in args.methods or () if name in EXACT and name not in possible]:
@@ -64,10 +69,11 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="deconfounded-debug-") as aside:
         base = Path(aside) if args.debug else args.out or Path("results")
         own = args.out is not None and args.task is not None
-        folders = {task.name: base if own else base / f"{task.name}-{args.preset}" for task in tasks}
+        kind = "-".join([args.preset, *named(args.protocol).values()])
+        folders = {task.name: base if own else base / f"{task.name}-{kind}" for task in tasks}
         for task in tasks:
             know_guests(folders[task.name] / "jobs")
-            changed(preset(args.preset, task, args.device), args.set)
+            changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set)
         run_tasks(tasks, args, [name for name in METHODS if name in wanted], folders)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.console import Parser
-from deconfounded.benchmarks.engine import catalogue
+from deconfounded.benchmarks.engine import catalogue, protocols
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import records
@@ -45,13 +45,16 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
 
-    settings = changed(preset(record["preset"], task, device, [method]), record["set"])
+    protocol = record.get("protocol_name", protocols.STANDARD)
+    task = protocols.applied(protocol, task)
+    settings = protocols.amounts(protocol, preset(record["preset"], task, device, [method]))
+    settings = changed(settings, record["set"])
     guest, salts = catalogue.guest(method), tuple(record["salts"]) if "salts" in record else None
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "jobs"
         folder.mkdir()
         what, of = (task.reference, settings, method, (record["seed"],)), (expert, record["salt"], guest)
-        job = BenchmarkJob(*what, folder, *of, salts=salts)
+        job = BenchmarkJob(*what, folder, *of, salts=salts, protocol=protocol)
         with Local() as engine:
             finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
         for again in records.of_run(finished, record["preset"], record["set"], task.episodes):

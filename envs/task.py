@@ -175,8 +175,12 @@ class Task(ABC):
 
     def sample_theta(self, rng: Streams) -> Array:
         """Draws theta [N, L] ~ p(theta); rng has a generator for each environment."""
-        u = rng.random((rng.groups, len(self.latents)))
+        u = self.quantile(rng.random((rng.groups, len(self.latents))))
         return np.stack([lat.ppf(u[:, i]) for i, lat in enumerate(self.latents)], -1)
+
+    def quantile(self, u: Array) -> Array:
+        """Uniform numbers [N, L] -> the quantiles of p(theta) at which theta is drawn; the same, unless restricted."""
+        return u
 
     @property
     def drifts(self) -> bool:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine.protocols import STANDARD, applied
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
@@ -52,19 +53,21 @@ class Context:
         folder: Path | None = None,
         expert: str | None = None,
         salt: str = "",
+        protocol: str = STANDARD,
     ) -> None:
         """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load.
 
         salt: of demonstrations and exploration, where their thetas are to be nobody's guess.
         """
-        self.task, self.preset, self.seeds, self.monitor = task, preset, list(seeds), monitor or Monitor()
-        self.folder, self.named_expert, self.salt = folder, expert, salt
+        self.task, self.scored = (applied(protocol, task, evaluation) for evaluation in (False, True))
+        self.preset, self.seeds, self.monitor = preset, list(seeds), monitor or Monitor()
+        self.folder, self.named_expert, self.salt, self.protocol = folder, expert, salt, protocol
         self.expert = policy.load(task, expert)
 
     @cached_property
     def env(self) -> envs.BatchEnv:
         """The environments that agents are scored in."""
-        return envs.BatchEnv(self.task, self.preset.eval_trials * len(self.seeds))
+        return envs.BatchEnv(self.scored, self.preset.eval_trials * len(self.seeds))
 
     def rows(self, i: int) -> slice:
         """Trials, of those that agents are scored in, of the i-th seed."""
@@ -78,7 +81,8 @@ class Context:
     def _kept(self, seed: int) -> tuple[Path, str]:
         """Where a seed's demonstrations are kept, and what they are made of."""
         assert self.folder is not None
-        made_of = identity.demonstrations(self.task, self.named_expert, self.preset.expert_trials, seed)
+        what = (self.task, self.named_expert, self.preset.expert_trials, seed, self.protocol)
+        made_of = identity.demonstrations(*what)
         return self.folder / f"demonstrations-{seed}.npz", made_of
 
     def has_demonstrations(self, seed: int) -> bool:

@@ -20,6 +20,7 @@ import numpy as np
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import sources
+from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.sources import ROOT
 from deconfounded.experts import policy
 
@@ -58,14 +59,21 @@ def identity(job: "Job") -> dict[str, Any]:
         "salt": job.salt,
         "versions": versions(),
         "outside": {kind: sources.digest(files) for kind, files in texts.items() if files},
+        **named(job.protocol),
     }
     return json.loads(json.dumps(made_of))
 
 
-def demonstrations(task: envs.Task, source: str | None, trials: int, seed: int) -> str:
+def named(protocol: str) -> dict[str, str]:
+    """What records and folders say of a protocol: nothing of the standard one. `protocol` is the version of all."""
+    return {} if protocol == STANDARD else {"protocol_name": protocol}
+
+
+def demonstrations(task: envs.Task, source: str | None, trials: int, seed: int, protocol: str = STANDARD) -> str:
     """SHA-256 of all that a seed's demonstrations depend on."""
     text = sources.digest(sources.of_task(task))
     parts = [PROTOCOL, task.name, task.version, text, expert(task, source), trials, seed, versions()]
+    parts += named(protocol).values()
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 

@@ -20,6 +20,7 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
 from deconfounded.benchmarks.engine.progress import tick
+from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.envs.support.files import write_atomically
@@ -44,6 +45,7 @@ class Job(ABC):
     salts: tuple[str, str] | None = None  # of a guest's training and evaluation; None: drawn
     track: bool = False  # whether losses go to TensorBoard as they come
     walled: bool = True  # whether a guest has a process of its own
+    protocol: str = STANDARD
 
     @property
     def about(self) -> Method:
@@ -53,7 +55,7 @@ class Job(ABC):
     def context(self, monitor: Monitor | None = None, salt: str = "") -> Context:
         """The data and environments of its seeds; salt: of its training, whose data is then kept nowhere."""
         folder = None if salt else self.folder
-        return Context(envs.get(self.task), self.preset, self.seeds, monitor, folder, self.expert, salt)
+        return Context(envs.get(self.task), self.preset, self.seeds, monitor, folder, self.expert, salt, self.protocol)
 
     @abstractmethod
     def run(self) -> str:

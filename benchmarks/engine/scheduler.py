@@ -88,7 +88,7 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
     ours = [job for job in parts if "demonstrations" in job.about.uses and job.guest is None]
     imitated = {seed: job for job in ours for seed in job.seeds}
     first: list[Job] = [
-        DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert)
+        DemonstrationJob(job.task, job.preset, "demonstrations", (seed,), folder, job.expert, protocol=job.protocol)
         for seed, job in sorted(imitated.items())
         if not job.context().has_demonstrations(seed)
     ]

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import records, scoring, statistics
 from deconfounded.benchmarks.output.pictures import colours, panels
@@ -34,6 +35,9 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
     records of random and expert.
     """
     scores: dict[str, dict[str, dict[int, Array]]] = {}
+    protocols = list(dict.fromkeys(record.get(records.NAME, STANDARD) for record in every))
+    if len(protocols) > 1:
+        raise InputError(f"records of protocols {' and '.join(protocols)} are not to be compared; give those of one")
 
     def add(record: Record) -> None:
         of = scores.setdefault(records.named(record), {}).setdefault(record["task"], {})
@@ -48,12 +52,12 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
             add(record)
     if not scores:
         raise InputError("the records given are of random and expert alone; give those of a method")
-    made_by = {record["task"]: tuple(record[key] for key in records.REFERENCED) for record in every}
+    made_by = {record["task"]: records.referenced(record) for record in every}
     for task, made in made_by.items():
-        for record in records.of_task(RECORDS, task):
+        for record in records.of_task(RECORDS, task, protocol=protocols[0]):
             name = records.named(record)
-            same = tuple(record[key] for key in records.REFERENCED) == made
-            if same and name in against and not any(records.named(one) == name for one in every if one["task"] == task):
+            ran = any(records.named(one) == name for one in every if one["task"] == task)
+            if records.referenced(record) == made and name in against and not ran:
                 add(record)
     for name in against:
         if name not in scores:

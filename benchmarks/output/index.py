@@ -188,8 +188,8 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
     over = {key: over_tasks(scores["last"], names) for key, names in tiers.items()}
     for key, names in tiers.items():
         for measure in ("first", "regret"):
-            for name, by_task in _runs(scores[measure], names).items():
-                over[key]["methods"][name][measure] = _as_json(statistics.over_tasks(statistics.iqm, by_task))
+            for name, runs in _runs(scores[measure], names).items():
+                over[key]["methods"][name][measure] = _as_json(statistics.over_tasks(statistics.iqm, runs))
     return {
         "tasks": sorted(tasks, key=lambda task: (task["tier"] == "none", task["tier"])),
         "methods": {name: methods[name] for name in order},

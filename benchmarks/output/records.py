@@ -15,7 +15,9 @@ import fastjsonschema
 import numpy as np
 
 from deconfounded.benchmarks.engine.catalogue import REFERENCES, label
+from deconfounded.benchmarks.engine.identity import named as named_protocol
 from deconfounded.benchmarks.engine.job_files import Finished
+from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import scoring
 from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
@@ -23,18 +25,21 @@ from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]
 SCHEMA = Path(__file__).with_name("record.schema.json")
-COMMON = ("task", "task_version", "preset", "set", "salt", "eval_trials", "episodes", "expert")  # of a table's records
+NAME = "protocol_name"  # which a record of the standard protocol lacks
+COMMON = (  # of a table's records
+    *("task", "task_version", "preset", NAME, "set", "salt", "eval_trials", "episodes", "expert"),
+)
 MADE_OF = (  # what makes a record stale when it changes
     *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
-    *("salt", "versions", "outside"),
+    *("salt", "versions", "outside", NAME),
 )
-SLOT = ("preset", "set", "salt", "method", "deployment", "seed")  # of which a task's file holds one record
+SLOT = ("preset", NAME, "set", "salt", "method", "deployment", "seed")  # of which a task's file holds one record
 
 
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
     """The records of what a job wrote of a seed, one for each agent that it scored; see record.schema.json."""
     meta = data["meta"]
-    seed = {key: meta["identity"][key] for key in ("task", "method", *MADE_OF)}
+    seed = {key: meta["identity"][key] for key in ("task", "method", *MADE_OF) if key in meta["identity"]}
     seed |= {key: meta[key] for key in ("seed", "tier", "budget", "cpu_s", "commit", "machine")}
     seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
     seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
@@ -105,7 +110,7 @@ def check(record: Any, where: str) -> Record:
 
 def stale(record: Record, identity: Mapping[str, Any]) -> list[str]:
     """What a record was made of that is no longer so, of `MADE_OF`; identity: of the job that would make it today."""
-    return [key for key in MADE_OF if record[key] != identity[key]]
+    return [key for key in MADE_OF if record.get(key) != identity.get(key)]
 
 
 def place(task: str) -> str:
@@ -164,7 +169,7 @@ def named(record: Record) -> str:
 
 
 def _slot(record: Record) -> str:
-    return json.dumps([record[key] for key in SLOT])
+    return json.dumps([record.get(key) for key in SLOT])
 
 
 def _grouped(records: Sequence[Record], key: Callable[[Record], str]) -> dict[str, list[Record]]:
@@ -208,10 +213,10 @@ def _line(record: Record) -> str:
     return json.dumps({**sealed(rest), **note}, separators=(",", ":"), allow_nan=False) + "\n"
 
 
-def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
+def of_task(folder: Path, task: str, preset: str = "default", protocol: str = STANDARD) -> list[Record]:
     """The records of a task under an unchanged preset, by method and seed: of its newest version, and each method's."""
-    plain = ("preset", "set", "salt")
-    kept = [record for record in held(folder / place(task)) if [record[key] for key in plain] == [preset, [], ""]]
+    plain: dict[str, Any] = {"preset": preset, "set": [], "salt": "", NAME: None, **named_protocol(protocol)}
+    kept = [record for record in held(folder / place(task)) if all(record.get(key) == plain[key] for key in plain)]
     newest: dict[str, int] = {}
     for name, version in (("task", "task_version"), ("method", "method_version")):
         for record in kept:
@@ -220,7 +225,7 @@ def of_task(folder: Path, task: str, preset: str = "default") -> list[Record]:
     return sorted(kept, key=lambda record: (named(record), record["seed"]))
 
 
-REFERENCED = ("task", "task_version", "protocol", "expert", "expert_version")  # what 0 and 1 are of
+REFERENCED = ("task", "task_version", "protocol", NAME, "expert", "expert_version")  # what 0 and 1 are of
 
 
 def references(record: Record, beside: Sequence[Record] = ()) -> tuple[float, float]:
@@ -230,13 +235,18 @@ def references(record: Record, beside: Sequence[Record] = ()) -> tuple[float, fl
     the records that come with the package, if these are of the same REFERENCED; else over the records `beside`. Raises
     InputError if these have none.
     """
-    of = tuple(record[key] for key in REFERENCED)
-    return _published(*of) or _references([one for one in beside if tuple(one[key] for key in REFERENCED) == of])
+    of = referenced(record)
+    return _published(record.get(NAME, STANDARD), *of) or _references([one for one in beside if referenced(one) == of])
+
+
+def referenced(record: Record) -> tuple[Any, ...]:
+    """What the record's 0 and 1 are of."""
+    return tuple(record.get(key) for key in REFERENCED)
 
 
 @cache
-def _published(*of: Any) -> tuple[float, float] | None:
-    kept = [one for one in of_task(RECORDS, of[0]) if tuple(one[key] for key in REFERENCED) == of]
+def _published(protocol: str, *of: Any) -> tuple[float, float] | None:
+    kept = [one for one in of_task(RECORDS, of[0], protocol=protocol) if referenced(one) == of]
     return _references(kept) if {one["method"] for one in kept} >= set(REFERENCES) else None
 
 
@@ -258,8 +268,9 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
     first = records[0]
     for record in records:
         for key in COMMON:
-            if record[key] != first[key]:
-                raise InputError(f"records with {key} {first[key]} and {record[key]} do not belong in one table")
+            if record.get(key) != first.get(key):
+                both = " and ".join(str(one.get(key, STANDARD)) for one in (first, record))
+                raise InputError(f"records with {key} {both} do not belong in one table")
     by_method, by_agent = _grouped(records, lambda record: record["method"]), _grouped(records, named)
     for method, of in by_method.items():
         if any(record[key] != of[0][key] for record in of for key in ("method_version", "outside")):
@@ -269,7 +280,7 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
     rank = {name: i for i, name in enumerate(order)}
     names = sorted(by_agent, key=lambda name: rank.get(by_agent[name][0]["method"], len(rank)))
     return {
-        **{key: first[key] for key in COMMON if first[key] not in ("", [])},
+        **{key: first[key] for key in COMMON if first.get(key) not in ("", [], None)},
         "seeds": sorted({record["seed"] for record in records}),
         "commits": sorted({record["commit"] or "unknown" for record in records}),
         "versions": first["versions"],

@@ -35,7 +35,8 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     except Exception as error:  # a GL, a font or an encoder can fail in many ways
         print(f"no pictures: {error_line(error)}")
     write_atomically(folder / "report.html", page(results, folder))
-    head = f"{task.name}: 0 = random actions, 1 = the expert that sees theta"
+    under = f", protocol {results[records.NAME]}" if records.NAME in results else ""
+    head = f"{task.name}{under}: 0 = random actions, 1 = the expert that sees theta"
     table = scoring.plain_table(scoring.COLUMNS, scoring.rows(results["methods"]), scoring.DROPPED)
     note = f"{scoring.INTERVALS}\n\n" if len(results["seeds"]) > 1 else ""
     return f"\n{head}\n\n{table}\n\n{note}{results['wall_s']:.0f} s -> {folder / 'report.html'}"

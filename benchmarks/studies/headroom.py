@@ -1,15 +1,17 @@
 """docs/headroom.md: what the best methods leave to gain on each task, and how many tasks are solved."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from deconfounded.benchmarks.engine.protocols import PROTOCOLS
 from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.scoring import MEASURES, two_decimals
+from deconfounded.benchmarks.output.scoring import MEASURES, interval, two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
+from deconfounded.benchmarks.studies.results import outdated
 from deconfounded.envs.streams import Array
 
 EXACT = "interventional"
@@ -17,6 +19,7 @@ NEAR = 0.03  # of the ceiling: then a task is solved
 SHARE = 0.5  # of the tasks, solved in the last episode without queries: then the suite is to be made harder
 BEST = 5  # methods, whose spread is shown
 ENDS = {"first": "the first episode", "last": "the last episode"}
+PICTURE = "![ceiling and the five best methods on each task](headroom.png)"
 BLIND = {"123": "of all theta-blind methods", "12": "of those without queries"}  # by tiers
 
 
@@ -55,8 +58,8 @@ def of_tasks(found: index.Found, certified: dict[str, Any], end: str, tiers: str
     return {name: one for name, one in made.items() if one}
 
 
-def page(found: index.Found, certified: dict[str, Any]) -> str:
-    """docs/headroom.md."""
+def page(found: index.Found, certified: dict[str, Any], others: Mapping[str, index.Found]) -> str:
+    """docs/headroom.md; others: found under other protocols, by name."""
     head = f"""# Headroom
 
 What is left to gain, and when the suite is to be made harder. Made by `deconf publish` from the [records](records)
@@ -67,18 +70,30 @@ deployment. A task is *solved* where the best comes within {NEAR:g} of the ceili
 sampling is not the best use of a belief.
 
 The suite is to be made harder when {SHARE:.0%} of its tasks are solved in the last episode, without queries."""
+    parts = [head, *_measured(found, certified)]
+    if len(parts) > 1:
+        older = any(outdated(*of) for of in found)
+        note = " Some records are of older versions than today's; [results](results.md) says which." if older else ""
+        solved = np.mean([one.solved for one in of_tasks(found, certified, "last", "12").values()])
+        parts[2:2] = [("**It is time.**" if solved >= SHARE else "It is not yet time, by this rule.") + note, PICTURE]
+    else:
+        parts.append("No task has the records for it.")
+    parts.append(deployments(found, certified))
+    for name, of in others.items():
+        parts += [f"## Protocol {name}", f"{PROTOCOLS[name].capitalize()}.", *_measured(of, certified)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _measured(found: index.Found, certified: dict[str, Any]) -> list[str]:
+    """The shares of tasks that are solved, and the table of tasks; nothing where no task has the records for it."""
     shares = {(end, tiers): of_tasks(found, certified, end, tiers) for end in ENDS for tiers in BLIND}
     if not shares["last", "12"]:
-        return f"{head}\n\nNo task has the records for it.\n"
+        return []
     lines = [f"- {_solved(of)} in {ENDS[end]}, {BLIND[tiers]}." for (end, tiers), of in shares.items()]
-    solved = np.mean([one.solved for one in shares["last", "12"].values()])
-    verdict = "**It is time.**" if solved >= SHARE else "It is not yet time, by this rule."
     first, last = (shares[end, "123"] for end in ENDS)
     rows = [(name, *_cells(first[name], found), *_cells(last[name], found)) for name in last]
     columns = [f"{end}: {what}" for end in ENDS for what in ("ceiling", "best", "fifth", "left")]
-    table = markdown_table(("task", *columns), rows)
-    picture = "![ceiling and the five best methods on each task](headroom.png)"
-    return "\n\n".join([head, "\n".join(lines), verdict, picture, table, deployments(found, certified)]).rstrip() + "\n"
+    return ["\n".join(lines), markdown_table(("task", *columns), rows)]
 
 
 def _solved(of: dict[str, Headroom]) -> str:
@@ -116,9 +131,8 @@ def deployments(found: index.Found, certified: dict[str, Any]) -> str:
                 runs = {str(i): np.array([*index.measured(of, measure)[name].values()]) for i, of in enumerate(having)}
                 figure = statistics.over_tasks(_mean, runs)
                 assert figure is not None
-                low, high = figure.interval or ("", "")
-                ends = f" ({two_decimals(low)} to {two_decimals(high)})" if figure.interval else ""
-                figures.append(two_decimals(figure.value) + ends)
+                ends = interval([float(end) for end in figure.interval]) if figure.interval else "one seed"
+                figures.append(f"{two_decimals(float(figure.value))} ({ends})")
             rows.append((name, str(len(having)), *figures))
     if not rows:
         return ""

@@ -72,9 +72,9 @@ def keep(run: Path) -> None:
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
     made = records.read(files[0])
     results = records.gather(made, list(METHODS))
-    if results["preset"] != "default" or {"set", "salt"} & set(results):
-        wrong = f"of preset {results['preset']}, or changed"
-        raise envs.InputError(f"{run} is {wrong}; pages show the default preset alone")
+    if results["preset"] != "default" or {"set", "salt", records.NAME} & set(results):
+        wrong = f"of preset {results['preset']}, or changed, or of another protocol"
+        raise envs.InputError(f"{run} is {wrong}; pages show the default preset and the standard protocol alone")
     if results["task"] not in envs.SUITE:
         raise envs.InputError(f"{run} is of {results['task']}; docs/ shows tasks of the suite, {', '.join(envs.SUITE)}")
     task = envs.get(results["task"])
@@ -131,7 +131,7 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
         DOCS / "results.md": results.results_page(found, certified),
-        DOCS / "headroom.md": headroom.page(found, certified),
+        DOCS / "headroom.md": headroom.page(found, certified, results.other_protocols()),
         **{file: _filled(file, of) for file, of in tables.items()},
     }
 

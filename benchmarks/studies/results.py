@@ -1,5 +1,6 @@
 """Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and baselines.md."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD
 from deconfounded.benchmarks.output import index, records, scoring
 from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
@@ -24,10 +26,18 @@ AUTHORS = {
 TIMED = ("bandit", "tilted_cartpole", "slippery_cartpole")  # in docs/speed.md
 
 
-def published() -> index.Found:
+def published(protocol: str = STANDARD, names: Sequence[str] = envs.SUITE) -> index.Found:
     """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
-    kept = {name: records.of_task(DOCS / "records", name) for name in envs.SUITE}
+    kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
     return [(envs.get(name), records.gather(of, list(METHODS))) for name, of in kept.items() if of]
+
+
+def other_protocols() -> dict[str, index.Found]:
+    """The same under each other protocol that has records; reads the files that have any."""
+    files = {name: DOCS / "records" / records.place(name) for name in envs.SUITE}
+    names = [name for name, file in files.items() if file.exists() and records.NAME.encode() in file.read_bytes()]
+    found = {protocol: published(protocol, names) for protocol in PROTOCOLS if protocol != STANDARD}
+    return {protocol: of for protocol, of in found.items() if of}
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
@@ -43,6 +53,7 @@ def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
     chosen = "" if results["preset"] == "default" else f" --preset {results['preset']}"
     counted = "" if seeds == preset(results["preset"], task, "cpu").seeds else f" --seeds {seeds}"
     changed = f" --set {' '.join(results['set'])}" if "set" in results else ""
+    changed += f" --protocol {results[records.NAME]}" if records.NAME in results else ""
     return f"python benchmarks/run.py --task {task.name}{chosen}{changed}{counted}{named}"
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.protocols import STANDARD, applied
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
@@ -30,19 +31,24 @@ def run(
     changes: Sequence[str] = (),
     cluster: str | None = None,
     base: "Preset | None" = None,
+    protocol: str = STANDARD,
 ) -> "list[Record]":
-    """The records of the methods' seeds on a task; base: the settings the folder is for, if others follow there."""
+    """The records of the methods' seeds on a task, under a protocol with its settings.
+
+    base: the settings that the folder is for, if others follow there.
+    """
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.job_files import prepare
     from deconfounded.benchmarks.engine.scheduler import listed, run_all
     from deconfounded.benchmarks.output import records
 
     wanted, own = [name for name in METHODS if name in methods], tuple(seeds)
-    jobs = [BenchmarkJob(task.reference, settings, name, own, folder / "jobs", expert=expert) for name in wanted]
+    task, rest = applied(protocol, task), {"expert": expert, "protocol": protocol}
+    jobs = [BenchmarkJob(task.reference, settings, name, own, folder / "jobs", **rest) for name in wanted]
     label = f"{task.name}, {', '.join(wanted)}, {listed(own)}"
     # Workers of its own: a record names the code that is there when it is made, and they have imported it.
     with commands.locked(folder), commands.engine(cluster) as engine:
-        about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert, "")
+        about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert, "", protocol)
         prepare(folder, about, resume=True)
         finished, _ = run_all(jobs, settings.device, label, engine)
     asked = [entry for entry in finished if entry[0] in wanted and entry[1] in own]

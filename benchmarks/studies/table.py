@@ -13,6 +13,8 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
+from deconfounded.benchmarks.engine.identity import named
+from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD, amounts, applied
 from deconfounded.benchmarks.studies import runs
 
 if TYPE_CHECKING:
@@ -28,22 +30,25 @@ def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
 
 
 def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...]:
-    """The job's seeds of which there is no record among those kept of its task, or one that is stale today."""
+    """The job's seeds of which a deployment has no record among those kept of its task, or one that is stale."""
     from deconfounded.benchmarks.engine.identity import identity
     from deconfounded.benchmarks.output import records
 
     today = identity(job)
     same = [record for record in kept if (record["method"], record["preset"]) == (job.method, preset)]
-    fresh = {record["seed"] for record in same if not records.stale(record, today)}
-    return tuple(seed for seed in job.seeds if seed not in fresh)
+    same = [record for record in same if record.get("protocol_name") == today.get("protocol_name")]
+    fresh = {(record["seed"], record["deployment"]) for record in same if not records.stale(record, today)}
+    ways = ("", *job.about.deployments)
+    return tuple(seed for seed in job.seeds if any((seed, way) not in fresh for way in ways))
 
 
 def main() -> None:
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
+    parser.add_argument("--protocol", default=STANDARD, help=f"of {', '.join(PROTOCOLS)}")
     parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
     args = parser.parse_args()
-    tasks = published.tasks(args.tasks)
+    tasks = [applied(args.protocol, task) for task in published.tasks(args.tasks)]
     asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
     methods = [name for name in METHODS if name in asked]
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
@@ -51,11 +56,14 @@ def main() -> None:
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.studies.cards import DOCS
 
-    folder = args.out or Path("results") / "table"
+    folder = args.out or Path("results") / "-".join(["table", *named(args.protocol).values()])
+    under = {"protocol": args.protocol}
     kept = DOCS / "records" if args.preset == "default" and not args.set else folder / "records"
-    settings = {task.name: changed(preset(args.preset, task, args.device), args.set) for task in tasks}
+    settings = {
+        task.name: changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set) for task in tasks
+    }
     jobs = [
-        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs")
+        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs", **under)
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods
@@ -67,7 +75,7 @@ def main() -> None:
         for job, seeds in left.items():
             print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
         return
-    options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster}
+    options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():
         made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
         records.write(kept, made)

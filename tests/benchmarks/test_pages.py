@@ -236,7 +236,7 @@ def scored(method: str, first: float, last: float, tier: str = "2", deployment: 
         "seeds": [0, 1],
         "reference": int(method == "expert"),
     }
-    return {**about, "score_first": first, "score_last": last, "return": [[first, last]] * 2}
+    return {**about, "version": 1, "score_first": first, "score_last": last, "return": [[first, last]] * 2}
 
 
 class TestHeadroom:
@@ -264,14 +264,19 @@ class TestHeadroom:
         better = {**self.METHODS, "a": scored("a", 0.6, 0.96)}
         tasks = [envs.get(name) for name in ("curling", "icy_road", "hidden_goal")]
         found = [
-            (task, {"methods": methods}) for task, methods in zip(tasks, (self.METHODS, better, better), strict=True)
+            (task, {"methods": methods, "task_version": task.version})
+            for task, methods in zip(tasks, (self.METHODS, better, better), strict=True)
         ]
         certified = {name: {"verdict": "passed"} for name in ("curling", "icy_road")}
-        text = headroom.page(found, certified)
+        text = headroom.page(found, certified, {})
         assert "- 1 of 2 tasks are solved (50%) in the last episode, of those without queries." in text
         assert "- 2 of 2 tasks are solved (100%) in the last episode, of all theta-blind methods." in text
         assert "**It is time.**" in text
-        assert "not yet time" in headroom.page(found[:1], certified)
+        apart = headroom.page(found[:1], certified, {"once": found[1:2]})
+        assert "It is not yet time" in apart
+        own = apart.partition("## Protocol once\n\nTrials of one episode.\n\n")[2]
+        assert "- 1 of 1 tasks are solved (100%) in the last episode, of those without queries." in own
+        assert "| curling |" not in own
         ceilings = "| curling | 0.85, mode | 0.70 a_mode (2) | 0.10 b | 0.15 | 0.98 | 0.95 b (3) | 0.90 a | solved |"
         assert ceilings in text
         assert "hidden_goal" not in text

@@ -1,0 +1,70 @@
+"""Protocols: what a benchmark changes, alike for all methods, of the amounts of data, of a trial, or of the thetas.
+
+A record names its protocol unless that is STANDARD. Versions of seeding and roll-outs are `identity.PROTOCOL`.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from deconfounded import envs
+from deconfounded.envs.streams import Array
+
+if TYPE_CHECKING:
+    from deconfounded.benchmarks.engine.presets import Preset
+
+STANDARD = "standard"
+PROTOCOLS = {
+    STANDARD: "all of it",
+    "scarce": "a sixteenth of the expert trials, of exploration and of queries",
+    "unseen": "theta from the middle half of each latent's distribution in training, from the rest in evaluation",
+    "once": "trials of one episode",
+}
+LESS = 16
+AMOUNTS = ("expert_trials", "explore_trials", "query_trials")
+EDGE = 0.25  # of the probability, at either end of a latent's distribution: thetas that training does not see
+
+
+def middle(u: Array) -> Array:
+    """Uniform numbers [...] -> uniform quantiles between the edges."""
+    return EDGE + (1 - 2 * EDGE) * u
+
+
+def edges(u: Array) -> Array:
+    """Uniform numbers [...] -> uniform quantiles in the edges."""
+    return 2 * EDGE * u + (1 - 2 * EDGE) * (u >= 0.5)
+
+
+def check(protocol: str, tasks: Sequence[envs.Task]) -> None:
+    """Raises InputError for a protocol that there is not, or that a task cannot be under."""
+    if protocol not in PROTOCOLS:
+        raise envs.closest("protocol", protocol, list(PROTOCOLS))
+    for task in tasks if protocol == "unseen" else ():
+        categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
+        why = f"{categories[0]} is categorical, which has no middle" if categories else ""
+        why = "its theta moves, and would leave the middle" if task.drifts or task.switches else why
+        why = why if task.has_likelihood else "it draws theta by its own sample_theta alone"
+        if why:
+            raise envs.InputError(f"--protocol unseen is not for {task.name}: {why}")
+
+
+def amounts(protocol: str, preset: "Preset") -> "Preset":
+    """The preset's amounts under a protocol."""
+    if protocol != "scarce":
+        return preset
+    return replace(preset, **{name: max(1, getattr(preset, name) // LESS) for name in AMOUNTS})
+
+
+def applied(protocol: str, task: envs.Task, evaluation: bool = False) -> envs.Task:
+    """The task under a protocol: of training, or of evaluation. It never changes what p(theta) is to exact policies."""
+    check(protocol, [task])
+    every: dict[str, dict[str, Any]] = {
+        "unseen": {"quantile": edges if evaluation else middle},
+        "once": {"episodes": 1, "latents": tuple(replace(latent, drift=0.0) for latent in task.latents)},
+    }
+    if protocol not in every:
+        return task
+    other = copy.copy(task)
+    other.__dict__.update(every[protocol])
+    return other

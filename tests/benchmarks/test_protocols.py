@@ -1,0 +1,156 @@
+"""Protocols: what each changes of data, trials and thetas, and that records of two never stand in one table."""
+
+import json
+import queue
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine import progress, protocols
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.identity import identity
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.published import RECORDS
+from deconfounded.benchmarks.output import comparison, records
+from deconfounded.benchmarks.studies import table
+from deconfounded.envs.streams import Array
+from deconfounded.experts.rollout import RandomAgent
+from tests import toys
+from tests.tools import tiny_preset
+
+PUSH = toys.Push()
+
+
+def context(task: envs.Task, protocol: str, **amounts: int) -> Context:
+    settings = replace(tiny_preset(), **amounts)
+    return Context(task, settings, [0, 1], expert="tests.toys:control", protocol=protocol)
+
+
+def inside(theta: Array) -> Array:
+    """Whether thetas are in the middle half of their distribution."""
+    quantile = PUSH.latents[0].cdf(theta)
+    return (quantile >= 0.25) & (quantile <= 0.75)
+
+
+def test_scarce_amounts() -> None:
+    """On control 16 expert trials and, over the rounds of deconfounded, 32 of exploration; evaluation as before."""
+    plain = preset("default", envs.get("curling"), "cpu")
+    made = protocols.amounts("scarce", plain)
+    rounds = made.configs["deconfounded"]["rounds"]
+    assert (made.expert_trials, made.explore_trials * rounds, made.query_trials) == (16, 32, 3)
+    assert replace(made, **{name: getattr(plain, name) for name in protocols.AMOUNTS}) == plain
+    assert protocols.amounts("once", plain) == plain
+
+
+def test_unseen_thetas() -> None:
+    """All that training sees is of the middle half, all that is scored of the rest, on both sides."""
+    made = context(PUSH, "unseen", expert_trials=32, explore_trials=16, query_trials=16, eval_trials=32)
+    made.demonstrations  # noqa: B018
+    explored = made._roll_out(16, None, made.rngs).theta
+    assert inside(made.demonstrated_theta).all()
+    assert inside(explored).all()
+    scored = evaluate(made, RandomAgent(PUSH.action_space), False)[0]["theta"]
+    assert not inside(scored).any()
+    assert scored.min() < made.demonstrated_theta.min()
+    assert scored.max() > made.demonstrated_theta.max()
+    standard = context(PUSH, "standard", expert_trials=32).demonstrated_theta
+    assert 0.2 < inside(standard).mean() < 0.8
+    grids = [protocols.applied("unseen", PUSH, evaluation).theta_grid(5) for evaluation in (False, True)]
+    assert all((grid == PUSH.theta_grid(5)).all() for grid in grids), "p(theta) is the same to exact policies"
+
+
+@pytest.mark.parametrize(
+    ("name", "says"), [("bandit", "best_arm is categorical"), ("rolling_deck", "moves"), ("gusty_drone", "moves")]
+)
+def test_tasks_without_unseen_thetas(name: str, says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"--protocol unseen is not for {name}: .*{says}"):
+        protocols.applied("unseen", envs.get(name))
+    with pytest.raises(envs.InputError, match="protocol 'onec' is unknown; did you mean 'once'"):
+        protocols.applied("onec", envs.get(name))
+
+
+def test_trials_of_one_episode() -> None:
+    made = context(toys.Drift(), "once")
+    assert not made.task.drifts
+    assert made.demonstrations.mask.shape[:2] == (8, 1)
+    assert evaluate(made, RandomAgent(PUSH.action_space), True)[0]["returns"].shape == (8, 1)
+    assert envs.get("rolling_deck").episodes == protocols.applied("scarce", envs.get("rolling_deck")).episodes == 5
+
+
+def test_a_job_s_record_names_its_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And that of the standard protocol is as it was."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = BenchmarkJob("weak_thruster", tiny_preset(), "random", (0,), tmp_path, protocol="once")
+    job.run()
+    data = job.load(0)
+    assert data is not None
+    (made,) = records.of_job(data, "default", [], 1)
+    assert made["protocol_name"] == "once"
+    assert len(made["returns"]) == 1
+    records.write(tmp_path / "records", [made])
+    assert records.read(tmp_path / "records" / "weak_thruster.jsonl") == [json.loads(json.dumps(made))]
+    assert "protocol_name" not in identity(replace(job, protocol="standard"))
+    assert (
+        replace(job, protocol="standard").unfit(0, data) == "it was made with another protocol_name (was once, is none)"
+    )
+
+
+class TestTables:
+    @pytest.fixture(scope="class")
+    def both(self) -> tuple[list[Any], list[Any]]:
+        """Records of a task under the standard protocol, and some that say that they are of another."""
+        kept = records.of_task(RECORDS, "curling")
+        return kept, [
+            {**one, "protocol_name": "once"} for one in kept if one["method"] in ("random", "expert", "dagger")
+        ]
+
+    def test_they_lie_side_by_side(self, both: tuple[list[Any], list[Any]], tmp_path: Path) -> None:
+        """In a task's file, each with its own 0 and 1; what asks for no protocol gets the standard one."""
+        kept, others = both
+        kept = [one for one in kept if one["method"] in ("random", "expert", "dagger")]
+        records.write(tmp_path, [*kept, *others])
+        assert records.of_task(tmp_path, "curling") == kept
+        assert records.of_task(tmp_path, "curling", protocol="once") == others
+        assert not (tmp_path / "superseded").exists()
+        with pytest.raises(envs.InputError, match="protocol_name standard and once do not belong in one table"):
+            records.gather([*kept, *others])
+        assert records.gather(others)["protocol_name"] == "once"
+        less = [{**one, "returns": [value - 1 for value in one["returns"]]} for one in others]
+        assert records.references(less[0], less) == pytest.approx(
+            [x - 1 for x in records.references(kept[0])], abs=1e-3
+        )
+
+    def test_compare_refuses_two(self, both: tuple[list[Any], list[Any]]) -> None:
+        kept, others = both
+        with pytest.raises(envs.InputError, match="records of protocols standard and once are not to be compared"):
+            comparison.gathered([*kept, *others], [])
+        assert set(comparison.gathered(others, [])) == {"dagger"}
+        with pytest.raises(envs.InputError, match="--against naive_rnn: no record is of it"):
+            comparison.gathered(others, ["naive_rnn"])
+
+    def test_what_is_missing(self, both: tuple[list[Any], list[Any]]) -> None:
+        """A deployment without record, or a record of another protocol, is missing."""
+        settings = preset("default", envs.get("curling"), "cpu")
+        job = BenchmarkJob("curling", settings, "random", (0, 1), Path())
+        fresh = [{**one, **{key: identity(job)[key] for key in identity(job) if key in one}} for one in both[0]]
+        fresh = [one for one in fresh if one["method"] == "random"]
+        assert table.missing(job, "default", fresh) == ()
+        assert table.missing(replace(job, protocol="once"), "default", fresh) == (0, 1)
+        way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
+        assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
+
+
+def test_quantiles() -> None:
+    """Halves of the probability, uniform in each, without a gap."""
+    u = (np.arange(1000) + 0.5) / 1000
+    assert np.ptp(protocols.middle(u)) == pytest.approx(0.5, abs=2e-3)
+    ends = protocols.edges(u)
+    assert np.sort([*protocols.middle(u), *ends]).max() < 1
+    assert np.histogram(ends, 4, (0, 1))[0].tolist() == [500, 0, 0, 500]
+    assert np.histogram(protocols.middle(u), 4, (0, 1))[0].tolist() == [0, 500, 500, 0]
