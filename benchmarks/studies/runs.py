@@ -43,8 +43,10 @@ def run(
     from deconfounded.benchmarks.output import records
 
     wanted, own = [name for name in METHODS if name in methods], tuple(seeds)
-    task, rest = applied(protocol, task), {"expert": expert, "protocol": protocol}
-    jobs = [BenchmarkJob(task.reference, settings, name, own, folder / "jobs", **rest) for name in wanted]
+    task, jobs = applied(protocol, task), []
+    for name in wanted:
+        what = (task.reference, settings, name, own, folder / "jobs")
+        jobs.append(BenchmarkJob(*what, expert=expert, protocol=protocol))
     label = f"{task.name}, {', '.join(wanted)}, {listed(own)}"
     # Workers of its own: a record names the code that is there when it is made, and they have imported it.
     with commands.locked(folder), commands.engine(cluster) as engine:
