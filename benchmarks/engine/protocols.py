@@ -4,7 +4,6 @@ A record names its protocol unless that is STANDARD. Versions of seeding and rol
 """
 
 import copy
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -36,17 +35,18 @@ def edges(u: Array) -> Array:
     return 2 * EDGE * u + (1 - 2 * EDGE) * (u >= 0.5)
 
 
-def check(protocol: str, tasks: Sequence[envs.Task]) -> None:
-    """Raises InputError for a protocol that there is not, or that a task cannot be under."""
+def check(protocol: str, task: envs.Task) -> None:
+    """Raises InputError for a protocol that there is not, or that the task cannot be under."""
     if protocol not in PROTOCOLS:
         raise envs.closest("protocol", protocol, list(PROTOCOLS))
-    for task in tasks if protocol == "unseen" else ():
-        categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
-        why = f"{categories[0]} is categorical, which has no middle" if categories else ""
-        why = "its theta moves, and would leave the middle" if task.drifts or task.switches else why
-        why = why if task.has_likelihood else "it draws theta by its own sample_theta alone"
-        if why:
-            raise envs.InputError(f"--protocol unseen is not for {task.name}: {why}")
+    if protocol != "unseen":
+        return
+    categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
+    why = f"{categories[0]} is categorical, which has no middle" if categories else ""
+    why = "its theta moves, and would leave the middle" if task.drifts or task.switches else why
+    why = why if task.has_likelihood else "it draws theta by its own sample_theta alone"
+    if why:
+        raise envs.InputError(f"--protocol unseen is not for {task.name}: {why}")
 
 
 def amounts(protocol: str, preset: "Preset") -> "Preset":
@@ -58,7 +58,7 @@ def amounts(protocol: str, preset: "Preset") -> "Preset":
 
 def applied(protocol: str, task: envs.Task, evaluation: bool = False) -> envs.Task:
     """The task under a protocol: of training, or of evaluation. It never changes what p(theta) is to exact policies."""
-    check(protocol, [task])
+    check(protocol, task)
     every: dict[str, dict[str, Any]] = {
         "unseen": {"quantile": edges if evaluation else middle},
         "once": {"episodes": 1, "latents": tuple(replace(latent, drift=0.0) for latent in task.latents)},

@@ -42,13 +42,26 @@ def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...
     return tuple(seed for seed in job.seeds if any((seed, way) not in fresh for way in ways))
 
 
+def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
+    """The tasks under a protocol; those that cannot be are left out, and a line says why."""
+    fit = []
+    for task in tasks:
+        try:
+            fit.append(applied(protocol, task))
+        except envs.InputError as error:
+            if protocol not in PROTOCOLS:
+                raise
+            print(f"left out: {error}")
+    return fit
+
+
 def main() -> None:
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
     parser.add_argument("--protocol", default=STANDARD, help=f"of {', '.join(PROTOCOLS)}")
     parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
     args = parser.parse_args()
-    tasks = [applied(args.protocol, task) for task in published.tasks(args.tasks)]
+    tasks = fitting(args.protocol, published.tasks(args.tasks))
     asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
     methods = [name for name in METHODS if name in asked]
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob

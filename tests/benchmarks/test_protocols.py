@@ -71,6 +71,7 @@ def test_unseen_thetas() -> None:
 def test_tasks_without_unseen_thetas(name: str, says: str) -> None:
     with pytest.raises(envs.InputError, match=f"--protocol unseen is not for {name}: .*{says}"):
         protocols.applied("unseen", envs.get(name))
+    assert [task.name for task in table.fitting("unseen", [envs.get(name), PUSH])] == ["push"]
     with pytest.raises(envs.InputError, match="protocol 'onec' is unknown; did you mean 'once'"):
         protocols.applied("onec", envs.get(name))
 
