@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from deconfounded.benchmarks.studies.foreign.world import World, demonstrations, explorer
-from deconfounded.deconf.diagnosis import exploration
-from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials, joined
 
@@ -44,6 +42,9 @@ class Case:
 
     def logs(self, folder: Path) -> tuple[Path, Path]:
         """Files of the expert's trials, and of exploration: half at random, half by a clone that tries things."""
+        from deconfounded.deconf.diagnosis import exploration  # torch takes seconds
+        from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+
         files = folder / "demonstrations.npz", folder / "explored.npz"
         try:
             _ = [Trials.load(file) for file in files]

@@ -7,7 +7,6 @@ from functools import cached_property
 import gymnasium
 import numpy as np
 
-from deconfounded.deconf.core.data import Rngs, as_generators
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.blackbox import BlackBox, task_of
 from deconfounded.envs.streams import Array, Mask, Obs
@@ -101,12 +100,12 @@ def demonstrations(world: World, n: int, seed: int) -> Rollout:
     return made._replace(trials=world.logged(made.trials))
 
 
-def explorer(world: World, n: int, rng: Rngs) -> Callable[[Agent | None], Trials]:
+def explorer(world: World, n: int, rng: np.random.Generator) -> Callable[[Agent | None], Trials]:
     """A function that rolls out an agent, or uniformly random actions, in n trials under fresh thetas."""
-    (generator,), random = as_generators(rng), RandomAgent(task(world).action_space)
+    random = RandomAgent(task(world).action_space)
 
     def explore(agent: Agent | None) -> Trials:
-        seed = int(generator.integers(2**31))
+        seed = int(rng.integers(2**31))
         return roll_out(world, agent or random, thetas(world, n, seed), seed).trials
 
     return explore
