@@ -322,12 +322,12 @@ class TestRecords:
         [
             ({"task": "../../etc"}, "task "),
             ({"seed": -1}, "seed "),
-            ({"returns": ["<script>"]}, r"returns\.0 "),
+            ({"returns": ["<script>"]}, r"returns\[0\] "),
             ({"machine": "<script>"}, "machine "),
-            ({"spans": [[0, 1]]}, r"spans\.0\.0 "),
+            ({"spans": [[0, 1]]}, r"spans\[0\]\[0\] "),
             ({"spans": [[1.8e9, 1.7e9]]}, "spans must end after they begin"),
             ({"tier": "0"}, "tier "),
-            ({"extra": 1}, "'extra' was unexpected"),
+            ({"extra": 1}, "must not contain {'extra'}"),
             ({"objective": [1.0, 2.0]}, "must be of as many episodes"),
         ],
     )
