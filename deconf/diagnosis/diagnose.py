@@ -14,7 +14,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts, Findings, Report, me
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 2  # raised when figures of the same trials change
+VERSION = 3  # raised when figures of the same trials change
 
 
 @dataclass(frozen=True)

@@ -181,12 +181,13 @@ def _correlation(x: Array, y: Array) -> float:
     return float((x * y).sum()) / max(float((x**2).sum() * (y**2).sum()) ** 0.5, 1e-12)
 
 
-def own_dynamics(trials: Trials, steps: Steps) -> tuple[float, int] | None:
+def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[float, int] | None:
     """How alike two halves of a trial are in what a fit of all trials leaves of the motion, and the column of it.
 
     Half the episodes each, or of one episode half the steps. What is left, and its products with observations and
     actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest, or 0
-    if that is chance. None for too little data. Columns that observation and action decide are left out.
+    if that is chance. None for too little data, also where chance exceeds `least`. Columns that observation and action
+    decide are left out.
     """
     count = len(trials)
     if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
@@ -203,16 +204,16 @@ def own_dynamics(trials: Trials, steps: Steps) -> tuple[float, int] | None:
     if not len(kept) or both.sum() < 16:
         return None
     best, tests = (0.0, 0), len(kept) * (1 + inputs.shape[1])
+    chance = statistics.NormalDist().inv_cdf(1 - CHANCE / tests) / float(both.sum()) ** 0.5
     for k in kept:
         rest = (left[:, k] / unit[k]).clip(-CLIP, CLIP)
         for x in (np.ones(len(rest)), *inputs.T):
             power = np.maximum(by_trial(x**2, group, 2 * count), 1e-9)
             halves = (by_trial(x * rest, group, 2 * count) / power).reshape(count, 2)[both]
             alike = float(np.corrcoef(*halves.argsort(0).argsort(0).T).min())
-            certain = statistics.NormalDist().inv_cdf(1 - CHANCE / tests)
-            if alike > max(best[0], certain / len(halves) ** 0.5):
+            if alike > max(best[0], chance):
                 best = alike, int(k)
-    return best
+    return best if best[0] or chance <= least else None
 
 
 def smooth(x: Array, y: Array) -> Array:

@@ -26,7 +26,6 @@ from deconfounded.deconf.diagnosis.thresholds import (
     DIFFERS,
     GOOD,
     MAX_MODEL_DEVIATION,
-    MEMORISED,
     MISFIT,
     NEGLIGIBLE,
     NO_EVIDENCE,
@@ -147,7 +146,8 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     figures = _figures(refits)
     names = ("memory_gain", "stakes", "paired_stakes", "model_deviation", "naive", "latent", "gap", "gap_by_actions")
     memory, stakes, paired, model, naive, latent, gap, by_actions = (figures[name] for name in names)
-    in_exploration = figures.get("exploration_evidence")
+    in_exploration, differ = figures.get("exploration_evidence"), figures.get("dynamics_differ")
+    alike = differ is not None and differ.high == 0  # what a latent explains is then where a trial went
     at_stake = any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, paired))
     harmless = max(stakes.high, paired.high) < STAKES and model.value < MAX_MODEL_DEVIATION
     reasons = [
@@ -164,11 +164,13 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if memory.low < -MISFIT:
         found = "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
         return conclude("cannot tell", None, found, MORE_TRIALS)
-    unused = in_exploration is not None and figures["latent_gain"].low > (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
+    least = (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
+    unused = in_exploration is not None and not alike and figures["latent_gain"].low > least
     if memory.low <= NEGLIGIBLE and not unused:
         if memory.high > NEGLIGIBLE:
             return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
-        if in_exploration is not None and min(in_exploration.low, figures["expert_evidence"].low) > DIFFERS:
+        seen = in_exploration is not None and min(in_exploration.low, figures["expert_evidence"].low) > DIFFERS
+        if seen and not alike:
             reasons.append(_rollouts(figures))
             if at_stake and max(gap.low, by_actions.low) > SMALL_GAP and figures["latent_gain"].low > 0:
                 found = (
@@ -196,10 +198,17 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         return conclude("cannot tell", None, found, EXPLORE_FIRST)
     in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(_evidence(figures))
-    differ, said = figures.get("dynamics_differ"), max(-in_trials.low, in_trials.value)
-    nowhere = in_exploration.high < DIFFERS and differ is not None and differ.high == 0
-    if said < NEGLIGIBLE and (nowhere or gain.high < NEGLIGIBLE):  # any gain is then from where a trial went
-        return _silent(figures, conclude, more_exploration)
+    if alike:
+        reasons.append(
+            "But trials of exploration do not differ in their dynamics: what one half of a trial does beyond a fit of"
+            " all trials, the other does not. The evidence is then of where a trial went, and of nothing hidden."
+        )
+        return _goal_or_habit(figures, conclude)
+    if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
+        return more_exploration(
+            "Whether trials differ in what actions do, and what that tells of the expert's actions, is not clear from"
+            " so little exploration."
+        )
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")
     if harmless and gain.low > 0:
@@ -236,22 +245,11 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     return conclude("confounded", 2, found, EXPLORE)
 
 
-def _silent(
-    figures: dict[str, Figure],
-    conclude: Callable[[Verdict, int | None, str, Next], Diagnosis],
-    more_exploration: Callable[[str], Diagnosis],
+def _goal_or_habit(
+    figures: dict[str, Figure], conclude: Callable[[Verdict, int | None, str, Next], Diagnosis]
 ) -> Diagnosis:
-    """The verdict where the dynamics of expert trials say nothing, and explain nothing: see `trait.py`."""
-    memory, evidence = figures["memory_gain"], figures["exploration_evidence"]
-    differ = figures.get("dynamics_differ")
-    if evidence.high >= NEGLIGIBLE or differ is None or differ.high > 0:
-        return more_exploration(
-            "Trials seem to differ in what actions do, but not enough was explored to say what it tells of the expert's"
-            " actions."
-        )
-    if figures["exploration_fit"].value - evidence.value > MEMORISED:
-        return more_exploration("The model of your system learned its trials by heart: there are too few of them.")
-    gain = figures.get("trait_gain")
+    """The verdict where past actions predict, and trials do not differ in their dynamics: see `trait.py`."""
+    memory, gain = figures["memory_gain"], figures.get("trait_gain")
     if gain is None:
         return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
     if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):

@@ -39,8 +39,7 @@ class Explanation(NamedTuple):
     Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
     much to overfit. action_evidence: the former less that given another trial's latent; exploration_evidence,
-    expert_evidence: as much of next observations, in exploration and in expert trials. exploration_fit: that of
-    exploration which the model was trained on.
+    expert_evidence: as much of next observations, in exploration and in expert trials.
     """
 
     model: VariationalModel
@@ -48,7 +47,6 @@ class Explanation(NamedTuple):
     latents: Tensor
     latent_gain: float | None = None
     action_evidence: float | None = None
-    exploration_fit: float | None = None
     exploration_evidence: float | None = None
     expert_evidence: float | None = None
 
@@ -88,14 +86,14 @@ def from_dynamics(
     def log_policy(of: ActionHead) -> LogProb:
         return lambda x, latent: of.log_prob(torch.cat([model.inputs.obs(x.obs), latent], -1), x.action)
 
-    fit, evidence = (_evidence(log_next, model, x, per_theta, draws) for x in (explored, explored_held_out))
+    evidence = _evidence(log_next, model, explored_held_out, per_theta, draws)
     _refit_noise(model, train, draws)
     belief = _belief(model, train)
     policy, other = (_train_policy(model, train, x, cloning, draws) for x in (belief, belief.roll(per_theta, 1)))
     gain = _gain(log_policy(policy), log_policy(other), model, held_out, draws)
     in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
     in_trials = _evidence(log_next, model, held_out, per_theta, draws)
-    return Explanation(model, policy, model.sample(belief, draws), gain, in_actions, fit, evidence, in_trials)
+    return Explanation(model, policy, model.sample(belief, draws), gain, in_actions, evidence, in_trials)
 
 
 def typical(x: Tensor, batch: Batch) -> float:

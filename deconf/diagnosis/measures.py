@@ -41,6 +41,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts.rollout import Agent, Trials
 
 CLEAR = 0.1  # nats a step
+RESOLVED = 0.5  # correlation of halves of trials that must be visible, if trials are to be said not to differ
 
 Report = Callable[[float], None]
 """Takes the share of the work that is done."""
@@ -83,10 +84,10 @@ class Findings(NamedTuple):
     memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone.
     latent_gain: that by the latent inferred from the dynamics, over latents of other trials. Evidence is the
     log-likelihood given a trial's own latent less that given another trial's. exploration_evidence, expert_evidence:
-    evidence in the dynamics, of exploration and of expert trials; exploration_fit: of exploration in the trials of
-    training, which exceeds that of held-out ones where the trials are too few. action_evidence: evidence in the
-    expert's actions, for which a naive clone takes its own. dynamics_differ: rank correlation of what two halves of an
-    exploration trial do beyond a fit of all trials, 0 if that is chance (`fits.own_dynamics`).
+    evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the expert's actions,
+    for which a naive clone takes its own. dynamics_differ: rank correlation of what two halves of an exploration trial,
+    or of an episode, do beyond a fit of all trials; 0 if that is chance, None if they are too few to know
+    (`fits.own_dynamics`).
 
     The others are of the last episode of rollouts in the learned dynamics, and deviations are over chance, which is 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
@@ -96,8 +97,8 @@ class Findings(NamedTuple):
     naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
     are None, and the latent explains actions too, Eq. (7).
 
-    Only where a memory gains and the dynamics of expert trials say next to nothing, others are not None: trait_gain,
-    the gain by a trait of the trial that is inferred from the actions of its other half (`trait.py`), and its stakes.
+    Only where a memory gains and dynamics do not differ, others are not None: trait_gain, the gain by a trait of the
+    trial that is inferred from the actions of its other half (`trait.py`), and its stakes.
     """
 
     memory_gain: float
@@ -105,7 +106,6 @@ class Findings(NamedTuple):
     exploration_evidence: float | None
     expert_evidence: float | None
     action_evidence: float | None
-    exploration_fit: float | None
     dynamics_differ: float | None
     stakes: float
     paired_stakes: float
@@ -162,11 +162,9 @@ def measure(
 
         rollouts = _rollouts(explanation, learned_env, recurrent, trajectories(episodes), amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
-    differ = None if explore is None else _differ(trials, explore)
-    findings = Findings(
-        memory, *in_dynamics, explanation.action_evidence, explanation.exploration_fit, differ, *rollouts
-    )
-    if explore is not None and memory > CLEAR and (explanation.expert_evidence or 0.0) < CLEAR:
+    differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
+    found = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
+    if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, present, Signature.of(train), amounts.cloning, draws)
         stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)
@@ -175,13 +173,20 @@ def measure(
     return findings
 
 
-def _differ(expert: Trials, explore: Trials) -> float | None:
-    """How much exploration trials differ in their dynamics, within the range of the expert's: see Findings."""
+def near(expert: Trials, explore: Trials) -> Trials:
+    """Exploration where the expert goes."""
     low, high = (x[0].numpy() for x in valid_range(Batch.of(expert, 1)))
     inside = np.asarray(explore.obs >= low) & np.asarray(explore.obs <= high)
-    near = Trials(explore.obs, explore.action, inside[:, :, :-1].all(-1) & explore.mask, explore.actions)
-    measured = fits.own_dynamics(near, fits.Steps.of(near))
-    return None if measured is None else measured[0]
+    return Trials(explore.obs, explore.action, inside[:, :, :-1].all(-1) & explore.mask, explore.actions)
+
+
+def _differ(explored: Trials) -> tuple[float | None, float]:
+    """How much trials differ in their dynamics, see Findings, and how much their episodes, 0 of one episode."""
+    lasting = fits.own_dynamics(explored, fits.Steps.of(explored), RESOLVED)
+    if explored.mask.shape[1] == 1:
+        return lasting and lasting[0], 0.0
+    passing = fits.own_dynamics(episodes := split_episodes(explored), fits.Steps.of(episodes))
+    return lasting and lasting[0], passing[0] if passing else 0.0
 
 
 @torch.no_grad()
@@ -264,11 +269,13 @@ def _explain(
     """An explanation by a latent of whole trials; or of single episodes, if these explain clearly more.
 
     More of the dynamics and of the expert's actions: of one alone, it can be where an episode went, and no latent.
+    Single episodes are tried where the halves of an episode are more alike in their dynamics than a trial's episodes.
     """
     per_trial = max(x[0].mask.shape[1] for x in (expert, exploration))
     config, batch = amounts.exploring, amounts.exploring.inference_batch
     units = [(expert, exploration, 1, config)]
-    if per_trial > 1:
+    lasting, passing = _differ(near(*(train for train, _ in (expert, exploration))))
+    if passing > (lasting or 0.0):
         longer = replace(config, inference_batch=batch and per_trial * batch)  # as many steps as of whole trials
         episodes = ((split_episodes(x[0]), split_episodes(x[1])) for x in (expert, exploration))
         units.append((*episodes, per_trial, longer))

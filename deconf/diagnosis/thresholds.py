@@ -4,7 +4,6 @@ NEGLIGIBLE, NO_EVIDENCE = 0.1, 0.01  # nats a step: of memory and of latents, of
 DIFFERS = 0.03  # nats a step of evidence, in exploration too, from which on dynamics are said to differ
 UNUSED = 0.25  # share by which a latent from the dynamics may explain more than a memory, which could know as much
 MISFIT = 0.2  # nats a step by which a memory may make a clone worse
-MEMORISED = 0.1  # nats a step by which evidence in trials of training may exceed that of held-out ones
 GOOD, SMALL_GAP, NO_LOSS = 0.8, 0.15, 0.97  # scores
 STAKES = 1.5  # times chance
 TRAIT_STAKES, TRAIT_SHARE = 3.0, 0.1  # times chance; of a memory's gain, for a goal that the dynamics do not tell

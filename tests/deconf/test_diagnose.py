@@ -97,7 +97,6 @@ class TestBadInput:
 CLEAR = Findings(
     memory_gain=1.0,
     exploration_evidence=0.2,
-    exploration_fit=0.2,
     dynamics_differ=0.5,
     expert_evidence=0.2,
     action_evidence=50.0,
@@ -112,9 +111,9 @@ CLEAR = Findings(
 )
 
 NO_FIGURES = ("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence")
-ALONE = dict.fromkeys((*NO_FIGURES, "exploration_fit", "dynamics_differ"))
+ALONE = dict.fromkeys((*NO_FIGURES, "dynamics_differ"))
 SILENT = {
-    **{"exploration_evidence": 0.0, "exploration_fit": 0.0, "dynamics_differ": 0.0},
+    **{"exploration_evidence": 0.0, "dynamics_differ": 0.0},
     **{"expert_evidence": 0.05, "latent_gain": -0.1},
     **{"trait_gain": 0.6, "trait_stakes": 2.0, "paired_trait_stakes": 5.0},
 }
@@ -138,8 +137,8 @@ class TestJudge:
             ({**SILENT, "latent_gain": 0.05}, "confounded", 3, advice.QUERY),
             ({**SILENT, "latent_gain": 0.4}, "confounded", 3, advice.QUERY),
             ({**SILENT, "dynamics_differ": 0.4}, "cannot tell", None, advice.EXPLORE_MORE),
-            ({**SILENT, "exploration_evidence": 0.2}, "cannot tell", None, advice.EXPLORE_MORE),
-            ({**SILENT, "exploration_fit": 0.2}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({**SILENT, "dynamics_differ": None}, "cannot tell", None, advice.EXPLORE_MORE),
+            ({**SILENT, "exploration_evidence": 0.8, "expert_evidence": 0.3}, "confounded", 3, advice.QUERY),
             ({**SILENT, "trait_gain": None}, "cannot tell", None, advice.MORE_TRIALS),
             ({**SILENT, "trait_gain": 0.05}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({**SILENT, "trait_gain": 0.09}, "nothing at stake", 1, advice.CLONE_HABITS),
@@ -150,6 +149,7 @@ class TestJudge:
             ({"memory_gain": 0.0, "latent_gain": 0.05}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": -0.1}, "not confounded", 1, advice.CLONE),
+            ({"memory_gain": 0.0, "latent_gain": 0.3, "dynamics_differ": 0.0}, "cannot tell", None, advice.VARY_LATENT),
             ({"memory_gain": 0.0, "exploration_evidence": 0.0}, "cannot tell", None, advice.MORE_TRIALS),
             ({"expert_evidence": -0.5}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"stakes": 1.1}, "confounded", 2, advice.EXPLORE),
