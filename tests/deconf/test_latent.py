@@ -79,6 +79,19 @@ def test_even_steps_predict_odd_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not odd[..., ::2].any()
 
 
+def test_how_much_trials_and_episodes_differ() -> None:
+    """theta lasts for a trial, for an episode, or is in no dynamics; and of a few trials nobody knows."""
+    lasting, passing, none = (
+        measures._differ(world(push, False, 96, 0, 4, drifts)) for push, drifts in ((0.2, 0), (0.2, 1), (0, 0))
+    )
+    assert lasting[0] is not None
+    assert lasting[0] >= lasting[1] > 0.5
+    assert passing[0] == 0
+    assert passing[1] > 0.5
+    assert none == (0, 0)
+    assert measures._differ(world(0, False, 24, 0, 1)) == (None, 0)
+
+
 @pytest.mark.slow
 def test_theta_that_drifts() -> None:
     """Each episode of the 48 training trials has a latent of its own; in whole trials there is no evidence of one."""
