@@ -243,13 +243,19 @@ def of_diagnosis(name: str) -> Numbers:
     with double():
         context = Context(task, replace(small(preset("default", task, "cpu")), expert_trials=12), (0,), expert=CONTROL)
         trials, explored = context.demonstrations, context.explore(None, context.rngs, 12)
+        env = envs.BatchEnv(task, 72)  # enough to see that they are alike
+        alike = run_trials(env, RandomAgent(task.action_space), 8, 0, np.zeros((env.n, 1))).trials
         amounts = diagnose.DiagnoseConfig().amounts
         parts = {part: getattr(amounts, part) for part in ("cloning", "naive", "offline", "exploring")}
         less = {part: replace(config, **few(asdict(config))) for part, config in parts.items()}
         amounts = replace(amounts, **less, candidates=4, rollouts=8)
         measured = {
             label: measures.measure(trials, exploration, amounts, np.random.default_rng(5))
-            for label, exploration in (("with exploration", explored), ("of expert trials alone", None))
+            for label, exploration in (
+                ("with exploration", explored),
+                ("with exploration that is alike", alike),
+                ("of expert trials alone", None),
+            )
         }
     return {
         f"{key} {label}": sums(np.asarray(value, float))
