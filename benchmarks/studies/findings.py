@@ -36,10 +36,18 @@ def _origins(made: list[dict[str, Any]]) -> str:
     return "; ".join(f"{machine}, torch {torch}, of {commit}" for machine, torch, commit in origins)
 
 
+def _outdated(rows: list[dict[str, Any]]) -> str:
+    """Which verdicts are of earlier versions of the diagnosis, as a sentence after another."""
+    from deconfounded.deconf.diagnosis.diagnose import VERSION  # torch takes seconds
+
+    old = [row["case"] for row in rows if "verdict" in row and row.get("diagnosis") != VERSION]
+    return f" Verdicts of an earlier version of the diagnosis: {', '.join(old)}." if old else ""
+
+
 def validated() -> str:
     """The table of docs/diagnose.md: what `deconf validate` measured where the truth is known."""
     rows = kept(validate.KEPT)
-    parts = [f"{validate.summary(rows)} ({_origins(rows)})", validate.table(rows)]
+    parts = [f"{validate.summary(rows)}{_outdated(rows)} ({_origins(rows)})", validate.table(rows)]
     return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"])
 
 
@@ -48,7 +56,7 @@ def foreign() -> str:
     rows = kept(report.KEPT)
     if not rows:
         return "These worlds have not been measured with the present versions of methods and diagnosis."
-    return f"{report.summary(rows)} ({_origins(rows)})\n\n{report.table(rows)}".lstrip()
+    return f"{report.summary(rows)}{_outdated(rows)} ({_origins(rows)})\n\n{report.table(rows)}".lstrip()
 
 
 def noises() -> str:

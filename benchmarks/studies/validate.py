@@ -42,7 +42,7 @@ LEARNED = ("naive_rnn", "deconfounded")
 KEPT = "diagnose/validation"
 FIGURES = (  # of the table
     *("memory_gain", "latent_gain", "exploration_evidence", "expert_evidence", "ratio"),
-    *("stakes", "paired_stakes", "model_deviation"),
+    *("dynamics_differ", "stakes", "paired_stakes", "model_deviation"),
 )
 
 
@@ -178,8 +178,14 @@ def main() -> None:
     check_names("task", args.tasks or (), list(cases))
     from deconfounded.benchmarks.diagnose import run
     from deconfounded.benchmarks.engine import identity
+    from deconfounded.deconf.diagnosis.diagnose import VERSION
 
-    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    about = {
+        "diagnosis": VERSION,
+        "commit": identity.commit(),
+        "machine": identity.machine("cpu"),
+        "versions": identity.versions(),
+    }
     for name in args.tasks or cases:
         task, source = envs.get(cases[name]), CASES[cases[name]]
         folder = args.out / task.name

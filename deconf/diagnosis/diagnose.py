@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.diagnosis.held_out import Report
 from deconfounded.deconf.diagnosis.judgement import Diagnosis, judge
 from deconfounded.deconf.diagnosis.latent import in_range
-from deconfounded.deconf.diagnosis.measures import Amounts, Findings, Report, measure
+from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 

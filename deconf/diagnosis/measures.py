@@ -19,10 +19,10 @@ from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.drift import split_episodes
-from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis import fits, latent, trait
 from deconfounded.deconf.diagnosis.deviation import deviation, excess_score, max_ratio, paired_deviation, trajectories
+from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report
 from deconfounded.deconf.diagnosis.latent import Explanation, typical
 from deconfounded.deconf.diagnosis.learned_env import (
     Actor,
@@ -38,13 +38,10 @@ from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.rollout import Trials
 
 CLEAR = 0.1  # nats a step
 RESOLVED = 0.5  # correlation of halves of trials that must be visible, if trials are to be said not to differ
-
-Report = Callable[[float], None]
-"""Takes the share of the work that is done."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,8 @@ class Amounts:
 class Findings(NamedTuple):
     """The figures of one split. Nats are a step, on held-out trials, of which no single one decides (`latent.typical`).
 
-    memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone.
+    memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone, each
+    at its best (`held_out.BestMonitor`).
     latent_gain: that by the latent inferred from the dynamics, over latents of other trials. Evidence is the
     log-likelihood given a trial's own latent less that given another trial's. exploration_evidence, expert_evidence:
     evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the expert's actions,
@@ -119,17 +117,6 @@ class Findings(NamedTuple):
     paired_trait_stakes: float | None = None
 
 
-class PartMonitor(Monitor):
-    """Reports the progress of a training that is part of the work, from share `begin` to `end`."""
-
-    def __init__(self, report: Report, begin: float, end: float) -> None:
-        super().__init__()
-        self.report, self.begin, self.end = report, begin, end
-
-    def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
-        self.report(self.begin + (self.end - self.begin) * done / total)
-
-
 def measure(
     trials: Trials,
     explore: Trials | None,
@@ -140,9 +127,11 @@ def measure(
     """Figures of a random split of expert trials, and of exploration that is blind to theta, if there is any."""
     amounts = amounts.fitting(trials.obs.shape[-1])
     expert, rngs = split(trials, amounts.held_out, rng), [rng]
-    train = expert[0]
-    blind = memoryless_bc.train(train, amounts.cloning, rng, monitor=PartMonitor(report, 0, 0.1))
-    recurrent = naive_rnn.train(train, amounts.naive, rng, PartMonitor(report, 0.1, 0.25))
+    train, held_out = expert[0], Batch.of(expert[1], 1)
+    alone, remembering = (BestMonitor(report, begin, end, held_out) for begin, end in ((0, 0.1), (0.1, 0.25)))
+    blind = memoryless_bc.train(train, amounts.cloning, rng, monitor=alone)
+    recurrent = naive_rnn.train(train, amounts.naive, rng, remembering)
+    memory = typical(remembering.best - alone.best, held_out)
     draws = Draws(rngs, "cpu")
     if explore is None:
         explanation = latent.from_expert_trials(train, amounts.offline, draws, PartMonitor(report, 0.25, 0.8))
@@ -151,9 +140,7 @@ def measure(
     data = [train] if explore is None else [train, explore]
     ends = termination.fit(data, blind.scales.obs, draws)
     with torch.no_grad():
-        held_out, episodes = Batch.of(expert[1], 1), Batch.of(split_episodes(train), 1)
-        present = blind.policy.log_prob(blind.scales.obs(held_out.obs), held_out.action)
-        memory = typical(recurrent.log_prob(held_out) - present, held_out)
+        episodes = Batch.of(split_episodes(train), 1)
         episodes = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # trials may have fewer than others
         batches, (_, per_trial, horizon) = [Batch.of(trials, 1) for trials in data], trials.mask.shape
 
@@ -166,7 +153,7 @@ def measure(
     found = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
-        of_trial = trait.fit(whole, held_out, present, Signature.of(train), amounts.cloning, draws)
+        of_trial = trait.fit(whole, held_out, alone.best, Signature.of(train), amounts.cloning, draws)
         stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)
         findings = findings._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
     report(1)

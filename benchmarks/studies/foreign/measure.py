@@ -133,6 +133,7 @@ def diagnosed(case: Case, folder: Path) -> str:
     from deconfounded.benchmarks.diagnose import run
     from deconfounded.benchmarks.studies.validate import predicted
     from deconfounded.deconf.diagnosis.advice import VARY_LATENT
+    from deconfounded.deconf.diagnosis.diagnose import VERSION
 
     demonstrated, explored = case.logs(folder)
     command = f"deconf foreign --cases {case.name}"
@@ -141,6 +142,7 @@ def diagnosed(case: Case, folder: Path) -> str:
     right = (case.tier == 1 and harmless) or (diagnosis.verdict, diagnosis.tier) == case.truth
     write(
         case,
+        diagnosis=VERSION,
         verdict=diagnosis.verdict,
         diagnosed_tier=diagnosis.tier,
         right=None if diagnosis.verdict == "cannot tell" and not right else right,
