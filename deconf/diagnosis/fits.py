@@ -17,7 +17,8 @@ FEW = 6  # columns, up to which their products are features too
 ENOUGH = 8  # steps of a trial for each feature of a fit of its own
 CHANCE = 0.001  # probability that trials that are alike are said to differ
 MENDED = 4.0  # excess kurtosis
-HIDDEN, FITTED = 512, 20_000  # random features: with 128 an acrobot's trials seemed to differ; steps, at most
+HIDDEN, FITTED = 128, 20_000  # random features; steps, at most
+FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hidden, left what looked like it
 CLIP = 4.0  # usual deviations
 ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
 
@@ -194,7 +195,7 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
         return None
     action = _one_hot(steps.action, trials.actions)
     change, inputs = steps.then - steps.obs, _standard(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
-    left = change - smooth(inputs, change)
+    left = change - smooth(inputs, change, FINE)
     unit = 1.48 * np.median(np.abs(left), 0)
     kept = np.flatnonzero(unit > 1e-4 * np.maximum(change.std(0), 1e-9))
     _, episode, step = np.nonzero(trials.mask)
@@ -216,11 +217,11 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     return best if best[0] or chance <= least else None
 
 
-def smooth(x: Array, y: Array) -> Array:
+def smooth(x: Array, y: Array, count: int = HIDDEN) -> Array:
     """A smooth function of standardised x [N, F], fitted to y [N, K] in all trials: ridge on random features."""
     rng = np.random.default_rng(0)
-    weight = rng.standard_normal((x.shape[1], HIDDEN)) * rng.choice([0.3, 1.0], HIDDEN) / x.shape[1] ** 0.25
-    hidden = np.tanh(x @ weight + rng.uniform(-2, 2, HIDDEN))
+    weight = rng.standard_normal((x.shape[1], count)) * rng.choice([0.3, 1.0], count) / x.shape[1] ** 0.25
+    hidden = np.tanh(x @ weight + rng.uniform(-2, 2, count))
     basis = np.concatenate([np.ones((len(x), 1)), x, x**2, hidden], 1)
     some = rng.permutation(len(x))[:FITTED]
     return basis @ _solved(basis[some], y[some], 1e-4)
