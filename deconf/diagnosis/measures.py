@@ -150,7 +150,7 @@ def measure(
         rollouts = _rollouts(explanation, learned_env, recurrent, trajectories(episodes), amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
-    found = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
+    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, alone.best, Signature.of(train), amounts.cloning, draws)
