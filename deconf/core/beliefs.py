@@ -5,6 +5,7 @@ prefixes of a batch of trials at once (`forward`), or one transition at a time (
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
@@ -55,8 +56,11 @@ class Belief(nn.Module, ABC):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
 
-    def innovation_loss(self, steps: Batch) -> Tensor:
-        """The loss [S] on steps [S, K] of what the belief needs beside its objective; 0 unless it reads innovations."""
+    def innovation_loss(self, steps: Batch, change: Callable[[], Tensor] | None = None) -> Tensor:
+        """The loss [S] on steps [S, K] of what the belief needs beside its objective; 0 unless it reads innovations.
+
+        change: gives the scaled changes [S, K, O] that are to be expected; None: those of the steps.
+        """
         return self.prior_mean.new_zeros(len(self.prior_mean))
 
     @abstractmethod
@@ -105,8 +109,10 @@ class EvidenceBelief(Belief):
         inputs = self.inputs.obs(batch.obs), self.inputs.action(batch.action)
         return *inputs, self.change(batch.next_obs - batch.obs) - self.expected(torch.cat(inputs, -1))
 
-    def innovation_loss(self, steps: Batch) -> Tensor:
-        return masked_mean(self._innovation(steps)[2].square().sum(-1), steps.mask)
+    def innovation_loss(self, steps: Batch, change: Callable[[], Tensor] | None = None) -> Tensor:
+        expected = self.expected(torch.cat([self.inputs.obs(steps.obs), self.inputs.action(steps.action)], -1))
+        changes = change() if change else self.change(steps.next_obs - steps.obs)
+        return masked_mean((changes - expected).square().sum(-1), steps.mask)
 
     def _terms(self, batch: Batch) -> Tensor:
         """Increments of the memory [..., M], one a transition: its evidence and a count of 1; 0 where the mask is 0."""

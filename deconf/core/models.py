@@ -130,7 +130,22 @@ class VariationalModel(LatentModel):
         mean, std = self.encoder.posterior(take(memories, index))
         theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
         bound = self.negative_elbo(transitions, mean, std, theta_hat, beta)
-        return bound + self.encoder.innovation_loss(transitions)
+        return bound + self.innovation_loss(transitions, theta_hat)
+
+    def innovation_loss(self, steps: Batch, theta_hat: Tensor) -> Tensor:
+        """The belief's `innovation_loss` [S], of steps [S, K] under latents [S, K, D].
+
+        What is to be expected of a step is E_theta E[s' - s | s, a, theta], the back-door adjustment. The mean of the
+        changes themselves is confounded: explorers act by what they believe of theta, so that a and s tell of it. So
+        to each change is added what the model says that the latent of another step would have made of it.
+        """
+
+        @torch.no_grad()
+        def change() -> Tensor:
+            own, other = (self.dynamics.mean(steps.obs, steps.action, x) for x in (theta_hat, theta_hat.flip(1)))
+            return self.inputs.scales.change(steps.next_obs - steps.obs) - own + other
+
+        return self.encoder.innovation_loss(steps, change)
 
     def negative_elbo(self, steps: Batch, mean: Tensor, std: Tensor, theta_hat: Tensor, beta: float) -> Tensor:
         """The negative of the bound of Eq. (6) [S], of steps [S, K], beliefs N(mean, std^2) and latents from these."""

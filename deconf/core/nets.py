@@ -266,6 +266,11 @@ class DynamicsHead(nn.Module):
         out = self.net(torch.cat(inputs if theta_hat is None else [*inputs, theta_hat], -1))
         return out.unflatten(-1, (self.copies, self.signature.obs))
 
+    def mean(self, obs: Tensor, action: Tensor, theta_hat: Tensor) -> Tensor:
+        """The mean of the scaled change [S, ..., O]."""
+        out = self(obs, action, theta_hat)[..., 0, :]
+        return self.change(torch.sigmoid(out) - obs) if self.signature.binary else out
+
     def log_prob(self, obs: Tensor, action: Tensor, next_obs: Tensor, theta_hat: Tensor | None = None) -> Tensor:
         """log p_psi [S, ..., copies] of next observations [S, ..., O], in units of the scaled change if Gaussian."""
         out = self(obs, action, theta_hat)

@@ -15,7 +15,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 3  # raised when figures of the same trials change
+VERSION = 4  # raised when figures of the same trials change
 
 
 @dataclass(frozen=True)

@@ -139,7 +139,7 @@ def _train_dynamics(
         steps, trial = rest.steps(index), index // batch.mask.shape[2]
         theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
-        loss = model.negative_elbo(steps, mean, std, theta_hat, beta) + model.encoder.innovation_loss(steps)
+        loss = model.negative_elbo(steps, mean, std, theta_hat, beta) + model.innovation_loss(steps, theta_hat)
         optimizer.step(loss)
         monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model

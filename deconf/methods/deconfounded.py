@@ -281,7 +281,7 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 
 
 @uses(
-    *USES, version=2, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+    *USES, version=3, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""

@@ -104,12 +104,13 @@ def inference_loss(model: VariationalModel, batch: Batch, config: MeanConfig, dr
     inside = index % steps + offset < steps
     target = batch.steps(torch.where(inside, index + offset, index))
     mask = target.mask * inside
-    out = model.dynamics(target.obs, target.action, take_steps(theta_hat, index))[..., 0, :]
+    latents = take_steps(theta_hat, index)
+    out = model.dynamics(target.obs, target.action, latents)[..., 0, :]
     if model.inputs.signature.binary:
         error = (torch.sigmoid(out) - target.next_obs).square().mean(-1)
     else:
         error = (out - model.dynamics.change(target.next_obs - target.obs)).square().mean(-1)
-    return ahead * masked_mean(error, mask) + config.beta * kl + model.encoder.innovation_loss(target)
+    return ahead * masked_mean(error, mask) + config.beta * kl + model.innovation_loss(target, latents)
 
 
 @torch.no_grad()
@@ -171,7 +172,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
 
 @uses(
     *("demonstrations", "exploration"),
-    version=2,
+    version=3,
     cost=8,
     on_control=MeanConfig(model="evidence"),
     on_bandit=MeanConfig(

@@ -77,7 +77,7 @@ def explain(
         kl = gaussian_kl(mean, std, *offline.encoder.prior(mean))
         weight = subset.mask * (steps / index.shape[1])  # an unbiased estimate of the sum over all steps
         loss = offline_loss(log_next, log_policy, kl, config.offline_beta, weight)
-        loss = loss + offline.encoder.innovation_loss(subset.flat())
+        loss = loss + offline.innovation_loss(subset.flat(), theta_hat.flatten(1, 2))
         optimizer.step(loss)
         monitor.update(update + 1, total, {"offline": loss.mean().item()})
     return offline, online, policy
@@ -145,7 +145,7 @@ def synthesise(
 
 @uses(
     "demonstrations",
-    version=2,
+    version=3,
     cost=7,
     on_control=OfflineConfig(),
     on_bandit=OfflineConfig(

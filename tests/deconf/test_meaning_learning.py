@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
-from deconfounded.deconf.core.models import new_model
+from deconfounded.deconf.core.models import VariationalModel, new_model
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
@@ -223,3 +224,39 @@ def test_a_small_effect_is_learned_beside_large_ones() -> None:
     inputs = np.concatenate([inferred, np.ones((200, 1))], 1)
     left = theta[100:] - inputs[100:] @ np.linalg.lstsq(inputs[:100], theta[:100], rcond=None)[0]
     assert 1 - (left**2).mean() / theta[100:].var() > 0.45
+
+
+def steered(n: int, informed: float, rng: np.random.Generator) -> Batch:
+    """Trials of a rudder that a hidden sign turns; a share of explorers know it, and steer to 0, others at random."""
+    sign, place = rng.choice([-1.0, 1.0], n), rng.normal(size=n)
+    seen, actions = [place], []
+    for _ in range(40):
+        back = np.where(np.arange(n) < informed * n, -sign * place, rng.uniform(-2, 2, n))
+        actions.append(back + 0.1 * rng.normal(size=n))
+        place = 0.9 * place + 0.5 * sign * actions[-1] + 0.3 * rng.normal(size=n)
+        seen.append(place)
+    obs, action = (torch.tensor(np.stack(x, 1)[..., None], dtype=torch.float32)[None] for x in (seen, actions))
+    return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, 40))
+
+
+def test_what_is_expected_of_a_step_is_blind_to_theta() -> None:
+    """Informed actions bring the rudder back by .5 a step, on average; blind to theta, they do nothing on average.
+
+    So the innovations of such steps are to be .5 towards 0. Those from the plain mean of changes are .15 to .19.
+    """
+    rng = np.random.default_rng(0)
+    data, fresh = steered(96, 0.8, rng), steered(200, 1.0, rng)
+    streams = Draws([rng], "cpu")
+    model = new_model("evidence", 4, 32, Scales.of(Signature(1, 1, 0, False), data), streams)
+    optimizer = Adam([model], 5e-3, 150)
+    for update in range(150):
+        batch = data.beginnings(update, 0.25).draw_trials(16, streams)
+        model.learn(optimizer, batch, 256, 1e-3 * min(1, update / 75), streams)
+    assert isinstance(model, VariationalModel)
+    belief = model.encoder
+    assert isinstance(belief, EvidenceBelief)
+    with torch.no_grad():
+        inputs = torch.cat([belief.inputs.obs(fresh.obs), belief.inputs.action(fresh.action)], -1)
+        innovation = fresh.next_obs - fresh.obs - belief.change.inverse(belief.expected(inputs))
+        towards = -(innovation * fresh.obs).sum() / fresh.obs.square().sum()
+    assert 0.25 < towards < 0.75
