@@ -29,6 +29,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
     "compare": ("benchmarks.compare", "compare methods over seeds and tasks: tables and figures for a paper", NOTHING),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
+    "version": ("benchmarks.version", "versions, machine and GL, for a report of a fault", NOTHING),
     "table": ("benchmarks.studies.table", "make the records that are missing", RESUMED),
     "publish": ("benchmarks.studies.publish", "write the pages of docs/ anew, of a finished run too", NOTHING),
     "site": ("benchmarks.studies.site", "build the documentation site", NOTHING),

@@ -60,7 +60,7 @@ def _short(values: Any) -> Any:
     return (np.round(values, 4) + 0.0).tolist()
 
 
-def _as_json(figure: statistics.Figure | None) -> dict[str, Any] | None:
+def as_json(figure: statistics.Figure | None) -> dict[str, Any] | None:
     """A figure as the page's data has it."""
     if figure is None:
         return None
@@ -83,7 +83,7 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "scores": entry["score"] + entry.get("score_beyond", []),
         "band": entry["band"],
         "trained": len(entry["score"]),
-        "minus": {other: _as_json(statistics.paired(last[name], last[other])) for other in others},
+        "minus": {other: as_json(statistics.paired(last[name], last[other])) for other in others},
         "return": round(float(np.mean(entry["return"], 0)[-1]), 2),
         "objective": round(entry["objective"][-1]),
         "r2": entry["theta_r2"],
@@ -108,11 +108,11 @@ def over_tasks(scores: Scores, tasks: Sequence[str]) -> dict[str, Any]:
     for name, by_task in runs.items():
         methods[name] = {
             "tasks": len(by_task),
-            "iqm": _as_json(statistics.over_tasks(statistics.iqm, by_task)),
-            "profile": _as_json(statistics.over_tasks(lambda x: statistics.profile(x, THRESHOLDS), by_task)),
+            "iqm": as_json(statistics.over_tasks(statistics.iqm, by_task)),
+            "profile": as_json(statistics.over_tasks(lambda x: statistics.profile(x, THRESHOLDS), by_task)),
         }
         if name != PEER and (shared := set(by_task) & set(runs.get(PEER, ()))):
-            improvement = _as_json(statistics.over_tasks(statistics.improvement, runs[PEER], by_task))
+            improvement = as_json(statistics.over_tasks(statistics.improvement, runs[PEER], by_task))
             methods[name]["improvement"] = {**(improvement or {}), "tasks": len(shared)}
     return {"tasks": tasks, "methods": methods}
 
@@ -155,10 +155,12 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
     }
 
 
-def certified(found: Found, certificates: Mapping[str, Any]) -> dict[str, dict[str, dict[int, float]]]:
-    """Scores in the last episode, by task, method and seed, of the tasks whose certificate is passed."""
+def certified(
+    found: Found, certificates: Mapping[str, Any], measure: str = "last"
+) -> dict[str, dict[str, dict[int, float]]]:
+    """One of scoring.MEASURES, by task, method and seed, of the tasks whose certificate is passed."""
     passed = {name for name, one in certificates.items() if one["verdict"] == "passed"}
-    return {task.name: last_scores(results["methods"]) for task, results in found if task.name in passed}
+    return {task.name: measured(results["methods"], measure) for task, results in found if task.name in passed}
 
 
 def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str]) -> dict[str, Any]:

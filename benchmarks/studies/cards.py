@@ -37,7 +37,7 @@ def certified() -> dict[str, dict[str, Any]]:
 
 
 def certificates(held: dict[str, Any]) -> str:
-    """README's table of certificates."""
+    """The table of certificates of docs/concepts.md."""
     rows, required = [], list[str]()
     for name, certificate in held.items():
         measured = (f"{check['measured']:.2f}" for check in certificate["checks"].values())

@@ -125,7 +125,8 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "spectrum.md": {"noises": findings.noises()},
         DOCS / "speed.md": {"costs": results.costs(found), "rates": findings.rates()},
         DOCS / "paper.md": {"controls": results.controls(found)},
-        README: {"summary": results.summary(found), "certificates": cards.certificates(certified)},
+        DOCS / "concepts.md": {"certificates": cards.certificates(certified)},
+        README: {"summary": results.summary(found, certified)},
     }
     return {
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
@@ -141,15 +142,15 @@ def write() -> str:
 
     Returns README's table of results.
     """
-    by_task = results.published()
-    for file, text in texts(by_task).items():
+    found = results.published()
+    for file, text in texts(found).items():
         if not file.exists() or file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
-    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(by_task)])
-    redraw(DOCS / "headroom.png", headroom.picture, headroom.points(by_task, cards.certified()))
+    redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
+    redraw(DOCS / "headroom.png", headroom.picture, headroom.points(found, cards.certified()))
     redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
-    return results.summary(by_task)
+    return results.summary(found, cards.certified())
 
 
 def redraw(file: Path, draw: Callable[..., None], data: Any) -> None:

@@ -9,15 +9,28 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD
-from deconfounded.benchmarks.output import index, records, scoring
+from deconfounded.benchmarks.output import index, records, scoring, statistics
 from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
+from deconfounded.deconf import methods as registry
 
-SUMMARY = (
+SUMMARY = {
+    "interventional": "exact posterior over theta from transitions alone, Eq. (5)",
+    "dagger": "imitation of the expert's answers in the states that the imitator visits",
+    "rma": "student of a teacher that sees theta",
+    "deconfounded": "the paper's Algorithms 1 and 2",
+    "deconfounded_offline": "the paper's Algorithm 3: demonstrations alone",
+    "naive_rnn": "behavioural cloning with an RNN",
+    "naive_transformer": "behavioural cloning with a causal transformer",
+    "naive_obs": "the RNN without its own past actions",
+    "gail": "adversarial imitation, with recurrent PPO",
+    "conditional": "exact posterior from transitions and actions, Eq. (3): what naive cloning converges to",
+}  # methods in README's table, and what they are
+BY_TASK = (
     *("deconfounded", "deconfounded_discrete", "deconfounded_offline", "dagger", "rma", "naive_rnn", "naive_obs"),
     *("oracle_bc", "blind_bc", "conditional", "interventional"),
-)  # methods in README's table
+)  # methods in the table of tasks of docs/results.md
 AUTHORS = {
     "swapped_lander": {"oracle_bc": 235, "dagger": 235, "deconfounded": 235, "gail": 130, "naive_rnn": -20},
     "cheetah_speed": {"oracle_bc": -500, "dagger": -500, "deconfounded": -500, "gail": -1300, "naive_rnn": -900},
@@ -99,15 +112,29 @@ def results_page(found: index.Found, certified: dict[str, Any]) -> str:
     """docs/results.md."""
     head = """# Results
 
-Made by `deconf publish` from the [records](records) alone, of which each is of one seed; where a commit ends in +, its
-tree had uncommitted changes. Scores: 0 = random actions,
-1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own actions under the expert that
-sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the belief or memory, held out.
-*First* and *last* are the scores of these episodes; *regret* is the expert's score less the agent's, summed over the
-episodes of a trial (less is better). *Twice as long*: the last score in a trial of twice as many episodes as in
-training. """
+[![all results as one page, to sort and filter](index.png)](index.html)
+
+*[index.html](index.html), one file that works offline: every score with its interval, seeds, curves and command,
+figures over tasks, clips and certificates. This page is its short form.*
+
+Made by `deconf publish` from the [records](records) alone, each of one task, method and seed; a commit with a + had
+uncommitted changes. `deconf verify slippery_cartpole deconfounded 0` runs a seed again and says whether the same bits
+come out; `deconf table --list` lists what is missing or stale. What each task is, to the last noise term, is in
+[tasks.md](tasks.md).
+
+Scores: 0 = random actions, 1 = the expert that sees theta. Return and Eq. (1), the log-likelihood of the agent's own
+actions under the expert that sees theta (more is better), are of the last episode; theta R2 is of a linear probe of the
+belief or memory, held out. *First* and *last* are the scores of these episodes; *regret* is the expert's score less the
+agent's, summed over the episodes of a trial (less is better). *Twice as long*: the last score in a trial of twice as
+many episodes as in training. """
     head += scoring.INTERVALS
-    parts = [head, in_short(found, certified), *(section(*of) for of in found), gap.section(gaps(found))]
+    parts = [
+        head,
+        in_short(found, certified),
+        by_task(found),
+        *(section(*of) for of in found),
+        gap.section(gaps(found)),
+    ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -122,17 +149,41 @@ def gaps(found: index.Found) -> list[gap.Gap]:
     return [both for task, results in found if (both := gap.gap(task, results["methods"]))]
 
 
-def summary(found: index.Found) -> str:
-    """README's table: scores in the last episode."""
+def by_task(found: index.Found) -> str:
+    """The part of docs/results.md with a row for each task: scores in the last episode."""
     rows, column = [], scoring.COLUMNS.index("last")
     for task, results in found:
         last = {row[0]: row[column] for row in scoring.rows(results["methods"])}
         tier = "none" if task.tier is None else str(task.tier)
-        rows.append((task.name, tier, *(last.get(name, "") for name in SUMMARY), f"{results['wall_s']:,.0f}"))
-    methods = (f"{name} ({METHODS[name].tier})" for name in SUMMARY)
-    older = any(outdated(*of) for of in found)
-    note = "\n\nSome records are of older versions than today's; docs/results.md says which." if older else ""
-    return markdown_table(("task", "tier needed", *methods, "seconds"), rows) + note
+        row = (*(last.get(name, "") for name in BY_TASK), f"{results['wall_s']:,.0f}")
+        rows.append((f"[{task.name}](#{task.name})", tier, *row))
+    methods = (f"{name} ({METHODS[name].tier})" for name in BY_TASK)
+    table = markdown_table(("task", "tier needed", *methods, "seconds"), rows)
+    text = """A *tier* is what a method may use: 1, demonstrations; 2, also exploration that is blind to theta; 3, also
+an expert to query. Methods have theirs in brackets; *tier needed* is the lowest that suffices on a task, if one does.
+Seconds are wall-clock time in which jobs of the task ran, mostly two at a time (counted once) and with other work on
+both cores."""
+    older = " Some records are of older versions than today's; each task's part says which."
+    return f"## Last episode, by task\n\n{table}\n\n{text}{older * any(outdated(*of) for of in found)}"
+
+
+def summary(found: index.Found, certified: dict[str, Any]) -> str:
+    """README's table: some methods, over the certified tasks where all of them were run; first and last episode."""
+    first, last = (index.certified(found, certified, measure) for measure in ("first", "last"))
+    tasks = [task for task, of in last.items() if SUMMARY.keys() <= of.keys()]
+    rows, rank = [], dict[str, float]()
+    for name, what in SUMMARY.items():
+        runs = ({task: np.array([*of[task][name].values()]) for task in tasks} for of in (first, last))
+        figures = [index.as_json(statistics.over_tasks(statistics.iqm, of)) for of in runs]
+        versions = {results["methods"][name]["version"] for task, results in found if task.name in tasks}
+        now = "" if versions <= {METHODS[name].version} else f" (now v{METHODS[name].version})"
+        link = f"[{name}](deconf/methods/{registry.METHODS[name].partition(':')[0]}.py)"
+        rank[link] = figures[1]["value"] if figures[1] else 0.0
+        made_of = ", ".join(f"v{version}" for version in sorted(versions)) + now
+        rows.append((link, what, METHODS[name].tier, *map(_with_interval, figures), made_of))
+    rows.sort(key=lambda row: -rank[row[0]])
+    table = markdown_table(("method", "what it is", "tier", "first episode", "last episode", "version"), rows)
+    return f"Interquartile means over {len(tasks)} tasks, and 95% intervals:\n\n{table}"
 
 
 def controls(found: index.Found) -> str:

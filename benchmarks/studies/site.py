@@ -1,9 +1,8 @@
 """The documentation site, docs/_build/html: `make docs`, with Sphinx (extra `docs`).
 
 Its sources are staged in docs/_build/source: the pages of docs/, CONTRIBUTING and CHANGELOG, with their links resolved,
-and a page for each task, method and module (site_pages.py). A paragraph that is only a link to a section of README or
-CONTRIBUTING is replaced by that section. Sphinx then builds with warnings as errors, and every link of the result is
-checked. The tutorials are executed, which trains what they train; nothing else is trained.
+and a page for each task, method and module (site_pages.py). Sphinx then builds with warnings as errors, and every link
+of the result is checked. The tutorials are executed, which trains what they train; nothing else is trained.
 """
 
 import os
@@ -42,7 +41,7 @@ CONTENTS: dict[
     "Project": {
         **{"contributing": "CONTRIBUTING.md", "design": "docs/design.md", "records": "docs/records/README.md"},
         **{"versions": "docs/versions.md", "faults": "docs/faults.md", "tried": "docs/tried.md"},
-        **{"changelog": "CHANGELOG.md"},
+        **{"changelog": "CHANGELOG.md", "history": "docs/history.md"},
     },
 }
 PAGES = {file: page for pages in CONTENTS.values() for page, file in pages.items() if file} | {HOME: "index"}
@@ -53,28 +52,6 @@ ELSEWHERE = {  # what a link to another file of the repository becomes
 NOTEBOOK = "\nThis page as a notebook, with its outputs: {{nb-download}}`{}.ipynb`.\n"  # at the end of a tutorial
 FENCE = re.compile(r"^(```+|~~~+).*?^\1\s*?$", re.S | re.M)
 LINK = re.compile(r"(!?\[(?:[^\[\]]|\[[^\[\]]*\])*\])\(([^()\s]+)\)")
-SECTION = re.compile(r"^\[[^\]\n]+\]\(([^()\s#]*(?:README|CONTRIBUTING)\.md)#([\w-]+)\)\n", re.M)
-
-
-def slug(heading: str) -> str:
-    """The anchor of a heading, as on GitHub."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
-
-
-def section(text: str, anchor: str) -> str:
-    """What a page says under the heading of that anchor. Raises InputError if it has none."""
-    headings = [(found.start(), found.end(), len(found[1]), found[2]) for found in _headings(text)]
-    for i, (_, end, level, heading) in enumerate(headings):
-        if slug(heading) == anchor:
-            after = [start for start, _, deeper, _ in headings[i + 1 :] if deeper <= level]
-            return text[end : after[0] if after else len(text)].strip() + "\n"
-    raise envs.InputError(f"there is no section #{anchor}; there are {', '.join(slug(one[3]) for one in headings)}")
-
-
-def _headings(text: str) -> list[re.Match[str]]:
-    fences = [found.span() for found in FENCE.finditer(text)]
-    found = re.finditer(r"^(#+) (.+)$", text, re.M)
-    return [one for one in found if not any(start < one.start() < end for start, end in fences)]
 
 
 def _outside_code(text: str, change: Callable[[str], str]) -> str:
@@ -91,25 +68,15 @@ class Site:
 
     def __init__(self, folder: Path) -> None:
         self.source, self.extra = folder / "source", folder / "extra"
-        self.sections: dict[tuple[str, str], str] = {}  # (file, anchor): the page that shows that section
-        for file, page in PAGES.items():
-            for found in SECTION.finditer((ROOT / file).read_text("utf-8")):
-                self.sections[_place(found[1], file), found[2]] = page
 
     def stage(self, page: str, text: str, file: str) -> None:
         """Write a page. text: Markdown, with links as in the file, from the root of the repository, that it is of."""
-
-        def shown(found: re.Match[str]) -> str:
-            origin = _place(found[1], file)
-            return self.resolved(section((ROOT / origin).read_text("utf-8"), found[2]), page, origin)
-
-        text = SECTION.sub(shown, self.resolved(text, page, file, keep=SECTION))
         target = self.source / f"{page}.md"
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(target, text)
+        write_atomically(target, self.resolved(text, page, file))
 
-    def resolved(self, text: str, page: str, file: str, keep: re.Pattern[str] | None = None) -> str:
-        """The text with its links to files of the repository as links of the site; keep: paragraphs left alone."""
+    def resolved(self, text: str, page: str, file: str) -> str:
+        """The text with its links to files of the repository as links of the site, but for those in code."""
 
         def link(found: re.Match[str]) -> str:
             words, target = found.groups()
@@ -118,15 +85,7 @@ class Site:
             path, _, anchor = target.partition("#")
             return self._link(words, _place(path, file), anchor, page)
 
-        def change(part: str) -> str:
-            kept = [found.span() for found in keep.finditer(part)] if keep else []
-            done, at = [], 0
-            for start, end in kept:
-                done += [LINK.sub(link, part[at:start]), part[start:end]]
-                at = end
-            return "".join([*done, LINK.sub(link, part[at:])])
-
-        return _outside_code(text, change)
+        return _outside_code(text, lambda part: LINK.sub(link, part))
 
     def _link(self, words: str, place: str, anchor: str, page: str) -> str:
         """A link to a file of the repository, and to an anchor in it. Raises InputError if it does not exist."""
@@ -135,8 +94,6 @@ class Site:
             return f'<a href="{above}interactive/index.html">{words[1:-1].strip("*")}</a>'
         if place == "docs/tasks.md" and anchor:
             return f"{words}(/tasks/{anchor}.md)"
-        if (shown := self.sections.get((place, anchor))) and place not in PAGES:
-            return f"{words}(/{shown}.md)"
         if target := PAGES.get(place) or ELSEWHERE.get(place):
             return f"{words}(/{target}.md{'#' * bool(anchor and place in PAGES)}{anchor * (place in PAGES)})"
         if not (ROOT / place).exists():

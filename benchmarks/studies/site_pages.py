@@ -137,10 +137,11 @@ def _expert(task: envs.Task) -> str:
 
 
 def _history(task: envs.Task) -> str:
-    """Today's version, and the items of the changelog that name the task."""
+    """Today's version, and the items of the changelogs that name the task."""
     text = f"Version {task.version}. A task's version is raised when its scores stop being comparable."
     items = [_as_in_docs(item) for item in _bullets((ROOT / "CHANGELOG.md").read_text("utf-8"), task.name)]
-    return "\n".join([f"{text} The changelog on {task.name}:\n", *items]) if items else text
+    items += _bullets((DOCS / "history.md").read_text("utf-8"), task.name)
+    return "\n".join([f"{text} The [changelogs](history.md) on {task.name}:\n", *items]) if items else text
 
 
 def _as_in_docs(text: str) -> str:

@@ -521,22 +521,26 @@ def test_records_are_few_and_small() -> None:
 
 @pytest.mark.slow
 def test_pages_are_up_to_date() -> None:
-    """What publish.py writes of tasks, certificates and results; README has a row for each of the latter two."""
+    """What publish.py writes of tasks, certificates and results; docs/ has a row for each of the latter two."""
     for file, text in publish.texts(results.published()).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
-    readme, docs = (ROOT / "README.md").read_text(), ROOT / "docs"
-    rows = re.findall(r"^\| (\w+) \|", readme, re.M)
-    tasks = {file.stem for file in (docs / "records").glob("*.jsonl")}
-    kept = [*tasks, *(file.stem for file in (docs / "certificates").glob("*.json"))]
-    assert sorted(name for name in rows if name != "task") == sorted(kept)
+    docs = ROOT / "docs"
+    of_results = re.findall(r"^\| \[(\w+)\]\(#", (docs / "results.md").read_text(), re.M)
+    assert sorted(of_results) == sorted(file.stem for file in (docs / "records").glob("*.jsonl"))
+    certified = re.findall(r"^\| (\w+) \|.* (?:passed|failed) \|$", (docs / "concepts.md").read_text(), re.M)
+    assert sorted(certified) == sorted(file.stem for file in (docs / "certificates").glob("*.json"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("marked", ["envs.make_vec", "def simulate"])
-def test_readme_snippets_run(marked: str) -> None:
-    """What README shows is what runs; its own task, expert, method and loop are in test_outside.py."""
-    snippets = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    assert len(snippets) == 7
-    code = "\n".join(code for code in snippets if marked in code or (marked == "def simulate" and "Monitor" in code))
+@pytest.mark.parametrize("marked", ["envs.make_vec", "Trials"])
+def test_snippets_run(marked: str) -> None:
+    """What README and docs/ show is what runs; one's own task, expert, method and loop are in test_outside.py."""
+    pages = {"environments": 1, "core": 2, "own_task": 2, "own_method": 1, "deploy": 1, "../README": 2}
+    snippets = []
+    for page, n in pages.items():
+        of_page = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / f"{page}.md").read_text(), re.S)
+        assert len(of_page) == n, page
+        snippets += of_page
+    code = "\n".join(code for code in snippets if marked in code or (marked == "Trials" and "Monitor" in code))
     done = command("-c", code)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; README's."""
+"""Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; docs/'s."""
 
 import hashlib
 import importlib.metadata
@@ -42,19 +42,19 @@ CONTROL = "slippery_cartpole"
 BENT = "bent_cartpole.py:BentCartpole"
 
 
-def snippets(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
+def snippets(page: str, language: str = "python") -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (ROOT / page).read_text(), re.S)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """README's task, expert and method, and packages that would be in the way."""
+    """The task, expert and method of docs/, and packages that would be in the way."""
     made = tmp_path_factory.mktemp("own")
-    python = snippets("python")
-    (made / "bent_cartpole.py").write_text(next(code for code in python if "class BentCartpole" in code))
-    (made / "bent_cartpole.xml").write_text(snippets("xml")[0])
-    (made / "linear.py").write_text(next(code for code in python if "def control" in code))
-    method = next(code for code in python if "class Clone" in code)
+    task, expert = snippets("docs/own_task.md")
+    (made / "bent_cartpole.py").write_text(task)
+    (made / "bent_cartpole.xml").write_text(*snippets("docs/own_task.md", "xml"))
+    (made / "linear.py").write_text(expert)
+    (method,) = snippets("docs/own_method.md")
     (made / "my_rnn.py").write_text(method.replace('{"updates": 20}', '{"updates": 2}'))
     for name in ("envs", "benchmarks", "experts", "deconf"):
         (made / name).mkdir()
@@ -117,7 +117,7 @@ def test_run_play_score(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """README's task holds the whole contract; one that gives theta away does not."""
+    """The task of docs/ holds the whole contract; one that gives theta away does not."""
     assert len((folder / "bent_cartpole.py").read_text().splitlines()) <= 60
     leaky = "from bent_cartpole import BentCartpole\nclass Leaky(BentCartpole):\n    name = 'leaky'\n"
     leaky += "    process_noise = {**BentCartpole.process_noise, 'hinge': (0, 0)}\n"
@@ -134,15 +134,36 @@ def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
 
 
 @pytest.mark.slow
-def test_loop_of_readme(tmp_path: Path) -> None:
+def test_loop_of_deploy(tmp_path: Path) -> None:
     """Ten lines that deploy an agent."""
     agent = fit(Context(envs.get(CONTROL), tiny_preset(), [0]), "deconfounded")
     assert isinstance(agent, LearnedAgent)
     agent.save(tmp_path / "results" / "slippery_cartpole-default" / "agents" / "deconfounded-0")
-    (code,) = (code for code in snippets("python") if "deconfounded.load" in code)
+    (code,) = snippets("docs/deploy.md")
     environ = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, env=environ)
     assert done.returncode == 0, done.stderr
+
+
+def test_method_of_readme(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It clones: its actions are nearer to the expert's than their mean is, and it can be evaluated."""
+    (code,) = (code for code in snippets("README.md") if "def fit" in code)
+    space: dict[str, Any] = {}
+    exec(code, space)
+    monkeypatch.setattr(methods, "load", lambda name: space["fit"])
+    context = Context(envs.get(CONTROL), tiny_preset(), [0])
+    agent = fit(context, "my_clone")
+    shown = context.demonstrations
+    obs, action = shown.obs[:, :, :-1][shown.mask], shown.action[shown.mask]
+    assert np.square(agent.act(obs) - action).mean() < 0.8 * action.var()
+    assert evaluate(context, agent, True)[0]["returns"].shape == (4, 5)
+
+
+def test_readme_is_short() -> None:
+    """A newcomer reads it to the end."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 160
+    assert len(text.split()) <= 1300
 
 
 @pytest.mark.slow

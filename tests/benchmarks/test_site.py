@@ -8,28 +8,6 @@ from deconfounded import envs
 from deconfounded.benchmarks.studies import site
 from deconfounded.deconf import methods
 
-PAGE = """# A *page*
-
-## One
-first
-
-```bash
-# Two
-```
-### Deeper
-second
-## Two, and more
-third
-"""
-
-
-def test_section() -> None:
-    """It ends at the next heading of its level; a comment in code is no heading."""
-    assert site.section(PAGE, "one") == "first\n\n```bash\n# Two\n```\n### Deeper\nsecond\n"
-    assert site.section(PAGE, "two-and-more") == "third\n"
-    with pytest.raises(envs.InputError, match=r"no section #two; there are a-page, one, deeper, two-and-more"):
-        site.section(PAGE, "two")
-
 
 def test_links(tmp_path: Path) -> None:
     """Links lead to pages of the site, or to copies of files; those in code and to other sites are left alone."""
@@ -37,7 +15,7 @@ def test_links(tmp_path: Path) -> None:
     for file, link, becomes in (
         ("docs/speed.md", "[a](results.md#bandit)", "[a](/results.md#bandit)"),
         ("docs/speed.md", "[a](tasks.md#bandit)", "[a](/tasks/bandit.md)"),
-        ("docs/speed.md", "[a](../README.md#is-it-confounded)", "[a](/concepts.md)"),
+        ("docs/speed.md", "[a](../CONTRIBUTING.md#tests)", "[a](/contributing.md#tests)"),
         ("docs/speed.md", "[a](../deconf/exact.py)", "[a](/files/deconf/exact.py)"),
         ("README.md", "![a [b] c](docs/gap.png)", "![a [b] c](/files/docs/gap.png)"),
         ("docs/paper.md", "[a](paper/preset)", "a (`docs/paper/preset`)"),

@@ -10,9 +10,11 @@ from collections import Counter
 from pathlib import Path
 
 import matplotlib
+import numpy as np
 import pytest
 from filelock import FileLock
 
+import deconfounded
 from deconfounded import envs
 from deconfounded.__main__ import COMMANDS, STUDIES
 from deconfounded.benchmarks.engine import identity, sources
@@ -146,6 +148,7 @@ train --task slippery_cartpole --steps 64
 push --help
 pull --help
 play --agent results/bandit-smoke/agents/blind_bc-0 --task bandit
+version
 """
 
 
@@ -160,7 +163,11 @@ def test_commands_work_as_installed(built: Path, empty: Path) -> None:
     before = files(built / "site")
     done = run(built, empty, "-c", SCRIPT, LINES.strip())
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "returns" in done.stdout.splitlines()[-1]
+    *_, played, ours, libraries, _, gl = done.stdout.splitlines()
+    assert "returns" in played
+    assert ours == f"deconfounded {deconfounded.__version__} (no checkout)"
+    assert f"numpy {np.__version__}" in libraries
+    assert gl.startswith("GL: ")
     code = "from deconfounded import envs; from deconfounded.benchmarks.engine import identity, sources;"
     code += "print(identity.demonstrations(envs.get('icy_road'), None, 8, 0), sources.package())"
     expected = f"{identity.demonstrations(envs.get('icy_road'), None, 8, 0)} {sources.package()}\n"
