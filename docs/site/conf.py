@@ -14,6 +14,7 @@ html_theme, html_title = "furo", "Deconfounded imitation"
 html_copy_source = html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}
 smartquotes = False
+html_static_path, html_css_files = ["static"], ["site.css"]
 exclude_patterns = ["files"]
 myst_enable_extensions = ["dollarmath"]
 html_math_renderer = "mathml"
@@ -29,13 +30,33 @@ copybutton_selector = "div:not(.output) > div.highlight pre"
 copybutton_exclude = ".linenos, .gp, .go"
 
 
+CODE, ITALIC = r"(`+[^`]+`+)", r"((?<![\w*])\*\w(?:[\w ,-]*\w)?\*(?![\w*]))"
+
+
 def as_rst(app, what, name, obj, options, lines):
-    """Docstrings are plain text with `code`: code becomes literal, and nothing else is markup."""
-    text = "\n".join(lines)
-    parts = re.split(r"(`+[^`]+`+)", text)
-    for i, part in enumerate(parts):
-        parts[i] = f"``{part.strip('`')}``" if i % 2 else re.sub(r"([*|\\_])", r"\\\1", part)
-    lines[:] = "".join(parts).split("\n")
+    """Docstrings are plain text with `code`, *italics* and indented blocks, whose columns stay; no other markup."""
+    blocks = []
+    for block in "\n".join(lines).split("\n\n"):
+        if blocks and block.strip() and all(line.startswith("    ") for line in block.split("\n") if line):
+            blocks += ["::", block]
+            continue
+        parts = re.split(f"{CODE}|{ITALIC}", block)
+        for i, part in enumerate(parts):  # text, code, italics, text, ...
+            kind, part = i % 3, part or ""
+            parts[i] = part if kind == 2 or not part else f"``{part.strip('`')}``" if kind else _plain(part)
+        blocks.append("".join(parts))
+    lines[:] = "\n\n".join(blocks).split("\n")
+
+
+def _plain(text):
+    return re.sub(r"([*|\\_])", r"\\\1", text)
+
+
+def mark_numbers(app, tree, page):
+    """Cells of tables that hold numbers alone get a class: they are not wrapped."""
+    for cell in tree.findall(nodes.entry):
+        if re.fullmatch(r"[-+\d., ±%()/:to]*\d[-+\d., ±%()/:to]*", cell.astext()):
+            cell["classes"].append("number")
 
 
 def short_arrays(app, what, name, obj, options, signature, returns):
@@ -48,7 +69,8 @@ def mathml(block):
     """A renderer of formulas as MathML, which browsers show without a network."""
 
     def visit(self, node):
-        self.body.append(latex2mathml.tex2mathml(node.astext(), as_block=block))
+        formula = latex2mathml.tex2mathml(node.astext(), as_block=block)
+        self.body.append(f'<div class="formula">{formula}</div>' if block else formula)
         raise nodes.SkipNode
 
     return visit
@@ -56,5 +78,6 @@ def mathml(block):
 
 def setup(app):
     app.add_html_math_renderer("mathml", (mathml(False), None), (mathml(True), None))
+    app.connect("doctree-resolved", mark_numbers)
     app.connect("autodoc-process-signature", short_arrays)
     app.connect("autodoc-process-docstring", as_rst)
