@@ -17,7 +17,7 @@ from deconfounded.deconf import methods as registry
 
 SUMMARY = {
     "interventional": "exact posterior over theta from transitions alone, Eq. (5)",
-    "dagger": "imitation of the expert's answers in the states that the imitator visits",
+    "dagger": "cloning of the expert's actions in states that the imitator visits",
     "rma": "student of a teacher that sees theta",
     "deconfounded": "the paper's Algorithms 1 and 2",
     "deconfounded_offline": "the paper's Algorithm 3: demonstrations alone",
