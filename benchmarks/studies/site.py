@@ -80,8 +80,10 @@ class Site:
 
         def link(found: re.Match[str]) -> str:
             words, target = found.groups()
+            start = words.index("[") + 1
+            words = f"{words[:start]}{LINK.sub(link, words[start:-1])}]"  # a picture may be a link
             if urlsplit(target).scheme or target.startswith(("#", "/")):
-                return found[0]
+                return f"{words}({target})"
             path, _, anchor = target.partition("#")
             return self._link(words, _place(path, file), anchor, page)
 

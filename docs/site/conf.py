@@ -53,9 +53,9 @@ def _plain(text):
 
 
 def mark_numbers(app, tree, page):
-    """Cells of tables that hold numbers alone get a class: they are not wrapped."""
+    """Cells of tables that hold numbers, or an amount and its unit, get a class: they are not wrapped."""
     for cell in tree.findall(nodes.entry):
-        if re.fullmatch(r"[-+\d., ±%()/:to]*\d[-+\d., ±%()/:to]*", cell.astext()):
+        if re.fullmatch(r"[-+]?\d[-+\w., ±%()/:]{0,80}", cell.astext()):
             cell["classes"].append("number")
 
 

@@ -18,6 +18,7 @@ def test_links(tmp_path: Path) -> None:
         ("docs/speed.md", "[a](../CONTRIBUTING.md#tests)", "[a](/contributing.md#tests)"),
         ("docs/speed.md", "[a](../deconf/exact.py)", "[a](/files/deconf/exact.py)"),
         ("README.md", "![a [b] c](docs/gap.png)", "![a [b] c](/files/docs/gap.png)"),
+        ("docs/a.md", "[![a](gap.png)](speed.md)", "[![a](/files/docs/gap.png)](/speed.md)"),
         ("docs/paper.md", "[a](paper/preset)", "a (`docs/paper/preset`)"),
         ("README.md", "[a](docs/index.html)", '<a href="interactive/index.html">a</a>'),
         *(("README.md", same, same) for same in ("[a](https://b.c)", "[a](#b)", "```\n[a](b)\n```")),
