@@ -3,7 +3,7 @@
 Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
 certificate; makes a small animated picture of the video; and brings the pages up to date from what docs/ keeps. All of
 it is looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
-README's picture of docs/index.html, which takes Chromium.
+the picture of docs/index.html on docs/results.md, which takes Chromium.
 """
 
 import hashlib
