@@ -191,7 +191,7 @@ def data(docs: Path, found: Found, certificates: dict[str, Any], command: Callab
     for key, names in tiers.items():
         for measure in ("first", "regret"):
             for name, runs in _runs(scores[measure], names).items():
-                over[key]["methods"][name][measure] = _as_json(statistics.over_tasks(statistics.iqm, runs))
+                over[key]["methods"][name][measure] = as_json(statistics.over_tasks(statistics.iqm, runs))
     return {
         "tasks": sorted(tasks, key=lambda task: (task["tier"] == "none", task["tier"])),
         "methods": {name: methods[name] for name in order},
