@@ -19,7 +19,8 @@ from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import normalise
-from deconfounded.deconf.exact import ExactAgent, Grid, grid_of
+from deconfounded.deconf.exact import Grid, grid_of
+from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, needs_particles
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
@@ -38,14 +39,19 @@ THRESHOLDS = {
 
 
 class EvidenceRecorder(ExpertAgent):
-    """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give."""
+    """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give.
 
-    def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid) -> None:
+    Evidence is for the true theta over those of the grid; the posterior is of particles where they are given.
+    """
+
+    def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid, particles: Particles | None = None) -> None:
         super().__init__(env, expert)
-        self.grid = grid
+        self.grid, self.particles = grid, particles
 
     def begin(self, n: int) -> None:
         super().begin(n)
+        if self.particles:
+            self.particles.begin(n)
         self.log_belief, self._steps = self.grid.prior(n), 0
         self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
         self.actions: list[Array] = []
@@ -54,7 +60,8 @@ class EvidenceRecorder(ExpertAgent):
 
     def note(self) -> None:
         """Keep the estimate of the theta of an episode's last step, now that it is over."""
-        self.estimates.append(self.grid.mean(self._updated))
+        mean = self.particles.mean(self.particles.log_weight) if self.particles else self.grid.mean(self._updated)
+        self.estimates.append(mean)
         self.truths.append(self._theta)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
@@ -63,6 +70,8 @@ class EvidenceRecorder(ExpertAgent):
             self.note()
             waited = self.grid.predict_steps(self.log_belief, self.env.task.horizon - self._steps)
             self.log_belief = self.grid.predict(waited)
+        if self.particles:
+            self.particles.reset(self._rng)
         self._steps = 0
 
     def act(self, obs: NDArray[np.float32]) -> Array:
@@ -77,6 +86,8 @@ class EvidenceRecorder(ExpertAgent):
         self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
         acted = self.expert.log_prob(obs, action, self._theta)
         self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
+        if self.particles:
+            self.particles.learn(self._state, obs, action, self.env.state, alive)
         updated = self.grid.updated(self.log_belief, self._state, obs, log_dynamics)
         self._updated = np.where(alive.reshape(-1, *[1] * (updated.ndim - 1)), updated, self.log_belief)
         self.log_belief = self.grid.predict_steps(self._updated)
@@ -133,7 +144,10 @@ def certify(
     def returns(agent: Agent) -> Array:
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
 
-    recorder = EvidenceRecorder(env, expert, thetas if isinstance(thetas, Grid) else grid_of(env, expert, thetas))
+    many = needs_particles(task) and not learned
+    particles = Particles(env, expert, conditional=False) if many else None
+    known = thetas if isinstance(thetas, Grid) else grid_of(env, expert, LEVELS if many else thetas)
+    recorder = EvidenceRecorder(env, expert, known, particles)
     best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
     recorder.note()
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
@@ -141,12 +155,12 @@ def certify(
         remedy = "train it first" if task.has_likelihood else "it must be better"
         raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; {remedy}")
     done(STAGES[0])
-    policies = {"interventional": returns(ExactAgent(env, expert, False, thetas))}
+    policies = {"interventional": returns(exact_agent(env, expert, False, thetas))}
     static = {}
     if task.drifts or task.switches:
-        static["static"] = returns(ExactAgent(env, expert, False, thetas, static=True))
+        static["static"] = returns(exact_agent(env, expert, False, thetas, static=True))
     done(STAGES[1])
-    policies |= {"conditional": returns(ExactAgent(env, expert, True, thetas)), **static}
+    policies |= {"conditional": returns(exact_agent(env, expert, True, thetas)), **static}
     done(STAGES[2])
     levels, matrix, raw = stakes(task, expert, max(trials // 2, 8))
     done(STAGES[3])
@@ -168,7 +182,7 @@ def certify(
     for name, (relation, bound) in THRESHOLDS.items():
         holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
         checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
-    known = recorder.estimates, recorder.truths
+    pairs = zip(recorder.estimates, recorder.truths, strict=True)
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
     return {
@@ -181,10 +195,11 @@ def certify(
         "return_expert": one,
         **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
-        "inferability": [inferability(task, x, y) for x, y in zip(*known, strict=True)],
+        "inferability": [inferability(task, *pair) for pair in pairs],
         "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
         "trials": trials,
         "grid": len(recorder.grid.theta),
+        **({"particles": PARTICLES} if many else {}),
         "seed": SEED,
         "versions": identity.versions(),
     }

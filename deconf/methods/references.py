@@ -1,6 +1,7 @@
 """Reference policies, without learning, on the environments that evaluation steps.
 
-The exact policies hold the posterior of theta on a grid: `conditional` takes its own actions for evidence, Eq. (2), and
+The exact policies hold the posterior of theta on a grid, or by particles where it has more than two
+latents: `conditional` takes its own actions for evidence, Eq. (2), and
 `interventional` does not, Eq. (5).
 """
 
@@ -9,10 +10,10 @@ from typing import Any
 
 from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.sizes import Configuration
-from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent
+from deconfounded.deconf.particles import exact_agent
+from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent
 
 
 @dataclass(frozen=True)
@@ -22,22 +23,22 @@ class ExactConfig(Configuration):
     grid: int = 21
 
 
-def _exact(given: Given, conditional: bool) -> ExactAgent:
+def _exact(given: Given, conditional: bool) -> Agent:
     env, expert = given.environment
-    return ExactAgent(env, expert, conditional, given.config.grid)
+    return exact_agent(env, expert, conditional, given.config.grid)
 
 
 EXACT: dict[str, Any] = {"exact": True, "on_control": ExactConfig(), "on_bandit": ExactConfig(0), "smoke": {"grid": 9}}
 
 
 @uses("environment", cost=1, **EXACT)
-def conditional(given: Given) -> ExactAgent:
+def conditional(given: Given) -> Agent:
     """The exact conditional policy: the optimum of naive cloning."""
     return _exact(given, True)
 
 
 @uses("environment", cost=4, **EXACT, deployments=deployments("episode", "mode", "mean"))
-def interventional(given: Given) -> ExactAgent:
+def interventional(given: Given) -> Agent:
     """The exact interventional policy, by posterior sampling: the optimum of deconfounded imitation."""
     return _exact(given, False)
 

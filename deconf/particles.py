@@ -1,0 +1,258 @@
+"""The exact policies' belief by particles, in place of a grid: for tasks of three latents or more.
+
+A grid of so many latents has too few values of each. K particles are drawn from p(theta), and weighed by the likelihood
+of every transition. Before their effective number falls below K / 2, they are drawn anew by their weights and moved: by
+a normal kernel that keeps their mean and covariance (Liu and West 2001), in coordinates in which p(theta) is a standard
+normal. A transition that says much is taken in by several such stages, each with a power of its likelihood.
+
+Simulating every particle would cost too much. A share of them is simulated, and the outcomes of the others are those of
+a quadratic function of theta, fitted to these by least squares for each transition. Where it misses the log-likelihoods
+of those simulated, as of thetas far apart, and wherever a latent is categorical, every particle is simulated.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from deconfounded.deconf.core.deployment import Way, acted_on
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.envs import BatchEnv, Task
+from deconfounded.envs.patches import PatchedTask
+from deconfounded.envs.streams import Array, Mask, Streams
+from deconfounded.experts.policy import Expert, sample_rows
+from deconfounded.experts.rollout import Agent
+
+PARTICLES = 256
+GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior factorises
+SIMULATED = 1.5  # particles for each coefficient of the quadratic
+TOLERANCE, NEAR = 0.1, 10.0  # nats: rms error of the quadratic, over particles so near the likeliest one
+KERNEL = 0.5  # std of the kernel, in units of the particles' own
+HALVINGS = 30  # of the interval, in the search for the power of a stage
+FAR = 6.0  # std; quantiles are kept from 0 and 1
+
+
+class Particles:
+    """A belief about theta in each of N trials: weighted particles, and the likelihoods that weigh them.
+
+    Attributes: `theta` [N, K, L], `log_weight` [N, K]; `missed`: how often every particle was simulated.
+    conditional: the expert's probability of an action counts as evidence too, Eq. (3). static: it assumes that theta
+    neither drifts nor switches.
+    """
+
+    def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, static: bool = False) -> None:
+        self.env, self.task, self.expert = env, env.task, expert
+        self.conditional, self.static = conditional, static
+
+    def begin(self, n: int) -> None:
+        """Start n new trials."""
+        self._n, self._started = n, False
+
+    def reset(self, rng: Streams) -> None:
+        """Start an episode: at first particles are drawn from p(theta), later theta drifts and switches.
+
+        rng seeds a generator for each trial, so that trials do not depend on those beside them.
+        """
+        if self._started:
+            for _ in range(0 if self.static else self.task.horizon - self._steps):
+                self._switch()
+            self._drift()
+        else:
+            self._start(rng)
+        self._steps, self._started = 0, True
+
+    def _start(self, rng: Streams) -> None:
+        seeds = (rng.random((self._n, 1))[:, 0] * 2**53).astype(np.int64)
+        self._rngs = [np.random.default_rng(seed) for seed in seeds.tolist()]
+        self._shape = self._n, PARTICLES, len(self.task.latents)
+        smooth = self.task.moves_state and all(lat.distribution != "categorical" for lat in self.task.latents)
+        terms = quadratic(np.zeros(self._shape[2])).size
+        wanted = round(SIMULATED * terms) if smooth else PARTICLES
+        self._simulated = np.arange(wanted) * PARTICLES // wanted  # evenly, among particles in their parents' order
+        self._simulator = self.task.simulator(self._n * wanted)
+        self._terms = np.zeros((*self._shape[:2], terms)) if smooth else None
+        self._solver = np.zeros((self._n, terms, wanted))
+        self.missed = 0  # transitions at which every particle was simulated
+        self._whole = self.task.simulator(PARTICLES) if smooth else None
+        self.log_weight = np.full(self._shape[:2], -np.log(PARTICLES))
+        self._z, self.theta = np.zeros(self._shape), np.full(self._shape, np.nan)
+        self._set(np.arange(self._n), self._normal(Streams(self._rngs)))
+
+    def learn(self, state: Array, obs: Array, action: Array, next_state: Array, alive: Mask) -> None:
+        """Take in a transition of each trial that is `alive` [N]; states [N, S], obs [N, O], action [N, A]."""
+        rows, remaining = np.flatnonzero(alive), np.ones(len(alive))
+        while rows.size:
+            log_prob = self._log_prob(rows, state[rows], obs[rows], action[rows], next_state[rows])
+            power = self._power(self.log_weight[rows], log_prob, remaining[rows])
+            weight = self.log_weight[rows] + power[:, None] * log_prob
+            self.log_weight[rows] = weight - np.logaddexp.reduce(weight, -1, keepdims=True)
+            remaining[rows] -= power
+            rows = rows[remaining[rows] > 0]
+            if rows.size:
+                self._move(rows)
+        self._switch()
+        self._steps += 1
+
+    def sample(self, log_weight: Array, rng: Streams) -> Array:
+        """Thetas [N, L] drawn from particles of these weights [N, K]."""
+        return self.theta[np.arange(len(self.theta)), sample_rows(np.exp(log_weight), rng)]
+
+    def mode(self, log_weight: Array) -> Array:
+        """As `mean`: that of a normal fitted to the particles, as they have no density of their own."""
+        return self.mean(log_weight)
+
+    def mean(self, log_weight: Array) -> Array:
+        """Thetas [N, L]: of each latent the posterior mean; of a categorical one its value in the likeliest theta."""
+        weight = np.exp(log_weight)
+        likeliest = self.theta[np.arange(len(weight)), weight.argmax(-1)]
+        categorical = [lat.distribution == "categorical" for lat in self.task.latents]
+        return np.where(categorical, likeliest, (weight[..., None] * self.theta).sum(1))
+
+    def features(self) -> NDArray[np.float32]:
+        """The posterior mean [N, F] of the encoded theta."""
+        return (np.exp(self.log_weight)[..., None] * self.task.encode_theta(self.theta)).sum(1).astype(np.float32)
+
+    def _normal(self, rng: Streams) -> Array:
+        """Standard normal draws [M, K, L], for M trials."""
+        k, latents = self._shape[1:]
+        return rng.standard_normal((rng.groups * k, latents)).reshape(rng.groups, k, latents)
+
+    def _set(self, rows: NDArray[np.int64], z: Array) -> None:
+        """Replace the particles of trials `rows` by those of coordinates z [M, K, L], in which p(theta) is N(0, I)."""
+        self._z[rows] = z = z.clip(-FAR, FAR)
+        theta = np.stack([lat.ppf(ndtr(z[..., i])) for i, lat in enumerate(self.task.latents)], -1)
+        share = self._simulated
+        changed = (theta != self.theta[rows])[:, share].any(-1)
+        self.theta[rows] = theta
+        for row, which in zip(*np.nonzero(changed), strict=True):
+            self._simulator.set_theta(int(rows[row]) * len(share) + int(which), theta[row, share[which]])
+        if self._terms is not None:
+            quantiles = ndtr(z)
+            middle, spread = (f(quantiles[:, share], 1, keepdims=True) for f in (np.mean, np.std))
+            self._terms[rows] = terms = quadratic((quantiles - middle) / (spread + 1e-12))
+            self._solver[rows] = np.linalg.pinv(terms[:, share])
+
+    def _drift(self) -> None:
+        if self.task.drifts and not self.static:
+            z, normal = self._z.copy(), self._normal(Streams(self._rngs))
+            for i, lat in enumerate(self.task.latents):
+                if lat.drift:
+                    z[..., i] = ndtri(lat.cdf(lat.drifted(self.theta[..., i], normal[..., i])))
+            self._set(np.arange(len(z)), z)
+
+    def _switch(self) -> None:
+        if self.task.switches and not self.static:
+            draws = ndtr(self._normal(Streams(self._rngs)))
+            switch = np.array([lat.switch for lat in self.task.latents])
+            anew = draws < switch  # and draws / switch are uniform then
+            self._set(np.arange(len(draws)), np.where(anew, ndtri(draws / np.maximum(switch, draws)), self._z))
+
+    def _log_prob(self, rows: NDArray[np.int64], state: Array, obs: Array, action: Array, next_state: Array) -> Array:
+        """Log-likelihood [M, K] of transitions of trials `rows` [M]."""
+
+        theta, following = self.theta[rows].reshape(-1, self._shape[2]), np.repeat(next_state, PARTICLES, 0)
+        log_prob = self.task.log_sense(following, theta).reshape(len(rows), PARTICLES)
+        if self.task.moves_state:
+            log_prob = log_prob + self._log_physics(rows, state, action, next_state)
+        if self.conditional:
+            obs, action = np.repeat(obs, PARTICLES, 0), np.repeat(action, PARTICLES, 0)
+            log_prob = log_prob + self.expert.log_prob(obs, action, theta).reshape(log_prob.shape)
+        return log_prob
+
+    def _log_physics(self, rows: NDArray[np.int64], state: Array, action: Array, next_state: Array) -> Array:
+        n, share = len(rows), len(self._simulated)
+        repeated = [np.repeat(x, share, 0) for x in (state, action, next_state)]
+        index = (rows[:, None] * share + np.arange(share)).ravel()
+        outcome = self._simulator.outcome(*repeated[:2], index)
+        simulated = self.task.log_prob(repeated[2], outcome).reshape(n, share)
+        if self._terms is None or self._whole is None:
+            return simulated
+        fitted = self._terms[rows] @ (self._solver[rows] @ outcome.reshape(n, share, -1))
+        log_prob = self.task.log_prob(next_state[:, None], fitted)
+        near = simulated > simulated.max(-1, keepdims=True) - NEAR
+        error = log_prob[:, self._simulated] - simulated
+        error = np.where(near, error - (error * near).sum(-1, keepdims=True) / near.sum(-1, keepdims=True), 0)
+        missed = np.square(error).sum(-1) > TOLERANCE**2 * near.sum(-1)
+        for i in np.flatnonzero(missed).tolist():
+            for which, theta in enumerate(self.theta[rows[i]]):
+                self._whole.set_theta(which, theta)
+            one = [np.repeat(x[i : i + 1], PARTICLES, 0) for x in (state, action, next_state)]
+            log_prob[i] = self.task.log_prob(one[2], self._whole.outcome(*one[:2]))
+        self.missed += int(missed.sum())
+        return log_prob
+
+    def _power(self, log_weight: Array, log_prob: Array, remaining: Array) -> Array:
+        """The largest power [M] of likelihoods, at most `remaining`, that leaves K / 2 effective particles."""
+
+        def enough(power: Array) -> Mask:
+            weight = log_weight + power[:, None] * log_prob
+            weight = np.exp(weight - weight.max(-1, keepdims=True))
+            return weight.sum(-1) ** 2 >= PARTICLES / 2 * np.square(weight).sum(-1)
+
+        low, high = np.zeros_like(remaining), remaining.copy()
+        whole = enough(high)
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            good = enough(middle)
+            low, high = np.where(good, middle, low), np.where(good, high, middle)
+        return np.where(whole, remaining, low)
+
+    def _move(self, rows: NDArray[np.int64]) -> None:
+        """Draw particles of trials `rows` anew by their weights, and move them."""
+        z, weight = self._z[rows], np.exp(self.log_weight[rows])
+        mean = np.einsum("nk,nkl->nl", weight, z)[:, None]
+        spread = np.einsum("nk,nkl,nkm->nlm", weight, z - mean, z - mean)
+        root = np.linalg.cholesky(spread + 1e-9 * np.eye(z.shape[-1]))
+        draws = Streams([self._rngs[i] for i in rows.tolist()])
+        start = draws.random((len(rows), 1))
+        level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
+        index = (weight.cumsum(-1)[:, None] < level[..., None] * weight.sum(-1)[:, None, None]).sum(-1)
+        kept = np.take_along_axis(z, index.clip(0, PARTICLES - 1)[..., None], 1)
+        noise = np.einsum("nlm,nkm->nkl", root, self._normal(draws))
+        self.log_weight[rows] = -np.log(PARTICLES)
+        self._set(rows, mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise)
+
+
+def quadratic(x: Array) -> Array:
+    """Terms [..., 1 + L + L (L + 1) / 2] of a quadratic function of x [..., L]."""
+    i, j = np.triu_indices(x.shape[-1])
+    return np.concatenate([np.ones_like(x[..., :1]), x, x[..., i] * x[..., j]], -1)
+
+
+class ParticleAgent(Agent):
+    """Takes theta from the particles, at first by drawing it at every step, and acts as the expert, as `ExactAgent`."""
+
+    def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, static: bool = False) -> None:
+        self.env, self.expert, self.belief = env, expert, Particles(env, expert, conditional, static)
+        self.way: Way = "step"
+
+    def begin(self, n: int) -> None:
+        self.belief.begin(n)
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        self._rng, self._theta = Streams(rngs), None
+        self.belief.reset(self._rng)
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        self._state = self.env.state
+        self._theta = acted_on(self.belief, self.way, self.belief.log_weight, self._rng, self._theta)
+        return self.expert.act(obs, self._theta, self._rng)
+
+    def observe(self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: Mask) -> None:
+        self.belief.learn(self._state, obs, action, self.env.state, alive)
+
+    def features(self) -> NDArray[np.float32]:
+        return self.belief.features()
+
+
+def needs_particles(task: Task) -> bool:
+    """Whether exact beliefs of a task are particles, not a grid."""
+    return len(task.latents) > GRID_UP_TO and not isinstance(task, PatchedTask)
+
+
+def exact_agent(env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = 21, static: bool = False) -> Agent:
+    """The exact policy of a task, by particles where it needs them, else by a grid k."""
+    if needs_particles(env.task) and not isinstance(k, Grid):
+        return ParticleAgent(env, expert, conditional, static)
+    return ExactAgent(env, expert, conditional, k, static)

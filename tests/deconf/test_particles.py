@@ -1,0 +1,178 @@
+"""Beliefs by particles: against the grid, against a closed form, and by ranks of the true theta."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.deconf.equations import belief_update
+from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.particles import PARTICLES, ParticleAgent, Particles, exact_agent, needs_particles
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.task import Task
+from deconfounded.envs.tasks.patchy_road import PatchyRoad
+from deconfounded.experts import policy
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import ExpertAgent, run_trials
+from tests.toys import Push, control
+
+N = 48
+
+
+class Three(Push):
+    """A plane, in which a push acts with two hidden forces and a hidden gain: the dynamics are linear in theta."""
+
+    name = "three"
+    latents = (Latent("x", "N", -1, 1), Latent("y", "N", -1, 1), Latent("gain", "", 0, 1))
+    std = np.array([0.3, 0.3])
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        return state * 0.5 + 0.4 * (theta[:, :2] + theta[:, 2:] * action * (1, -1))
+
+    def terminated(self, state: Array) -> np.ndarray:
+        return np.zeros(len(state), bool)
+
+
+class Switch(Push):
+    name = "switch"
+    latents = (Latent("force", "N", -1.0, 1.0, switch=0.1),)
+
+
+class Drift(Push):
+    name = "drift"
+    latents = (Latent("force", "N", -1.0, 1.0, drift=0.3),)
+
+
+class Kinds(Push):
+    """Whether the force is to the left or to the right."""
+
+    name = "kinds"
+    latents = (Latent("side", "", 0, 1, "categorical"),)
+    std = np.array([0.3, 0.3])
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        return super().outcome(state, action, 0.4 * theta - 0.2)
+
+
+def expert(task: Task) -> CallableExpert:
+    return CallableExpert(task, lambda obs, theta: control(obs, theta[:, :1]), "toy")
+
+
+class Follower(ExpertAgent):
+    """The expert; beside it both beliefs of the same trials."""
+
+    def __init__(self, env: envs.BatchEnv, grid: Grid, particles: Particles) -> None:
+        super().__init__(env, grid.expert)
+        self.grid, self.particles = grid, particles
+        self.exact = ExactAgent(env, grid.expert, particles.conditional, grid, particles.static)
+
+    def begin(self, n: int) -> None:
+        self.particles.begin(n)
+        self.exact.begin(n)
+
+    def reset(self, rngs: Any) -> None:
+        super().reset(rngs)
+        self.particles.reset(self._rng)
+        self.exact.reset(rngs)
+
+    def act(self, obs: Any) -> Array:
+        self._state = self.exact._state = self.env.state
+        return super().act(obs)
+
+    def observe(self, obs: Any, action: Array, next_obs: Any, alive: Any) -> None:
+        self.particles.learn(self._state, obs, action, self.env.state, alive)
+        self.exact.observe(obs, action, next_obs, alive)
+
+
+def followed(task: Push, conditional: bool, k: int = 161) -> Follower:
+    env = envs.BatchEnv(task, N)
+    agent = Follower(env, Grid(env, expert(task), k), Particles(env, expert(task), conditional))
+    run_trials(env, agent, 2, 0)
+    return agent
+
+
+CASES = [(Push(), False), (Push(), True), (Switch(), False), (Drift(), False), (Kinds(), False), (Kinds(), True)]
+
+
+@pytest.mark.parametrize(("task", "conditional"), CASES, ids=lambda case: getattr(case, "name", str(case)))
+def test_particles_agree_with_the_grid(task: Push, conditional: bool) -> None:
+    """After two episodes of the expert: means to a fifth of a std, as of so many draws; stds to 10%.
+
+    Actions say much at once, and are taken in by several stages.
+    """
+    agree(followed(task, conditional))
+
+
+def agree(agent: Follower) -> None:
+    belief, values = np.exp(agent.exact.log_belief), agent.grid.theta[:, 0]
+    weight, theta = np.exp(agent.particles.log_weight), agent.particles.theta[..., 0]
+    mean, ours = belief @ values, (weight * theta).sum(-1)
+    std = np.sqrt((belief * (values - mean[:, None]) ** 2).sum(-1))
+    our_std = np.sqrt((weight * (theta - ours[:, None]) ** 2).sum(-1))
+    floor = 0.02  # of a std: where the grid's values are too far apart, or one category is sure
+    assert np.median(np.abs(ours - mean) / (std + floor)) < 0.2
+    assert np.median((our_std + floor) / (std + floor)) == pytest.approx(1, abs=0.1)
+    assert std.mean() < 0.8 * values.std()
+
+
+def test_true_thetas_have_uniform_ranks() -> None:
+    """Of three latents, after two episodes: the rank of the true theta among the particles is uniform."""
+    task = Three()
+    env = envs.BatchEnv(task, 4 * N)
+    agent = ParticleAgent(env, expert(task), conditional=False)
+    run_trials(env, agent, 2, 0)
+    weight, theta = np.exp(agent.belief.log_weight), agent.belief.theta
+    rank = (weight[..., None] * (theta < env.theta[:, None])).sum(1)
+    for ranks in rank.T:
+        assert ranks.mean() == pytest.approx(0.5, abs=0.06)
+        assert ranks.var() == pytest.approx(1 / 12, rel=0.2)
+    truth = env.theta - env.theta.mean(0)
+    assert (1 - np.square(agent.belief.estimate() - env.theta).mean(0) / np.square(truth).mean(0)).min() > 0.5
+
+
+def test_a_quadratic_stands_for_simulation() -> None:
+    """Of a drone in wind, posteriors by fitted outcomes are those by simulation, to .05 in total variation."""
+    task, rows = envs.get("windy_drone"), np.arange(2)
+    env, teacher = envs.BatchEnv(task, 2), policy.load(task)
+    belief, gaps = Particles(env, teacher, False), []
+    belief.begin(2)
+    obs = env.reset(0)
+    belief.reset(Streams([np.random.default_rng(0)]))
+    for t in range(12):
+        state, action = env.state, teacher.act(obs, env.theta, np.random.default_rng(1))
+        env.step(action)
+        if t in (0, 11):
+            fitted = belief._log_prob(rows, state, obs, action, env.state)
+            repeated = [np.repeat(x, PARTICLES, 0) for x in (state, action, env.state)]
+            outcome = task.outcome(*repeated[:2], belief.theta.reshape(-1, 2))
+            simulated = task.log_prob(repeated[2], outcome).reshape(fitted.shape)
+            posteriors = [np.exp(belief_update(belief.log_weight, x)) for x in (fitted, simulated)]
+            gaps.append(np.abs(posteriors[0] - posteriors[1]).sum(-1).mean() / 2)
+        belief.learn(state, obs, action, env.state, env.alive)
+        obs = env.observe()
+    assert max(gaps) < 0.05
+    assert belief.missed < 24
+
+
+def test_a_trial_does_not_depend_on_those_beside_it() -> None:
+    """Two groups with a generator each: the second group's particles are those that it has alone."""
+    task = Three()
+
+    def final(seeds: list[int]) -> Array:
+        env = envs.BatchEnv(task, 4 * len(seeds))
+        agent = ParticleAgent(env, expert(task), conditional=True)
+        run_trials(env, agent, 2, seeds)
+        return agent.belief.theta
+
+    np.testing.assert_array_equal(final([1, 2])[4:], final([2]))
+
+
+def test_particles_are_for_many_latents() -> None:
+    """Of one or two latents the exact policy has a grid; patches factorise, whatever their number."""
+    for task, particles in ((Push(), False), (Three(), True), (PatchyRoad(), False), (envs.get("windy_drone"), False)):
+        assert needs_particles(task) == particles
+    env = envs.BatchEnv(Three(), 1)
+    assert isinstance(exact_agent(env, expert(env.task), False), ParticleAgent)
+    assert isinstance(exact_agent(env, expert(env.task), False, Grid(env, expert(env.task), 2)), ExactAgent)
