@@ -30,6 +30,7 @@ from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_tr
 EPISODES, SEED = 5, 0
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
+MOST = 16  # levels of many latents, drawn from all combinations
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
     "told_wrong_theta": ("<=", 0.65),
@@ -101,6 +102,7 @@ def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, 
     """
     task = task.without_switches()
     levels = np.unique(task.theta_grid(LEVELS), axis=0)
+    levels = levels[np.sort(np.random.default_rng(SEED).permutation(len(levels))[:MOST])]
     j = len(levels)
     true = np.repeat(levels, j * trials, 0)
     assumed = np.tile(np.repeat(levels, trials, 0), (j, 1))
@@ -220,10 +222,12 @@ def inferability(task: envs.Task, estimate: Array, truth: Array) -> dict[str, fl
 def picture(result: dict[str, Any], file: Path) -> None:
     """Stakes, exact policies and evidence on one page."""
     with panels(file, 1, 3, size=(13, 3.9)) as [[left, middle, right]]:
-        for (i, j), value in np.ndenumerate(score := np.array(result["stakes"]["score"])):
+        score, levels = np.array(result["stakes"]["score"]), result["stakes"]["levels"]
+        size, legible = (8, levels) if len(levels) < 9 else (4, [])
+        for (i, j), value in np.ndenumerate(score):
             hue = "white" if value < 0.6 else "black"
-            left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=8)
-        ticks = ["\n".join(f"{x:.3g}" for x in level) for level in result["stakes"]["levels"]]
+            left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=size)
+        ticks = ["\n".join(f"{x:.3g}" for x in level) for level in legible]
         left.set(xlabel="theta given", ylabel="true theta", title="score of an expert given a wrong theta")
         left.set_xticks(range(len(ticks)), ticks)
         left.set_yticks(range(len(ticks)), ticks)

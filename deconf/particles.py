@@ -47,7 +47,7 @@ class Particles:
 
     def begin(self, n: int) -> None:
         """Start n new trials."""
-        self._n, self._started = n, False
+        self._n, self._started, self._steps = n, False, 0
 
     def reset(self, rng: Streams) -> None:
         """Start an episode: at first particles are drawn from p(theta), later theta drifts and switches.
@@ -150,7 +150,6 @@ class Particles:
 
     def _log_prob(self, rows: NDArray[np.int64], state: Array, obs: Array, action: Array, next_state: Array) -> Array:
         """Log-likelihood [M, K] of transitions of trials `rows` [M]."""
-
         theta, following = self.theta[rows].reshape(-1, self._shape[2]), np.repeat(next_state, PARTICLES, 0)
         log_prob = self.task.log_sense(following, theta).reshape(len(rows), PARTICLES)
         if self.task.moves_state:
@@ -161,11 +160,11 @@ class Particles:
         return log_prob
 
     def _log_physics(self, rows: NDArray[np.int64], state: Array, action: Array, next_state: Array) -> Array:
+        """That of the next state alone, but for its readings, by simulation and fit."""
         n, share = len(rows), len(self._simulated)
-        repeated = [np.repeat(x, share, 0) for x in (state, action, next_state)]
         index = (rows[:, None] * share + np.arange(share)).ravel()
-        outcome = self._simulator.outcome(*repeated[:2], index)
-        simulated = self.task.log_prob(repeated[2], outcome).reshape(n, share)
+        outcome = self._simulator.outcome(np.repeat(state, share, 0), np.repeat(action, share, 0), index)
+        simulated = self.task.log_prob(np.repeat(next_state, share, 0), outcome).reshape(n, share)
         if self._terms is None or self._whole is None:
             return simulated
         fitted = self._terms[rows] @ (self._solver[rows] @ outcome.reshape(n, share, -1))
@@ -177,8 +176,8 @@ class Particles:
         for i in np.flatnonzero(missed).tolist():
             for which, theta in enumerate(self.theta[rows[i]]):
                 self._whole.set_theta(which, theta)
-            one = [np.repeat(x[i : i + 1], PARTICLES, 0) for x in (state, action, next_state)]
-            log_prob[i] = self.task.log_prob(one[2], self._whole.outcome(*one[:2]))
+            same = np.full(PARTICLES, i)
+            log_prob[i] = self.task.log_prob(next_state[same], self._whole.outcome(state[same], action[same]))
         self.missed += int(missed.sum())
         return log_prob
 

@@ -24,10 +24,10 @@ class Edit(ABC):
         self._stale = True
         self.target.body(name).quat[:] = np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0
 
-    def body_shift(self, name: str, x: float) -> None:
-        """Set a body's x in its parent's frame; m."""
+    def body_shift(self, name: str, *place: float) -> None:
+        """Set a body's x, or x and y, in its parent's frame; m."""
         self._stale = True
-        self.target.body(name).pos[0] = x
+        self.target.body(name).pos[: len(place)] = place
 
     @abstractmethod
     def body_mass(self, name: str, scale: float) -> None:

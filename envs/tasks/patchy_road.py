@@ -27,7 +27,8 @@ class PatchyRoad(PatchedTask, IcyRoad):
     """The joints of IcyRoad."""
 
     name = "patchy_road"
-    latents = tuple(Latent(f"grip_{i}", "", 0.1, 0.6, "loguniform") for i in range(PATCHES))
+    version = 1
+    latents = tuple(Latent(f"grip_{i}", "", 0.15, 0.6, "loguniform") for i in range(PATCHES))
     observation = IcyRoad.observation | {"circuit_cos": (-1, 1), "circuit_sin": (-1, 1)}
     stretch = PATCHES * LENGTH
 

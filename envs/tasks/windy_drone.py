@@ -14,6 +14,8 @@ They are spread over four rotors of 0 to 6 N. Reward: .7 exp(-(d / .25)^2 / 2) +
 episode is 125 steps of .04 s, and ends 1.5 m off, or tilted by more than a right angle.
 """
 
+from typing import ClassVar
+
 import numpy as np
 from gymnasium import spaces
 
@@ -44,7 +46,7 @@ class WindyDrone(MujocoTask):
     """A free joint, `flight`; its position is measured from the ground, the observed height from the mark."""
 
     name = "windy_drone"
-    latents = (Latent("wind", "m/s", -16.0, 16.0), Latent("load", "m", -0.02, 0.02))
+    latents: ClassVar[tuple[Latent, ...]] = (Latent("wind", "m/s", -16.0, 16.0), Latent("load", "m", -0.02, 0.02))
     horizon = 125
     expert_noise = 0.02
     process_noise = {"flight": (0.003, 0.003, 0.12, 0.16)}
