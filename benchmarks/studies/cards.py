@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded import envs
+from deconfounded.envs.patches import PatchedTask
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TIERS = {None: "none: no imitator can succeed", 2: "2: exploration is enough", 3: "3: queries of the expert are needed"}
@@ -47,7 +48,7 @@ def certificates(held: dict[str, Any]) -> str:
 
 
 def _certificate(task: envs.Task) -> str:
-    certificate = kept(f"certificates/{task.name}")
+    certificate = kept(f"certificates/{task.name}") or kept(f"certificates/hard/{task.name}")
     if certificate is None:
         return "No certificate."
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in certificate["checks"].items())
@@ -88,12 +89,13 @@ def card(task: envs.Task) -> str:
     latents: list[tuple[str, ...]] = []
     for lat in task.latents:
         drift = f", drifts by {lat.drift:g}" if lat.drift else ""
-        latents.append((lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution + drift))
+        switch = f", drawn anew after a step with probability {lat.switch:g}" if lat.switch else ""
+        latents.append((lat.name, lat.unit, f"{lat.low:g} to {lat.high:g}", lat.distribution + drift + switch))
     more, noise = "", list[tuple[str, ...]]()
     if isinstance(task, envs.MujocoTask):
         head, latents = (
             (*head, "what it moves in the model"),
-            [(*row, _moved(task, i)) for i, row in enumerate(latents)],
+            [(*row, _moved(task, 0 if isinstance(task, PatchedTask) else i)) for i, row in enumerate(latents)],
         )
         more = f", {task.control_dt:g} s each; the expert's action noise is {task.expert_noise:g}"
         for joint, stds in task.process_noise.items():  # of a free joint, two of each: position and rotation
@@ -122,9 +124,14 @@ def card(task: envs.Task) -> str:
 
 
 def tasks_page() -> str:
-    """docs/tasks.md: all cards."""
+    """docs/tasks.md: all cards, the suite's and the hard tasks'."""
     head = """# Tasks
 
 Made by `deconf publish` from the tasks' own classes and docs/certificates. Ideas that failed their
 certificate are in [tried.md](tried.md)."""
-    return "\n\n".join([head, *(card(envs.get(name)) for name in envs.SUITE)]) + "\n"
+    hard = """# Hard tasks
+
+Beside the suite (`envs.HARD`), for methods that solve it: the exact policy succeeds, and much is left to learners.
+Their certificates are in docs/certificates/hard."""
+    suite, beside = ([card(envs.get(name)) for name in names] for names in (envs.SUITE, envs.HARD))
+    return "\n\n".join([head, *suite, hard, *beside]) + "\n"
