@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--out", type=place, help="weights file; default: <task>.safetensors in this folder")
     args = parser.parse_args()
     task = envs.get(args.task)
-    if not isinstance(task, envs.MujocoTask):
+    if task.has_closed_expert or not isinstance(task, envs.MujocoTask):
         raise envs.InputError(f"the expert of {task.name} is a closed form; there is nothing to train")
     file = args.out or Path(f"{task.name}.safetensors")
     if file.suffix != ".safetensors":

@@ -2,8 +2,8 @@
 
 A grid of so many latents has too few values of each. K particles are drawn from p(theta), and weighed by the likelihood
 of every transition. Before their effective number falls below K / 2, they are drawn anew by their weights and moved: by
-a normal kernel that keeps their mean and covariance (Liu and West 2001), in coordinates in which p(theta) is a standard
-normal. A transition that says much is taken in by several such stages, each with a power of its likelihood.
+a normal kernel that keeps their mean and covariance (Liu and West 2001), in quantiles of the latents, reflected at 0
+and 1. A transition that says much is taken in by several such stages, each with a power of its likelihood.
 
 Simulating every particle would cost too much. A share of them is simulated, and the outcomes of the others are those of
 a quadratic function of theta, fitted to these by least squares for each transition. Where it misses the log-likelihoods
@@ -11,10 +11,10 @@ of those simulated, as of thetas far apart, and wherever a latent is categorical
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 
 from deconfounded.deconf.core.deployment import Way, acted_on
 from deconfounded.deconf.exact import ExactAgent, Grid
@@ -24,13 +24,12 @@ from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.experts.policy import Expert, sample_rows
 from deconfounded.experts.rollout import Agent
 
-PARTICLES = 256
+PARTICLES = 1024
 GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior factorises
 SIMULATED = 1.5  # particles for each coefficient of the quadratic
 TOLERANCE, NEAR = 0.1, 10.0  # nats: rms error of the quadratic, over particles so near the likeliest one
 KERNEL = 0.5  # std of the kernel, in units of the particles' own
-HALVINGS = 30  # of the interval, in the search for the power of a stage
-FAR = 6.0  # std; quantiles are kept from 0 and 1
+HALVINGS = 20  # of the interval, in the search for the power of a stage
 
 
 class Particles:
@@ -75,9 +74,10 @@ class Particles:
         self._solver = np.zeros((self._n, terms, wanted))
         self.missed = 0  # transitions at which every particle was simulated
         self._whole = self.task.simulator(PARTICLES) if smooth else None
+        self._flat = self._n * PARTICLES, self._shape[2]
         self.log_weight = np.full(self._shape[:2], -np.log(PARTICLES))
-        self._z, self.theta = np.zeros(self._shape), np.full(self._shape, np.nan)
-        self._set(np.arange(self._n), self._normal(Streams(self._rngs)))
+        self._u, self.theta = np.zeros(self._shape), np.full(self._shape, np.nan)
+        self._set(np.arange(self._n), Streams(self._rngs).random(self._flat).reshape(self._shape))
 
     def learn(self, state: Array, obs: Array, action: Array, next_state: Array, alive: Mask) -> None:
         """Take in a transition of each trial that is `alive` [N]; states [N, S], obs [N, O], action [N, A]."""
@@ -113,40 +113,32 @@ class Particles:
         """The posterior mean [N, F] of the encoded theta."""
         return (np.exp(self.log_weight)[..., None] * self.task.encode_theta(self.theta)).sum(1).astype(np.float32)
 
-    def _normal(self, rng: Streams) -> Array:
-        """Standard normal draws [M, K, L], for M trials."""
-        k, latents = self._shape[1:]
-        return rng.standard_normal((rng.groups * k, latents)).reshape(rng.groups, k, latents)
-
-    def _set(self, rows: NDArray[np.int64], z: Array) -> None:
-        """Replace the particles of trials `rows` by those of coordinates z [M, K, L], in which p(theta) is N(0, I)."""
-        self._z[rows] = z = z.clip(-FAR, FAR)
-        theta = np.stack([lat.ppf(ndtr(z[..., i])) for i, lat in enumerate(self.task.latents)], -1)
+    def _set(self, rows: NDArray[np.int64], u: Array) -> None:
+        """Replace the particles of trials `rows` by those of quantiles u [M, K, L], folded into [0, 1)."""
+        u = np.abs(u) % 2
+        self._u[rows] = u = np.minimum(u, 2 - u).clip(max=1 - 1e-9)
+        theta = np.stack([lat.ppf(u[..., i]) for i, lat in enumerate(self.task.latents)], -1)
         share = self._simulated
         changed = (theta != self.theta[rows])[:, share].any(-1)
         self.theta[rows] = theta
         for row, which in zip(*np.nonzero(changed), strict=True):
             self._simulator.set_theta(int(rows[row]) * len(share) + int(which), theta[row, share[which]])
         if self._terms is not None:
-            quantiles = ndtr(z)
-            middle, spread = (f(quantiles[:, share], 1, keepdims=True) for f in (np.mean, np.std))
-            self._terms[rows] = terms = quadratic((quantiles - middle) / (spread + 1e-12))
+            middle, spread = (f(u[:, share], 1, keepdims=True) for f in (np.mean, np.std))
+            self._terms[rows] = terms = quadratic((u - middle) / (spread + 1e-12))
             self._solver[rows] = np.linalg.pinv(terms[:, share])
 
     def _drift(self) -> None:
         if self.task.drifts and not self.static:
-            z, normal = self._z.copy(), self._normal(Streams(self._rngs))
-            for i, lat in enumerate(self.task.latents):
-                if lat.drift:
-                    z[..., i] = ndtri(lat.cdf(lat.drifted(self.theta[..., i], normal[..., i])))
-            self._set(np.arange(len(z)), z)
+            draws = Streams(self._rngs).standard_normal(self._flat).reshape(self._shape)
+            self._set(np.arange(self._n), self._u + draws * [lat.drift for lat in self.task.latents])
 
     def _switch(self) -> None:
         if self.task.switches and not self.static:
-            draws = ndtr(self._normal(Streams(self._rngs)))
+            draws = Streams(self._rngs).random(self._flat).reshape(self._shape)
             switch = np.array([lat.switch for lat in self.task.latents])
             anew = draws < switch  # and draws / switch are uniform then
-            self._set(np.arange(len(draws)), np.where(anew, ndtri(draws / np.maximum(switch, draws)), self._z))
+            self._set(np.arange(self._n), np.where(anew, draws / np.maximum(switch, draws), self._u))
 
     def _log_prob(self, rows: NDArray[np.int64], state: Array, obs: Array, action: Array, next_state: Array) -> Array:
         """Log-likelihood [M, K] of transitions of trials `rows` [M]."""
@@ -184,31 +176,34 @@ class Particles:
     def _power(self, log_weight: Array, log_prob: Array, remaining: Array) -> Array:
         """The largest power [M] of likelihoods, at most `remaining`, that leaves K / 2 effective particles."""
 
-        def enough(power: Array) -> Mask:
-            weight = log_weight + power[:, None] * log_prob
+        def enough(power: Array, rows: Any = slice(None)) -> Mask:
+            weight = log_weight[rows] + power[:, None] * log_prob[rows]
             weight = np.exp(weight - weight.max(-1, keepdims=True))
             return weight.sum(-1) ** 2 >= PARTICLES / 2 * np.square(weight).sum(-1)
 
-        low, high = np.zeros_like(remaining), remaining.copy()
-        whole = enough(high)
-        for _ in range(HALVINGS):
-            middle = (low + high) / 2
-            good = enough(middle)
-            low, high = np.where(good, middle, low), np.where(good, high, middle)
-        return np.where(whole, remaining, low)
+        power = remaining.copy()
+        if (rows := np.flatnonzero(~enough(power))).size:
+            low, high = np.zeros(len(rows)), power[rows]
+            for _ in range(HALVINGS):
+                middle = (low + high) / 2
+                good = enough(middle, rows)
+                low, high = np.where(good, middle, low), np.where(good, high, middle)
+            power[rows] = low
+        return power
 
     def _move(self, rows: NDArray[np.int64]) -> None:
         """Draw particles of trials `rows` anew by their weights, and move them."""
-        z, weight = self._z[rows], np.exp(self.log_weight[rows])
-        mean = np.einsum("nk,nkl->nl", weight, z)[:, None]
-        spread = np.einsum("nk,nkl,nkm->nlm", weight, z - mean, z - mean)
-        root = np.linalg.cholesky(spread + 1e-9 * np.eye(z.shape[-1]))
+        u, weight = self._u[rows], np.exp(self.log_weight[rows])
+        mean = np.einsum("nk,nkl->nl", weight, u)[:, None]
+        spread = np.einsum("nk,nkl,nkm->nlm", weight, u - mean, u - mean)
+        root = np.linalg.cholesky(spread + 1e-12 * np.eye(u.shape[-1]))
         draws = Streams([self._rngs[i] for i in rows.tolist()])
         start = draws.random((len(rows), 1))
         level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
         index = (weight.cumsum(-1)[:, None] < level[..., None] * weight.sum(-1)[:, None, None]).sum(-1)
-        kept = np.take_along_axis(z, index.clip(0, PARTICLES - 1)[..., None], 1)
-        noise = np.einsum("nlm,nkm->nkl", root, self._normal(draws))
+        kept = np.take_along_axis(u, index.clip(0, PARTICLES - 1)[..., None], 1)
+        normal = draws.standard_normal((u[..., 0].size, u.shape[-1])).reshape(u.shape)
+        noise = np.einsum("nlm,nkm->nkl", root, normal)
         self.log_weight[rows] = -np.log(PARTICLES)
         self._set(rows, mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise)
 

@@ -57,6 +57,10 @@ class Edit(ABC):
     def actuator_gain(self, name: str, scale: float) -> None:
         """Scale a motor's gain; -1 reverses it."""
 
+    def actuator_bias(self, name: str, value: float) -> None:
+        """Set the constant part of an actuator's force, whose bias is affine; in units of ctrl where its gain is 1."""
+        self.target.actuator(name).biasprm[0] = value
+
     @abstractmethod
     def tendon_friction(self, name: str, value: float) -> None:
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""

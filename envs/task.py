@@ -132,6 +132,15 @@ class Task(ABC):
         """Action probabilities [N, actions] of a closed-form expert; None where the expert is a network."""
         return None
 
+    def expert_mean(self, obs: Array, theta: Array) -> Array | None:
+        """Mean actions [N, A] of a closed-form expert, where actions are numbers; None where it is a network."""
+        return None
+
+    @property
+    def has_closed_expert(self) -> bool:
+        """Whether the task states its expert, which then has no weights."""
+        return self.n_actions > 0 or type(self).expert_mean is not Task.expert_mean
+
     @abstractmethod
     def renderer(self, theta: Array) -> Renderer:
         """A renderer of an environment with theta [L]. Raises InputError where no picture can be made."""

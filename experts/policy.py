@@ -14,7 +14,6 @@ from safetensors.numpy import load_file
 from scipy.special import log_ndtr
 
 from deconfounded.envs import InputError, Task
-from deconfounded.envs.blackbox import BlackBox
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS, Array, Streams
@@ -97,7 +96,7 @@ class NetworkExpert(BoxExpert):
 class CallableExpert(BoxExpert):
     """An expert whose mean is any callable from observation [N, O] and theta [N, L], in its units, to [N, A]."""
 
-    def __init__(self, task: Task, call: Callable[[Array, Array], Array], name: str) -> None:
+    def __init__(self, task: Task, call: Callable[[Array, Array], Array | None], name: str) -> None:
         super().__init__(task)
         self.call, self.name = call, name
 
@@ -154,7 +153,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
         expert.mean(np.zeros((2, len(task.observation)), np.float32), lat)
         return expert
-    if source is None and isinstance(task, BlackBox):
+    if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")
     return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source)))
 
@@ -192,7 +191,7 @@ def fingerprint(task: Task, source: str | Path | None = None) -> str:
 
 def version(task: Task, source: str | Path | None = None) -> int:
     """Version of an expert, raised by hand when its actions change: in the weights' card, or a closed form's task's."""
-    if task.n_actions:
+    if task.n_actions or (source is None and task.has_closed_expert):
         return task.version
     stated = _card(path(task) if source is None else Path(source)).get("version")
     return stated if isinstance(stated, int) else 0

@@ -127,7 +127,7 @@ def _action(task: envs.Task) -> str:
 def _expert(task: envs.Task) -> str:
     file = ROOT / "assets" / "experts" / f"{task.name}.json"
     if not file.is_file():
-        return "The expert has a closed form, `expert_probs` of the class."
+        return f"The expert has a closed form, `{'expert_probs' if task.n_actions else 'expert_mean'}` of the class."
     card = json.loads(file.read_text("utf-8"))
     rows = [("algorithm", card["algorithm"]), ("made by", f"`{card['command']}`"), ("version", str(card["version"]))]
     mean, error = card["return_mean"], card["return_standard_error"]

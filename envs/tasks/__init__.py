@@ -13,7 +13,7 @@ SUITE = (
     *("curling", "swapped_lander", "windy_drone"),
 )
 # Where the exact policy succeeds, and no learner without theta did when added. Of patchy_road both are yet to be shown.
-HARD = ("gusty_drone", "patchy_road")
+HARD = ("gusty_drone", "patchy_road", "loaded_arm")
 
 for _name in (*SUITE, *HARD):  # a task's class has its file's name, in camel case
     register(getattr(importlib.import_module(f"{__name__}.{_name}"), _name.title().replace("_", "")))

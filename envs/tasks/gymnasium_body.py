@@ -17,5 +17,6 @@ def load(name: str, timestep: float) -> mujoco.MjSpec:
         body.name = f"foot_{i + 1}"
     for actuator in spec.actuators:
         actuator.name = actuator.target
-    spec.lights[0].name = "sun"
+    for light in spec.lights:
+        light.name = "sun"
     return spec
