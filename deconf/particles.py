@@ -225,7 +225,8 @@ class ParticleAgent(Agent):
         self.belief.begin(n)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        self._rng, self._theta = Streams(rngs), None
+        self._rng = Streams(rngs)
+        self._theta: Array | None = None
         self.belief.reset(self._rng)
 
     def act(self, obs: NDArray[np.float32]) -> Array:
