@@ -136,7 +136,9 @@ def test_true_thetas_have_uniform_ranks() -> None:
         assert ranks.mean() == pytest.approx(0.5, abs=0.08)
         assert ranks.var() == pytest.approx(1 / 12, rel=0.3)
     truth = env.theta - env.theta.mean(0)
-    assert (1 - np.square(agent.belief.mean(agent.belief.log_weight) - env.theta).mean(0) / np.square(truth).mean(0)).min() > 0.3
+    assert (
+        1 - np.square(agent.belief.mean(agent.belief.log_weight) - env.theta).mean(0) / np.square(truth).mean(0)
+    ).min() > 0.3
 
 
 def test_a_quadratic_stands_for_simulation() -> None:
