@@ -17,6 +17,15 @@ def _forget_tasks() -> Iterator[None]:
         del envs.TASKS[name]
 
 
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jobs of a run run in this process, one after another: others take seconds to begin."""
+    from deconfounded.benchmarks import commands
+    from deconfounded.benchmarks.engine.local import Here
+
+    monkeypatch.setattr(commands, "engine", lambda *_: Here())
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Without dm_control there is no walker."""
     if find_spec("dm_control") is not None:

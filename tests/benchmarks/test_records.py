@@ -431,6 +431,7 @@ def test_broken_pictures_leave_the_numbers(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_table_makes_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,6 +61,7 @@ def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_runs_are_those_asked_for(tmp_path: Path) -> None:
     """What else the folder has is not in their records; what it has of them is not made again."""
     task, settings = envs.get("bandit"), tiny_preset()
@@ -75,6 +76,7 @@ def test_runs_are_those_asked_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each setting its own numbers, and references that are made once; what is kept is not tried again."""
     (tmp_path / "docs").mkdir()

@@ -2,14 +2,16 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import certify
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.experts import policy
-from tests.benchmarks.test_outside import deconf
+from tests.tools import deconf
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
 PENDULUM, CART = f"{WORLDS}/context_pendulum.py:ContextPendulum", f"{WORLDS}/reversed_cart.py:ReversedCart"
@@ -49,7 +51,8 @@ def test_a_data_set(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_certificate_says_that_it_is_learned() -> None:
+def test_a_certificate_says_that_it_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=20))
     task = envs.get(CART)
     result = certify.certify(task, policy.load(task), trials=8, grid=5)
     assert set(result["learned_dynamics"]) == {"r2", "exponent"}
