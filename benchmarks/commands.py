@@ -19,6 +19,7 @@ from deconfounded.envs.support.files import check_folder
 if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes without
     from deconfounded.benchmarks.engine.job_files import Finished
     from deconfounded.benchmarks.engine.jobs import Job
+    from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.presets import Preset
     from deconfounded.benchmarks.engine.scheduler import Engine
 
@@ -94,12 +95,17 @@ def engine(cluster: str | None, debug: bool = False) -> "Engine":
 
         return Here()
     if cluster is None:
-        from deconfounded.benchmarks.engine.local import Local
-
-        return Local()
+        return local()
     from deconfounded.benchmarks.engine.cluster import Cluster
 
     return Cluster(cluster)
+
+
+def local() -> "Local":
+    """Processes of this machine."""
+    from deconfounded.benchmarks.engine.local import Local
+
+    return Local()
 
 
 def run(

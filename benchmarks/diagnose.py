@@ -87,7 +87,6 @@ def run(
     """
     trials, explore = look.read(data, exploration, columns)
     from deconfounded.benchmarks.engine import identity
-    from deconfounded.benchmarks.engine.local import Local
     from deconfounded.benchmarks.engine.scheduler import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
     from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check
@@ -108,7 +107,7 @@ def run(
     shared: dict[str, Any] = {"seed": seed, "refits": config.refits, "made_of": json.dumps(about), "folder": folder}
     files = folder / "trials.npz", None if explore is None else folder / "explored.npz"
     refits = [Refit(*files, config.amounts, i, **shared) for i in range(config.refits)]
-    with commands.locked(folder), Local() as engine:
+    with commands.locked(folder), commands.local() as engine:
         for log, file in zip((trials, explore), files, strict=True):
             if log is not None and file is not None:
                 log.save(file)

@@ -23,7 +23,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     from deconfounded.benchmarks import commands
     from deconfounded.benchmarks.engine.local import Here
 
-    monkeypatch.setattr(commands, "engine", lambda *_: Here())
+    monkeypatch.setattr(commands, "local", Here)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -57,7 +57,7 @@ def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
         for context in (contextlib.chdir(folder), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)):
             stack.enter_context(context)
         stack.enter_context(mock.patch.object(sys, "argv", ["deconf", *args]))
-        stack.enter_context(mock.patch.object(commands, "engine", return_value=Here()))
+        stack.enter_context(mock.patch.object(commands, "local", Here))
         try:
             __main__.main()
         except SystemExit as ended:

@@ -240,6 +240,7 @@ def test_gain_by_memory() -> None:
     assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory_gain < 0.02
 
 
+@pytest.mark.usefixtures("here")
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A page that needs no other file, a json that says the same; a second time nothing is measured again."""
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
@@ -279,6 +280,7 @@ FEWER = {
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Every line of docs/diagnose.md, on less data and with less training."""
     monkeypatch.chdir(tmp_path)

@@ -229,6 +229,7 @@ OPTIONS = ["--trial", "vehicle", "--episode", "lap", "--obs", "speed*", "--actio
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("here")
 def test_from_csv_to_a_verdict(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
