@@ -143,6 +143,7 @@ def diagnosed(case: Case, folder: Path) -> str:
     write(
         case,
         diagnosis=VERSION,
+        splits=diagnosis.refits,
         verdict=diagnosis.verdict,
         diagnosed_tier=diagnosis.tier,
         right=None if diagnosis.verdict == "cannot tell" and not right else right,

@@ -25,6 +25,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
         rank = stats.spearmanr(*zip(*both, strict=True)).statistic if len(both) > 2 else None
         alike = "" if rank is None else f"; the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
         sentences.append(f"Of the half {what}, {share}{alike}.")
+    if few := [row["case"] for row in rows if row.get("splits") == 1]:
+        sentences.append(f"Judged by a single split of their trials, so far: {', '.join(few)}.")
     return " ".join(sentences)
 
 
