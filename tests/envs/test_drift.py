@@ -95,7 +95,7 @@ class Average(LatentModel):
             step.next_obs[..., 0]
         )
 
-    final_memory = belief = sample = point = loss = None  # type: ignore[assignment]
+    final_memory = belief = sample = mode = mean = loss = None  # type: ignore[assignment]
 
 
 def test_kept_share_is_chosen_without_theta() -> None:
