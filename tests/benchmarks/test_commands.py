@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from deconfounded.benchmarks.output import records, scoring
 from deconfounded.benchmarks.output.pictures import save_figure
 from deconfounded.benchmarks.studies import publish, results
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
+from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs import render
 from deconfounded.envs.support.files import check_file, read_sealed, write_json, write_sealed
 from deconfounded.experts.policy import CallableExpert
@@ -441,8 +443,9 @@ class TestScore:
 
 
 @pytest.mark.slow
-def test_certificate_fails_what_deserves_it() -> None:
+def test_certificate_fails_what_deserves_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
+    monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=500))
     task = NoStakes()
     result = certify.certify(task, CallableExpert(task, feedback, "feedback"), trials=12, grid=7)
     assert result["return_expert"] > 4 * result["return_random"]

@@ -38,8 +38,9 @@ def thetas(task: envs.Task, seed: int, k: int) -> Array:
 class TestTrials:
     @pytest.mark.slow
     @pytest.mark.parametrize("episodes", [1, 2])
-    def test_vector_equals_single_environments(self, name: str, episodes: int) -> None:
+    def test_vector_equals_single_environments(self, name: str, episodes: int, monkeypatch: pytest.MonkeyPatch) -> None:
         """Bit for bit, with keep_theta given by hand; theta is the next of its own stream after `episodes` of them."""
+        monkeypatch.setattr(type(envs.get(name)), "horizon", 25)
         task, n = envs.get(name), 2
         vec, single = envs.make_vec(name, n, episodes=episodes), [envs.make(name) for _ in range(n)]
         drawn = [thetas(task, 7 + i, 9) for i in range(n)]
