@@ -622,7 +622,7 @@ class TestSaved:
     def test_a_run_leaves_its_agents(self, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-        monkeypatch.setattr(type(envs.get(task)), "horizon", 25)
+        monkeypatch.setattr(type(envs.get(task)), "horizon", 12)
         (tmp_path / "jobs").mkdir()
         for method in ("deconfounded", "naive_rnn", "deconfounded_discrete", "blind_bc"):
             job = BenchmarkJob(task, tiny_preset(), method, (0, 1), tmp_path / "jobs")

@@ -270,6 +270,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 
 FEWER = {
+    "EPISODES, STEPS = 3, 60": "EPISODES, STEPS = 2, 20",
     "range(192)": "range(24)",
     "range(96)": "range(24)",
     "range(32)": "range(4)",

@@ -79,7 +79,7 @@ def test_exact_policies_at_the_fork() -> None:
 def test_tier_2_fails(name: str) -> None:
     """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
     task = envs.get(name)
-    config = asdict(DeconfoundedConfig(rounds=2, inference_updates=200, imitation_updates=150, final_updates=300))
+    config = asdict(DeconfoundedConfig(rounds=2, inference_updates=120, imitation_updates=100, final_updates=200))
     amounts = replace(preset("default", task, "cpu"), expert_trials=64, explore_trials=32)
     agent = fit(Context(task, amounts.configured("deconfounded", **config), [0]), "deconfounded")
     assert scores(envs.BatchEnv(task, N), agent)[-1] < 0.6
