@@ -32,7 +32,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python >= 3.11 is needed')"
 	cd deconfounded && for name in assets benchmarks deconf envs experts; do test -e $$name || ln -s ../$$name; done
 	$(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/pip install -q -c constraints.txt torch
-	$(VENV)/bin/pip install -q -c constraints.txt --config-settings editable_mode=compat -e .[dev]  # a path, as editors need
-	$(VENV)/bin/pip install -q -c constraints.txt --no-deps dm_control  # for its MJCF; from 3.13 on the line above leaves it out
+	$(VENV)/bin/pip install -q --no-compile -c constraints.txt torch  # a minute less: modules are compiled when imported
+	$(VENV)/bin/pip install -q --no-compile -c constraints.txt --config-settings editable_mode=compat -e .[dev]  # a path, as editors need
+	$(VENV)/bin/pip install -q --no-compile -c constraints.txt --no-deps dm_control  # for its MJCF; from 3.13 on the line above leaves it out
 	touch $@

@@ -80,7 +80,7 @@ def test_tier_2_fails(name: str) -> None:
     """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
     task = envs.get(name)
     config = asdict(DeconfoundedConfig(rounds=2, inference_updates=120, imitation_updates=100, final_updates=200))
-    amounts = replace(preset("default", task, "cpu"), expert_trials=64, explore_trials=32)
+    amounts = replace(preset("default", task, "cpu"), expert_trials=48, explore_trials=16)
     agent = fit(Context(task, amounts.configured("deconfounded", **config), [0]), "deconfounded")
     assert scores(envs.BatchEnv(task, N), agent)[-1] < 0.6
 
