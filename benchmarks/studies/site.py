@@ -176,11 +176,13 @@ def dead_links(folder: Path) -> list[str]:
     for file, page in pages.items():
         for link in page.links:
             scheme, host, path, _, anchor = urlsplit(link)
+            if scheme or host:  # elsewhere, or the data itself
+                continue
             target = (file.parent / unquote(path)).resolve() if path else file
             held = pages.get(target)
             scripted = "_modules" not in file.parts and held is not None and "interactive" in target.parts
             missing = not target.is_file() or (anchor and held and unquote(anchor) not in held.anchors)
-            if not (scheme or host or (scripted and target.is_file())) and missing:
+            if missing and not (scripted and target.is_file()):
                 dead.append(f"{file.relative_to(folder.resolve())}: {link}")
     return dead
 
