@@ -52,6 +52,6 @@ def main() -> None:
                 repo, repo_type=kind, revision=commit, local_dir=fetched, allow_patterns=list(WANTED[kind])
             )
             shutil.rmtree(fetched / ".cache", ignore_errors=True)  # the hub's notes on downloads
-            found = check(fetched, kind)
+            described = check(fetched, kind)
             os.rename(fetched, out)
-    print(f"{found}; commit {commit[:7]} -> {out}")
+    print(f"{described}; commit {commit[:7]} -> {out}")

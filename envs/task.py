@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -210,9 +210,13 @@ class Task(ABC):
         """The same task, with a theta that holds still within episodes."""
         if not self.switches:
             return self
-        still = copy.copy(self)
-        still.__dict__["latents"] = tuple(replace(latent, switch=0.0) for latent in self.latents)
-        return still
+        return self.changed(latents=tuple(replace(latent, switch=0.0) for latent in self.latents))
+
+    def changed(self, **attributes: Any) -> Self:
+        """A copy of the task with other attributes."""
+        other = copy.copy(self)
+        other.__dict__.update(attributes)
+        return other
 
     def theta_path(self, theta: Array, rng: Streams) -> Array:
         """Theta [N, T + 1, L] at each step of an episode that starts with theta [N, L], and after its last step.

@@ -3,7 +3,6 @@
 A record names its protocol unless that is STANDARD. Versions of seeding and roll-outs are `identity.PROTOCOL`.
 """
 
-import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -63,8 +62,4 @@ def applied(protocol: str, task: envs.Task, evaluation: bool = False) -> envs.Ta
         "unseen": {"quantile": edges if evaluation else middle},
         "once": {"episodes": 1, "latents": tuple(replace(latent, drift=0.0) for latent in task.latents)},
     }
-    if protocol not in every:
-        return task
-    other = copy.copy(task)
-    other.__dict__.update(every[protocol])
-    return other
+    return task.changed(**every[protocol]) if protocol in every else task

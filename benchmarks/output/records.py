@@ -26,9 +26,7 @@ from deconfounded.envs.task import InputError
 Record = dict[str, Any]
 SCHEMA = Path(__file__).with_name("record.schema.json")
 NAME = "protocol_name"  # which a record of the standard protocol lacks
-COMMON = (  # of a table's records
-    *("task", "task_version", "preset", NAME, "set", "salt", "eval_trials", "episodes", "expert"),
-)
+COMMON = ("task", "task_version", "preset", NAME, "set", "salt", "eval_trials", "episodes", "expert")  # of a table
 MADE_OF = (  # what makes a record stale when it changes
     *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
     *("salt", "versions", "outside", NAME),

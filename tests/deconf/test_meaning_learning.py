@@ -11,7 +11,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
-from deconfounded.deconf.core.models import VariationalModel, new_model
+from deconfounded.deconf.core.models import LatentModel, VariationalModel, new_model
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
@@ -206,6 +206,17 @@ def loaded_mass(n: int, rng: np.random.Generator) -> tuple[Array, Batch]:
     return theta, Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, 60))
 
 
+def trained(data: Batch, latent: int, updates: int, rng: np.random.Generator) -> LatentModel:
+    """A model with the evidence belief, trained on continuous trials."""
+    streams, signature = Draws([rng], "cpu"), Signature(data.obs.shape[-1], data.action.shape[-1], 0, False)
+    model = new_model("evidence", latent, 32, Scales.of(signature, data), streams)
+    optimizer = Adam([model], 5e-3, updates)
+    for update in range(updates):
+        batch = data.beginnings(update, 0.25).draw_trials(16, streams)
+        model.learn(optimizer, batch, 256, 1e-3 * min(1, 2 * update / updates), streams)
+    return model
+
+
 def test_a_small_effect_is_learned_beside_large_ones() -> None:
     """Of two loads, small beside the noise, the belief knows most after 60 steps, on trials it has not seen.
 
@@ -213,12 +224,7 @@ def test_a_small_effect_is_learned_beside_large_ones() -> None:
     """
     rng = np.random.default_rng(0)
     (_, data), (theta, fresh) = loaded_mass(96, rng), loaded_mass(200, rng)
-    streams = Draws([rng], "cpu")
-    model = new_model("evidence", 8, 32, Scales.of(Signature(6, 2, 0, False), data), streams)
-    optimizer = Adam([model], 5e-3, 300)
-    for update in range(300):
-        batch = data.beginnings(update, 0.25).draw_trials(16, streams)
-        model.learn(optimizer, batch, 256, 1e-3 * min(1, update / 150), streams)
+    model = trained(data, 8, 300, rng)
     with torch.no_grad():
         inferred = model.mean(model.belief(model.final_memory(fresh)))[0].double().numpy()
     inputs = np.concatenate([inferred, np.ones((200, 1))], 1)
@@ -246,12 +252,7 @@ def test_what_is_expected_of_a_step_is_blind_to_theta() -> None:
     """
     rng = np.random.default_rng(0)
     data, fresh = steered(96, 0.8, rng), steered(200, 1.0, rng)
-    streams = Draws([rng], "cpu")
-    model = new_model("evidence", 4, 32, Scales.of(Signature(1, 1, 0, False), data), streams)
-    optimizer = Adam([model], 5e-3, 150)
-    for update in range(150):
-        batch = data.beginnings(update, 0.25).draw_trials(16, streams)
-        model.learn(optimizer, batch, 256, 1e-3 * min(1, update / 75), streams)
+    model = trained(data, 4, 150, rng)
     assert isinstance(model, VariationalModel)
     belief = model.encoder
     assert isinstance(belief, EvidenceBelief)
