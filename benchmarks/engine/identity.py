@@ -47,6 +47,9 @@ def identity(job: "Job") -> dict[str, Any]:
     texts = {"task": sources.of_task(task)}
     if method.reference:
         texts["method"] = sources.of_reference(method.reference)
+    config = preset.configs.get(job.method)
+    if config is not None:  # without the device, which a record's `machine` names
+        config = {name: value for name, value in config.items() if name != "device"}
     made_of = {
         "kind": type(job).__name__,
         "protocol": PROTOCOL,
@@ -54,7 +57,7 @@ def identity(job: "Job") -> dict[str, Any]:
         "task_version": task.version,
         "method": job.method,
         "method_version": method.version,
-        "settings": settings | ({"config": preset.configs[job.method]} if job.method in preset.configs else {}),
+        "settings": settings | ({"config": config} if config is not None else {}),
         **expert(task, job.expert),
         "salt": job.salt,
         "versions": versions(),

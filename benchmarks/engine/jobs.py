@@ -172,11 +172,15 @@ class JobMonitor(Monitor):
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         self._tell(self.share * done / total)
 
+    def _made_of(self) -> str:
+        """What a checkpoint goes with: the states of random generators are of a device."""
+        return json.dumps([self.identity, self.device])
+
     def save(self, state: Callable[[], Training]) -> None:
         if time.monotonic() - self.saved >= SAVE_EVERY_S:
             buffer = io.BytesIO()
             known = {"kept": self.kept, "budget": self.budget, "spans": self.spans(), "cpu": self.cpu()}
-            made_of = {"layout": LAYOUT, "identity": json.dumps(self.identity)}
+            made_of = {"layout": LAYOUT, "identity": self._made_of()}
             torch.save({"training": state(), **made_of, **known}, buffer)
             write_atomically(self.file, hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
             self.saved = time.monotonic()
@@ -187,7 +191,7 @@ class JobMonitor(Monitor):
             if hashlib.sha256(content[32:]).digest() != content[:32]:
                 return None
             state = torch.load(io.BytesIO(content[32:]), self.device, weights_only=True)
-            if state["layout"] != LAYOUT or state["identity"] != json.dumps(self.identity):
+            if state["layout"] != LAYOUT or state["identity"] != self._made_of():
                 print(f"{self.file.name} was begun with other code or amounts; training begins again")
                 return None
         except Exception:  # missing, or of other code, which torch tells in many ways: begin again

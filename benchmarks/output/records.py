@@ -29,7 +29,7 @@ NAME = "protocol_name"  # which a record of the standard protocol lacks
 COMMON = ("task", "task_version", "preset", NAME, "set", "salt", "eval_trials", "episodes", "expert")  # of a table
 MADE_OF = (  # what makes a record stale when it changes
     *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
-    *("salt", "versions", "outside", NAME),
+    *("salt", "outside", NAME),
 )
 SLOT = ("preset", NAME, "set", "salt", "method", "deployment", "seed")  # of which a task's file holds one record
 
@@ -38,6 +38,7 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
     """The records of what a job wrote of a seed, one for each agent that it scored; see record.schema.json."""
     meta = data["meta"]
     seed = {key: meta["identity"][key] for key in ("task", "method", *MADE_OF) if key in meta["identity"]}
+    seed |= {"versions": meta["identity"]["versions"]}
     seed |= {key: meta[key] for key in ("seed", "tier", "budget", "cpu_s", "commit", "machine")}
     seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
     seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
@@ -281,12 +282,21 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
         **{key: first[key] for key in COMMON if first.get(key) not in ("", [], None)},
         "seeds": sorted({record["seed"] for record in records}),
         "commits": sorted({record["commit"] or "unknown" for record in records}),
-        "versions": first["versions"],
+        "versions": _versions(records),
         "machine": "; ".join(sorted({record["machine"] for record in records})),
         "wall_s": round(covered([span for record in records for span in record["spans"]]), 1),
         "methods": scoring.summarise(
             {name: by_agent[name] for name in names}, first["episodes"], references(first, records)
         ),
+    }
+
+
+def _versions(records: Sequence[Record]) -> dict[str, str]:
+    """Of each library, all versions that the records were made with."""
+    names = dict.fromkeys(name for record in records for name in record["versions"])
+    return {
+        name: " and ".join(dict.fromkeys(r["versions"][name] for r in records if name in r["versions"]))
+        for name in names
     }
 
 
