@@ -33,7 +33,7 @@ def main() -> None:
     """The experiment on one page."""
     parser = commands.parser(__doc__, "`all`, or some of those that --list names; your own is path/file.py:fit")
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
-    several = f"several tasks, a folder each: names, or {' or '.join(published.GROUPS)}"
+    several = f"several tasks, a folder each: names, or {', '.join(published.GROUPS)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help=several)
     parser.add_argument("--expert", **COMMON["--expert"])
     parser.add_argument("--list", action="store_true", help="list tasks and methods, and stop")

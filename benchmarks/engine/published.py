@@ -6,7 +6,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import ROOT
 
 CERTIFICATES, RECORDS = ROOT / "docs" / "certificates", ROOT / "docs" / "records"
-GROUPS = ("certified", "suite")  # names for several tasks
+GROUPS = ("certified", "suite", "hard")  # names for several tasks
 
 
 def certified() -> list[str]:
@@ -21,6 +21,6 @@ def certified() -> list[str]:
 
 def tasks(asked: list[str]) -> list[envs.Task]:
     """Tasks by names, references and GROUPS, each once. Raises InputError for a name that is unknown."""
-    groups = {"certified": certified, "suite": lambda: list(envs.SUITE)}
+    groups = {"certified": certified, "suite": lambda: list(envs.SUITE), "hard": lambda: list(envs.HARD)}
     names = [name for each in asked for name in (groups[each]() if each in groups else [each])]
     return [envs.get(name) for name in dict.fromkeys(names)]

@@ -32,9 +32,13 @@ def nats(certificate: dict[str, Any]) -> list[str]:
     return [f"{value:,.2f}" if value < 10 else f"{value:,.0f}" for value in evidence]
 
 
-def certified() -> dict[str, dict[str, Any]]:
-    """In the registry's order, the tasks that have a certificate in docs/, and what it holds."""
-    return {name: certificate for name in envs.SUITE if (certificate := kept(f"certificates/{name}"))}
+def certified(names: Sequence[str] = envs.SUITE) -> dict[str, dict[str, Any]]:
+    """Those of the tasks that have a certificate in docs/, and what it holds."""
+    return {name: certificate for name in names if (certificate := _kept_certificate(name))}
+
+
+def _kept_certificate(name: str) -> Any:
+    return kept(f"certificates/{'hard/' * (name in envs.HARD)}{name}")
 
 
 def certificates(held: dict[str, Any]) -> str:
@@ -48,7 +52,7 @@ def certificates(held: dict[str, Any]) -> str:
 
 
 def _certificate(task: envs.Task) -> str:
-    certificate = kept(f"certificates/{task.name}") or kept(f"certificates/hard/{task.name}")
+    certificate = _kept_certificate(task.name)
     if certificate is None:
         return "No certificate."
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in certificate["checks"].items())
@@ -131,7 +135,6 @@ Made by `deconf publish` from the tasks' own classes and docs/certificates. Idea
 certificate are in [tried.md](tried.md)."""
     hard = """# Hard tasks
 
-Beside the suite (`envs.HARD`), for methods that solve it: the exact policy succeeds, and much is left to learners.
-Their certificates are in docs/certificates/hard."""
+Beside the suite (`envs.HARD`), for methods that solve it. What methods reach there: [hard.md](hard.md)."""
     suite, beside = ([card(envs.get(name)) for name in names] for names in (envs.SUITE, envs.HARD))
     return "\n\n".join([head, *suite, hard, *beside]) + "\n"

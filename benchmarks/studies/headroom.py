@@ -1,6 +1,6 @@
 """docs/headroom.md: what the best methods leave to gain on each task, and how many tasks are solved."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -41,14 +41,22 @@ class Headroom(NamedTuple):
 
 def headroom(methods: dict[str, Any], end: str, tiers: str = "123") -> Headroom | None:
     """From the `methods` of results.json, of the score of an episode of ENDS; None without reference or methods."""
+    ceiling, best = _ranked(methods, end, lambda entry: entry["method"] == EXACT), best_of(methods, end, tiers)
+    return Headroom(ceiling[0], best[:BEST]) if ceiling and best else None
+
+
+def best_of(methods: dict[str, Any], end: str, tiers: str = "123") -> list[tuple[str, float]]:
+    """The learners of some tiers, each in its best deployment, and their scores in an episode of ENDS; best first."""
+    return _ranked(methods, end, lambda entry: entry["method"] != EXACT and entry["tier"] in tiers)
+
+
+def _ranked(methods: dict[str, Any], end: str, chosen: Callable[[dict[str, Any]], bool]) -> list[tuple[str, float]]:
     best: dict[str, tuple[str, float]] = {}
     for name, entry in methods.items():
-        if entry["method"] == EXACT or entry["tier"] in tiers:
-            held = best.setdefault(entry["method"], (name, entry[f"score_{end}"]))
-            best[entry["method"]] = max(held, (name, entry[f"score_{end}"]), key=lambda agent: agent[1])
-    ceiling = best.pop(EXACT, None)
-    ranked = sorted(best.values(), key=lambda agent: -agent[1])[:BEST]
-    return Headroom(ceiling, ranked) if ceiling and ranked else None
+        if chosen(entry):
+            agent = (name, entry[f"score_{end}"])
+            best[entry["method"]] = max(best.get(entry["method"], agent), agent, key=lambda agent: agent[1])
+    return sorted(best.values(), key=lambda agent: -agent[1])
 
 
 def of_tasks(found: index.Found, certified: dict[str, Any], end: str, tiers: str = "123") -> dict[str, Headroom]:

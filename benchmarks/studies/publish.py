@@ -25,7 +25,7 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of
-from deconfounded.benchmarks.studies import cards, findings, gap, headroom, results, spectrum, validate
+from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, results, spectrum, validate
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS
 from deconfounded.envs.support.files import write_atomically
 
@@ -132,6 +132,7 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
         DOCS / "results.md": results.results_page(found, certified),
+        DOCS / "hard.md": hard.page(results.published(names=envs.HARD), cards.certified(envs.HARD)),
         DOCS / "headroom.md": headroom.page(found, certified, results.other_protocols()),
         **{file: _filled(file, of) for file, of in tables.items()},
     }

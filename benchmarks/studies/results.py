@@ -85,8 +85,9 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
         f"{seeds} seeds of {results['eval_trials']:,} trials; {results['wall_s']:,.0f} s; {results['machine']};"
         f" {versions} ([records](records/{task.name}.jsonl), of {commits}).",
         markdown_table((*scoring.COLUMNS, "twice as long"), rows),
-        f"![score by episode]({task.name}.png)",
     ]
+    if (DOCS / f"{task.name}.png").exists():
+        parts.append(f"![score by episode]({task.name}.png)")
     if older := outdated(task, results):
         parts.append(f"Of an older version, and not yet made again: {'; '.join(older)}.")
     if (DOCS / (link := f"records/superseded/{records.place(task.name)}")).exists():

@@ -17,7 +17,7 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
-from deconfounded.benchmarks.studies import cards, findings, gap, headroom, publish, results, tune
+from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, publish, results, tune
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -281,6 +281,27 @@ class TestHeadroom:
         assert ceilings in text
         assert "hidden_goal" not in text
         assert "| a | 2 | 0.60 (0.60 to 0.60) | 0.93 (0.93 to 0.93) | 0.47 (0.47 to 0.47) |" in text
+
+    @pytest.mark.parametrize(
+        ("verdict", "exact", "first", "last", "says"),
+        [
+            ("passed", 0.95, 0.7, 0.79, "yes, by the first and the last episode"),
+            ("passed", 0.95, 0.8, 0.95, "yes, by the first episode"),
+            ("passed", 0.95, 0.85, 0.9, "no: solved"),
+            ("passed", 0.85, 0.1, 0.1, "no: the exact policy does not reach it"),
+            ("failed", 0.95, 0.1, 0.1, "no: not certified"),
+        ],
+    )
+    def test_admitted(self, verdict: str, exact: float, first: float, last: float, says: str) -> None:
+        """A hard task is certified, can be done with the exact belief, and is not solved by learners."""
+        certificate = {"verdict": verdict, "interventional": {"score": [0.99, exact]}}
+        assert hard.admitted(certificate, first, last) == says
+        assert hard.admitted(None, first, last) == "no: not certified"
+
+    def test_best_learner(self) -> None:
+        """Who sees theta and the exact policies are no learners."""
+        assert headroom.best_of(self.METHODS, "first")[0] == ("a_mode", 0.7)
+        assert headroom.best_of(self.METHODS, "last")[0] == ("b", 0.95)
 
     def test_picture(self, tmp_path: Path) -> None:
         found = [(envs.get("curling"), {"methods": self.METHODS})]
