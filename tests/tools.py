@@ -21,6 +21,7 @@ OFFLINE = {"offline_updates": 2, "online_updates": 2, "online_batch": 4, "offlin
 PLAIN: dict[str, dict[str, Any]] = {
     "deconfounded": FEW,
     "deconfounded_gru": {"model": "gru", **FEW},
+    "deconfounded_forgetting": {"model": "forgetting", **FEW},
     "deconfounded_discrete": {"model": "discrete", **FEW},
     "deconfounded_offline": {**OFFLINE, "online_steps": 64},
     "deconfounded_mean": {**FEW, "inference_steps": 64},

@@ -19,6 +19,7 @@ COLOURS = {
     "conditional": "#d62728",
     "deconfounded": "#1f77b4",
     "deconfounded_gru": "#17becf",
+    "deconfounded_forgetting": "#1b9e77",
     "deconfounded_discrete": "#9467bd",
     "deconfounded_offline": "#a8a91e",
     "dagger": "#e377c2",

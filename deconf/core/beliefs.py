@@ -67,6 +67,13 @@ class Belief(nn.Module, ABC):
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std [..., D] of q_phi given memories [..., M]."""
 
+    def hindsight(self, batch: Batch) -> Tensor:
+        """Memories [S, K, M] from which the latents of whole trials [S, B, T] are inferred.
+
+        K is B, a memory a trial, or B T, a memory a step where the latent may change within a trial.
+        """
+        return self(batch)[:, :, -1]
+
 
 class EvidenceBelief(Belief):
     """The order-free belief: a sum of evidence over transitions, read by a small network.
@@ -138,14 +145,76 @@ class EvidenceBelief(Belief):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)
 
-    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        scale = (self.longest / memory[..., -1:]).clamp(max=1) if self.longest else 1.0
-        total, count = memory[..., :-1] * scale, memory[..., -1:] * scale
-        n = 1 + count
-        mean, raw = self.out(torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)).chunk(2, -1)
+    def _read(self, memory: Tensor, longest: Tensor | float) -> Tensor:
+        """The inputs [..., 2 F + 1] of the network that reads a sum of evidence and its count."""
+        scale = (longest / memory[..., -1:]).clamp(max=1) if longest else 1.0
+        total, n = memory[..., :-1] * scale, 1 + memory[..., -1:] * scale
+        return torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)
+
+    def _gaussian(self, inputs: Tensor, empty: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and std that the network says; those of the prior where there is no evidence."""
+        mean, raw = self.out(inputs).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()
-        empty, (prior_mean, prior_std) = count == 0, self.prior(mean)
+        prior_mean, prior_std = self.prior(mean)
         return torch.where(empty, prior_mean, mean), torch.where(empty, prior_std, std)
+
+    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        return self._gaussian(self._read(memory, self.longest), memory[..., -1:] == 0)
+
+
+class ForgettingBelief(EvidenceBelief):
+    """A belief about a latent that may change at any step, or may not: sums that forget beside the one that does not.
+
+    Besides the sum of all evidence it keeps sums in which a step counts KEPT^age, so that evidence of a former latent
+    fades. The network reads all of them, and learns which to trust for what.
+    """
+
+    KEPT = (31 / 32, 7 / 8)
+
+    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
+        super().__init__(latent, width, scales, draws)
+        self.sums = 1 + len(self.KEPT)
+        self.out = Mlp(self.sums * (2 * self.features + 1), width, 2 * latent, draws)
+
+    def forward(self, batch: Batch) -> Tensor:
+        terms = self._terms(batch)
+        if self.training and torch.is_grad_enabled():
+            self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
+        sums = [terms.cumsum(2), *(faded_sum(terms, kept) for kept in self.KEPT)]
+        return F.pad(torch.cat(sums, -1), (0, 0, 1, 0))
+
+    def hindsight(self, batch: Batch) -> Tensor:
+        """Of each step, what is evidence of the latent at that step: before it and after it."""
+        terms = self._terms(batch)
+        sums = [terms.sum(2, keepdim=True).expand_as(terms)]
+        for kept in self.KEPT:
+            after = faded_sum(terms.flip(2), kept).flip(2)
+            sums.append(after + kept * F.pad(faded_sum(terms, kept), (0, 0, 1, -1)))
+        return torch.cat(sums, -1).flatten(1, 2)
+
+    def start(self, n: int) -> Tensor:
+        return self.prior_mean.new_zeros(len(self.prior_mean), n, self.sums * (self.features + 1))
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        terms, mask = self._terms(step), step.mask[..., None]
+        whole, *faded = memory.chunk(self.sums, -1)
+        faded = [part * (1 - (1 - kept) * mask) for part, kept in zip(faded, self.KEPT, strict=True)]
+        return torch.cat([part + terms for part in (whole, *faded)], -1)
+
+    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        whole, *faded = memory.chunk(self.sums, -1)
+        parts = [self._read(whole, self.longest)]
+        parts += [self._read(part, 1 / (1 - kept)) for part, kept in zip(faded, self.KEPT, strict=True)]
+        return self._gaussian(torch.cat(parts, -1), whole[..., -1:] == 0)
+
+
+def faded_sum(x: Tensor, kept: float) -> Tensor:
+    """y[t] = x[t] + kept y[t - 1], of x [S, B, T, F] along T, by doubling the window until kept^window is < 1e-4."""
+    window, y = 1, x
+    while window < x.shape[2] and kept**window > 1e-4:
+        y = y + kept**window * F.pad(y, (0, 0, window, -window))
+        window *= 2
+    return y
 
 
 class GruMemory(nn.Module):

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
-BELIEFS = {"evidence": EvidenceBelief, "gru": GruBelief}
+BELIEFS = {"evidence": EvidenceBelief, "forgetting": ForgettingBelief, "gru": GruBelief}
 
 
 class LatentModel(nn.Module, ABC):
@@ -51,7 +51,7 @@ class LatentModel(nn.Module, ABC):
 
     @abstractmethod
     def final_memory(self, batch: Batch) -> Tensor:
-        """The memory [S, B, M] after the last step of whole trials."""
+        """The memory [S, B, M] after whole trials; [S, B T, M], one a step, if the latent may change within."""
 
     @abstractmethod
     def belief(self, memory: Tensor) -> Tensor:
@@ -104,7 +104,7 @@ class VariationalModel(LatentModel):
         return self.encoder.update(memory, step)
 
     def final_memory(self, batch: Batch) -> Tensor:
-        return self.encoder(batch)[:, :, -1]
+        return self.encoder.hindsight(batch)
 
     def belief(self, memory: Tensor) -> Tensor:
         return torch.cat(self.encoder.posterior(memory), -1)
@@ -222,7 +222,7 @@ class DiscreteModel(LatentModel):
 
 
 def new_model(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> LatentModel:
-    """An untrained model: `evidence`, `gru` or `discrete`. Raises InputError for another kind."""
+    """An untrained model: of BELIEFS, or `discrete`. Raises InputError for another kind."""
     if kind == "discrete":
         return DiscreteModel(latent, width, scales, draws)
     if kind not in BELIEFS:
@@ -232,6 +232,9 @@ def new_model(kind: str, latent: int, width: int, scales: Scales, draws: Draws) 
 
 @torch.no_grad()
 def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
-    """Beliefs q_phi(theta_hat_H | tau) after whole trials, [S, B, P]; in parts of so many, to save memory."""
+    """Beliefs q_phi(theta_hat_H | tau) after whole trials, [S, B, P]; in parts of so many, to save memory.
+
+    [S, B T, P], one a step, if the latent may change within a trial.
+    """
     indices = torch.arange(len(trials), device=trials.mask.device).split(part)
-    return model.belief(torch.cat([model.final_memory(trials[:, i]) for i in indices], 1))
+    return torch.cat([model.belief(model.final_memory(trials[:, i])) for i in indices], 1)

@@ -40,7 +40,7 @@ class DeconfoundedConfig(Configuration):
     The discrete model has an exact likelihood: beta, warm_up, inference_steps and fit_prior do not apply to it.
     """
 
-    model: Literal["evidence", "gru", "discrete"] = "evidence"
+    model: Literal["evidence", "forgetting", "gru", "discrete"] = "evidence"
     width: int = 64
     latent: int = 8  # dimensions of theta_hat, or its number of values if discrete
     beta: float = 1e-3
@@ -112,10 +112,11 @@ class DeconfoundedAgent(LearnedAgent):
         self._memory = self.model.update(self._memory, step)
 
     def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
-        """The imitation loss [S] on steps of expert trials; their theta_hat_H is drawn from beliefs [S, B, P]."""
+        """The imitation loss [S] on steps of expert trials; theta_hat_H is drawn from `final_belief`."""
         index = batch.draw_steps(steps, draws)
         pairs = batch.steps(index)
-        theta_hat = self.model.sample(take(belief, index // batch.mask.shape[2]), draws)
+        steps_each = batch.mask.shape[1:].numel() // belief.shape[1]  # of a belief: a trial's, or one
+        theta_hat = self.model.sample(take(belief, index // steps_each), draws)
         with torch.no_grad():
             inputs = self.model.inputs.obs(pairs.obs)
         return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), pairs.action), pairs.mask)

@@ -16,7 +16,7 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, GruBelief, GruMemory
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief, GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
@@ -114,7 +114,7 @@ class TestEquations:
         assert std.grad is not None
 
 
-@pytest.mark.parametrize("kind", [EvidenceBelief, GruBelief])
+@pytest.mark.parametrize("kind", [EvidenceBelief, ForgettingBelief, GruBelief])
 @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
 class TestBeliefs:
     def make(self, kind: type[Belief], name: str) -> tuple[Belief, Batch, Trials]:
@@ -132,7 +132,8 @@ class TestBeliefs:
         for t in range(data.mask.shape[2]):
             memory = belief.update(memory, data[:, :, t])
             memories.append(memory)
-        torch.testing.assert_close(torch.stack(memories, 2), belief(data), rtol=1e-4, atol=1e-4)
+        real = torch.cat([torch.ones_like(data.mask[..., :1]), data.mask], 2) == 1
+        torch.testing.assert_close(torch.stack(memories, 2)[real], belief(data)[real], rtol=1e-4, atol=1e-4)
 
     def test_masked_steps_change_nothing(self, kind: type[Belief], name: str) -> None:
         belief, data, _ = self.make(kind, name)
@@ -150,6 +151,19 @@ class TestBeliefs:
         mean_turned, _ = belief.posterior(belief(turned)[:, :, -1])
         same = torch.allclose(mean, mean_turned, atol=1e-4)
         assert same == (kind is EvidenceBelief)
+
+    def test_hindsight(self, kind: type[Belief], name: str) -> None:
+        """A memory of whole trials, each of whose steps counts the less the further it is from where theta is asked."""
+        belief, data, _ = self.make(kind, name)
+        memory, (seeds, trials, steps) = belief.hindsight(data), data.mask.shape
+        if not isinstance(belief, ForgettingBelief):
+            torch.testing.assert_close(memory, belief(data)[:, :, -1])
+            return
+        terms = belief._terms(data)
+        apart = (torch.arange(steps)[:, None] - torch.arange(steps)).abs()
+        weights = [kept**apart for kept in (1.0, *belief.KEPT)]
+        expected = torch.cat([torch.einsum("tu,sbuf->sbtf", weight, terms) for weight in weights], -1)
+        torch.testing.assert_close(memory, expected.reshape(seeds, trials * steps, -1), rtol=1e-3, atol=2e-3)
 
 
 def _bandit_batch(n: int) -> tuple[Batch, Scales, Draws]:
@@ -476,7 +490,7 @@ class TestMethods:
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3).returns.mean() < 42
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
+    @pytest.mark.parametrize("kind", ["evidence", "forgetting", "gru", "discrete"])
     def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
         """The same seed gives the same agent, and neither training nor acting touches torch's global generator."""
         trials, env = demonstrations("slippery_cartpole", 8)

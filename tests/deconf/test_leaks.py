@@ -239,7 +239,7 @@ def make(kind: str, name: str = CONTROL) -> tuple[LatentModel, Batch, Draws, Dec
     return model.eval(), data, draws, DeconfoundedAgent(model, policy_)
 
 
-@pytest.mark.parametrize("kind", ["evidence", "gru", "discrete"])
+@pytest.mark.parametrize("kind", ["evidence", "forgetting", "gru", "discrete"])
 class TestLatents:
     def test_training_draws_theta_hat(self, kind: str) -> None:
         """The same update twice: only the noise of theta_hat differs, and so does the loss."""
