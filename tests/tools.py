@@ -35,6 +35,8 @@ PLAIN: dict[str, dict[str, Any]] = {
     "naive_obs": {"updates": 2, "batch": 4},
     "naive_dropout": {"updates": 2, "batch": 4},
     "palr": {"updates": 2, "batch": 4, "samples": 32},
+    "dml_il": {"updates": 4, "batch": 4, "components": 2, "steps": 64},
+    "dadp": {"inference_updates": 2, "inference_batch": 4, "inference_steps": 64, "imitation_updates": 2},
     "naive_rnn": {"updates": 2, "batch": 4},
     "oracle_bc": {"updates": 3, "batch": 64},
     "blind_bc": {"updates": 3, "batch": 64},

@@ -31,6 +31,8 @@ COLOURS = {
     "gail": "#637939",
     "rma": "#7b4173",
     "palr": "#31a354",
+    "dml_il": "#00868b",
+    "dadp": "#c51b8a",
     "naive_obs": "#e6ab02",
     "naive_dropout": "#ad494a",
     "naive_transformer": "#e6550d",

@@ -23,6 +23,8 @@ METHODS = {
     "naive_obs": "naive_obs:fit",
     "naive_dropout": "naive_dropout:fit",
     "palr": "palr:fit",
+    "dml_il": "dml_il:fit",
+    "dadp": "dadp:fit",
     "naive_rnn": "naive_rnn:fit",
     "oracle_bc": "oracle_bc:fit",
     "blind_bc": "blind_bc:fit",

@@ -24,7 +24,9 @@ from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, rma
+from deconfounded.deconf.methods.dadp import DadpAgent, contexts
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
+from deconfounded.deconf.methods.dml_il import DmlAgent, moment_loss, sources
 from deconfounded.deconf.methods.gail import Discriminator, GailAgent, GailConfig
 from deconfounded.deconf.methods.gail_ppo import SequencePolicy, new_ppo
 from deconfounded.deconf.methods.naive_dropout import ActionDropoutAgent
@@ -37,7 +39,10 @@ from deconfounded.experts.train import train
 from tests.tools import tiny_preset
 
 CONTROL = "slippery_cartpole"
-NEW = ("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr")
+NEW = (
+    *("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr"),
+    *("dml_il", "dadp"),
+)
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 
 
@@ -64,7 +69,7 @@ def test_tiers() -> None:
     """Tiers follow from declared data: rma alone sees theta."""
     tiers = {name: METHODS[name].tier for name in NEW}
     assert tiers == {
-        **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr"), "1"),
+        **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr", "dml_il", "dadp"), "1"),
         **dict.fromkeys(("deconfounded_mean", "gail"), "2"),
         "rma": "sees theta",
     }
@@ -156,6 +161,68 @@ class TestPalr:
         agent.config = PalrConfig(penalty=1e3, samples=20)
         assert torch.equal(agent.held_out_loss(batch), plain)
         assert (agent.loss(batch, batch.action, agent.memory.start(3))[0] > plain).all()
+
+
+class TestDmlIl:
+    def test_the_moment_is_that_of_the_policy(self) -> None:
+        """Noise that moves the state and the action: a regression on states is biased, one on roll-outs is not."""
+        z, u, first, second = streams().normal(4, 1, 50_000, 1)[0]
+        state, action = z + u, 2 * (z + u) - u
+        slopes = torch.linspace(0, 4, 81)
+
+        def best(*states: torch.Tensor) -> float:
+            residuals = [(action - slopes[:, None, None] * x[0]) for x in states]  # [81, 50_000, 1]
+            return slopes[moment_loss(residuals, torch.ones(81, 50_000)).argmin()].item()
+
+        assert best(state, state) == pytest.approx(1.5, abs=0.051)
+        assert best(z + first, z + second) == pytest.approx(2, abs=0.051)
+
+    def test_histories_end_before_the_noise(self) -> None:
+        """In training and in deployment the policy reads the memory of k steps ago, or of the episode's beginning."""
+        draws, lag = streams(), 3
+        batch = random_batch(draws, 3, 12)
+        batch.next_obs = batch.next_obs.clone()
+        batch.next_obs[:, 1, 6] += 1  # an episode of the second trial ends there
+        source = sources(batch, lag)
+        assert source[0, 0].tolist() == [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
+        assert source[0, 1].tolist() == [0, 0, 0, 0, 1, 2, 3, 7, 7, 7, 7, 8]
+        agent = DmlAgent.new(2, 8, lag, scales(batch), draws)
+        with torch.no_grad():
+            read = agent.history.at(batch, 12 + source[:, 1])  # in the second trial
+            agent.begin(3)
+            for t in range(12):
+                if t in (0, 7):
+                    agent.reset([np.random.default_rng(t)])
+                torch.testing.assert_close(agent._memories[0][0, 1], read[0, t])
+                agent.remember(batch[:, :, t])
+
+
+class TestDadp:
+    def test_contexts_are_of_other_episodes(self) -> None:
+        """Of a trial of 4 episodes, each of its others is in the context of an episode half of the time."""
+        memories = torch.eye(4).expand(1, 2000, 4, 4)
+        made = contexts(memories, streams())
+        assert torch.equal(made.diagonal(dim1=2, dim2=3), torch.zeros(1, 2000, 4))
+        assert made.unique().tolist() == [0, 1]
+        assert made.sum(-1).unique(return_counts=True)[1].min() > 1800  # 0, 1, 2 or 3 of them: 2000 each
+        assert made.mean((0, 1))[~torch.eye(4, dtype=torch.bool)].sub(0.5).abs().max() < 0.06
+
+    def test_it_acts_on_earlier_episodes_alone(self) -> None:
+        """What happens in an episode does not change its latent, which is 0 in the first; the next episode reads it."""
+        draws = streams()
+        batch = random_batch(draws)
+        agent = DadpAgent.new(2, 8, scales(batch), draws)
+        agent.begin(3)
+        latents = []
+        for _ in range(2):
+            agent.reset([np.random.default_rng(5)])
+            for t in range(2):
+                latents.append(agent.latent(agent._context))
+                agent.remember(batch[:, :, t])
+        assert torch.equal(latents[0], torch.zeros(1, 3, 2))
+        assert torch.equal(latents[1], latents[0])
+        assert torch.equal(latents[3], latents[2])
+        assert (latents[2] != 0).all()
 
 
 def transformer(batch: Batch, window: int, layers: int = 2) -> TransformerAgent:

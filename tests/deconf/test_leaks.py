@@ -20,10 +20,12 @@ from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.models import DiscreteModel, LatentModel, VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.methods import (
+    dadp,
     dagger,
     deconfounded,
     deconfounded_mean,
     deconfounded_offline,
+    dml_il,
     gail,
     naive_obs,
     naive_rnn,
@@ -145,7 +147,7 @@ class TestData:
         "method",
         [
             *("deconfounded", "deconfounded_offline", "deconfounded_mean", "gail"),
-            *("naive_rnn", "naive_obs", "naive_transformer", "palr", "dagger"),
+            *("naive_rnn", "naive_obs", "naive_transformer", "palr", "dml_il", "dadp", "dagger"),
         ],
     )
     def test_methods_are_handed_no_theta(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,6 +163,8 @@ class TestData:
             "naive_obs": naive_obs,
             "naive_transformer": naive_transformer,
             "palr": palr,
+            "dml_il": dml_il,
+            "dadp": dadp,
             "dagger": dagger,
         }
         handed: list[Any] = []
