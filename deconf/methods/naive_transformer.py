@@ -7,7 +7,7 @@ Positions are rotary (Su et al., 2021), and so relative: deployment may be longe
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -145,17 +145,19 @@ class Transformer(nn.Module):
 class TransformerAgent(LearnedAgent):
     """A policy of the latest `window` tokens of the trial, across resets."""
 
+    net_kind: ClassVar[type[Transformer]] = Transformer
+
     def __init__(self, net: Transformer, policy: ActionHead, scales: Scales) -> None:
         super().__init__(policy)
         self.net, self.scales = net, scales
 
-    @staticmethod
-    def new(shape: dict[str, Any], scales: Scales, draws: Draws) -> "TransformerAgent":
+    @classmethod
+    def new(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> Self:
         """An untrained agent."""
         signature, width = scales.signature, shape["width"]
         inputs = 2 * signature.obs + signature.action_features + 1
-        net = Transformer(inputs, width, shape["layers"], shape["heads"], shape["window"], draws)
-        return TransformerAgent(net, ActionHead(width + signature.obs, width, scales, draws), scales)
+        net = cls.net_kind(inputs, width, shape["layers"], shape["heads"], shape["window"], draws)
+        return cls(net, ActionHead(width + signature.obs, width, scales, draws), scales)
 
     @classmethod
     def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "TransformerAgent":

@@ -1,0 +1,220 @@
+"""Behavioural cloning as robotics trains it today: flow matching over chunks of actions, given a short history.
+
+After Diffusion Policy (Chi et al., 2023, arXiv 2303.04137), which draws a chunk of actions by denoising and executes its
+beginning before it draws the next (receding horizon); chunks as in ACT (Zhao et al., 2023, arXiv 2304.13705); and flow
+matching (Lipman et al., 2023, arXiv 2210.02747) in place of diffusion, as in pi0 (Black et al., 2024, arXiv 2410.24164):
+a straight path from noise x_0 ~ N(0, 1) to the chunk x_1, x_tau = (1 - tau) x_0 + tau x_1, which needs few steps of
+integration and has no noise schedule. It needs demonstrations alone. Its history has its own past actions, which it
+takes for the expert's, as `naive_rnn` does: a better model of the expert's actions is no cure for that. The history is
+cleared at each reset, as is usual in robotics, so that episodes after the first are no better than it.
+
+It departs from these papers as follows. Networks are small MLPs of standardised observations, not a U-Net or a
+transformer of images. The network predicts the end of the path, E[x_1 | x_tau, history]; the velocity follows from it,
+(x_1 - x_tau) / (1 - tau). Diffusion Policy reads past observations; here past actions are read too, because theta shows
+in how observations answer actions. Steps of a chunk after the end of an episode have no loss; the papers repeat the last
+action. Discrete actions are one-hot vectors in -1 and 1, to which noise flows as it does to numbers; the action is the
+largest of them. The exact flow ends in one-hot vectors with the expert's probabilities, and so this rule draws from them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source, take_steps, trials_of
+from deconfounded.deconf.core.drift import split_episodes
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.sizes import Configuration
+from deconfounded.deconf.equations import masked_mean
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
+from deconfounded.deconf.methods.sequence_bc import train_sequence
+
+PHASES = 4  # cosines of tau that the network reads
+
+
+@dataclass(frozen=True)
+class FlowConfig(Configuration):
+    """Hyperparameters for each seed; batch counts episodes, from which an update draws `steps`."""
+
+    width: int = 64
+    history: int = 16  # past steps that the policy reads
+    ahead: int = 8  # actions of a chunk
+    executed: int = 4  # of these, before the next chunk is drawn
+    integration: int = 8  # steps of Euler's method from noise to a chunk
+    updates: int = 3000
+    batch: int = 64
+    steps: int = 512
+    learning_rate: float = 2e-3
+    device: str = "cpu"
+
+
+class ChunkFlow(nn.Module):
+    """A flow from noise to a chunk of `ahead` actions, given features of a history."""
+
+    def __init__(self, features: int, width: int, ahead: int, scales: Scales, draws: Draws) -> None:
+        super().__init__()
+        self.signature, self.scaler, self.width, self.ahead = scales.signature, scales.label, width, ahead
+        self.chunk = ahead * self.signature.action_features
+        self.embed = Mlp(features, width, width, draws)
+        self.net = Mlp(self.chunk + PHASES + width, width, self.chunk, draws)
+
+    def encode(self, action: Tensor) -> Tensor:
+        """Actions [S, ..., A] -> [S, ..., action_features] of about unit size."""
+        return 2 * self.signature.encode_action(action) - 1 if self.signature.actions else self.scaler(action)
+
+    def decode(self, x: Tensor) -> Tensor:
+        """The reverse of `encode`; continuous actions are clipped to [-1, 1]."""
+        if self.signature.actions:
+            return x.argmax(-1, keepdim=True).float()
+        return self.scaler.inverse(x).clamp(-1, 1)
+
+    def end(self, x: Tensor, tau: Tensor, embedded: Tensor) -> Tensor:
+        """The expected end [S, N, chunk] of paths that are at x [S, N, chunk] at times tau [S, N, 1]."""
+        phases = [(math.pi * k * tau).cos() for k in range(1, PHASES + 1)]
+        return self.net(torch.cat([x, *phases, embedded], -1))
+
+    def loss(self, features: Tensor, chunk: Tensor, mask: Tensor, draws: Draws) -> Tensor:
+        """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A] of steps with a mask.
+
+        features [S, N, F], mask [S, N, ahead].
+        """
+        target = self.encode(chunk).flatten(2)
+        tau, noise = draws.uniform(target.shape[1], 1), draws.normal(*target.shape[1:])
+        error = self.end(torch.lerp(noise, target, tau), tau, self.embed(features)) - target
+        return masked_mean(error.square().unflatten(-1, (self.ahead, -1)).mean(-1).flatten(1), mask.flatten(1))
+
+    def sample(self, features: Tensor, steps: int, draws: Draws) -> Tensor:
+        """Draw chunks [S, N, ahead, A], given features [S, N, F]."""
+        x, embedded = draws.normal(features.shape[1], self.chunk), self.embed(features)
+        for i in range(steps):
+            end = self.end(x, torch.full_like(x[..., :1], i / steps), embedded)
+            x = x + (end - x) / (steps - i)
+        return self.decode(x.unflatten(-1, (self.ahead, -1)))
+
+
+class FlowAgent(LearnedAgent):
+    """A policy of the latest observations and actions of the episode, which draws chunks and executes their beginnings."""
+
+    policy: ChunkFlow  # type: ignore[assignment]
+
+    def __init__(self, policy: ChunkFlow, scales: Scales, history: int, executed: int, integration: int) -> None:
+        super().__init__(policy)  # type: ignore[arg-type]
+        self.scales, self.history, self.executed, self.integration = scales, history, executed, integration
+
+    @classmethod
+    def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "FlowAgent":
+        signature = scales.signature
+        features = signature.obs + shape["history"] * (signature.obs + signature.action_features + 1)
+        policy = ChunkFlow(features, shape["width"], shape["ahead"], scales, draws)
+        return cls(policy, scales, shape["history"], shape["executed"], shape["integration"])
+
+    def shape(self) -> dict[str, Any]:
+        sizes = {"history": self.history, "executed": self.executed, "integration": self.integration}
+        return {"width": self.policy.width, "ahead": self.policy.ahead, **sizes}
+
+    def parts(self) -> dict[str, nn.Module]:
+        return {"policy": self.policy, "scales": self.scales}
+
+    def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+        super().reset(rngs)
+        signature = self.policy.signature
+        width = signature.obs + signature.action_features + 1
+        self._past = torch.zeros(self.seeds, self._n, self.history, width, device=self.device)
+        self._chunk = torch.empty(0)
+        self._left = 0
+
+    def before(self, obs: Tensor, action: Tensor, took_place: Tensor) -> Tensor:
+        """Features [..., O + F + 1] of past steps; zeros where took_place [...] is 0."""
+        took_place = took_place[..., None].float()
+        return torch.cat([self.scales.obs(obs), self.scales.encode(action), took_place], -1) * took_place
+
+    def features(self) -> NDArray[np.float32]:
+        return self._past.flatten(0, 1).flatten(1).cpu().numpy()
+
+    def choose(self, obs: Tensor) -> Tensor:
+        if not self._left:
+            features = torch.cat([self.scales.obs(obs), self._past.flatten(2)], -1)
+            self._chunk, self._left = self.policy.sample(features, self.integration, self._draws), self.executed
+        self._left -= 1
+        return self._chunk[:, :, self.executed - 1 - self._left]
+
+    def remember(self, step: Batch) -> None:
+        new = self.before(step.obs, step.action, step.mask)
+        self._past = torch.cat([new[:, :, None], self._past[:, :, :-1]], 2)
+
+    def loss(self, episodes: Batch, label: Tensor, steps: int | None, draws: Draws) -> Tensor:
+        """The loss [S] of chunks of labels [S, B, T, A] from so many steps of episodes [S, B, T] on; None: from all."""
+        index = episodes.draw_steps(steps, draws)
+        at, length = index % episodes.mask.shape[2], episodes.mask.shape[2]
+        back = torch.arange(1, self.history + 1, device=index.device)
+        ahead = torch.arange(self.policy.ahead, device=index.device)
+        past, then = (
+            (index[..., None] - back).clamp(min=0),
+            (index[..., None] + ahead).clamp(max=label[0, ..., 0].numel() - 1),
+        )
+        rows = [take_steps(x, past.flatten(1)).unflatten(1, past.shape[1:]) for x in (episodes.obs, episodes.action)]
+        before = self.before(*rows, at[..., None] >= back)
+        features = torch.cat([self.scales.obs(take_steps(episodes.obs, index)), before.flatten(2)], -1)
+        chunk, mask = (take_steps(x, then.flatten(1)).unflatten(1, then.shape[1:]) for x in (label, episodes.mask))
+        mask = mask * (at[..., None] + ahead < length) * take_steps(episodes.mask, index)[..., None]
+        return self.policy.loss(features, chunk, mask, draws)
+
+    @torch.no_grad()
+    def held_out_loss(self, batch: Batch) -> Tensor:
+        """The loss [S] on the expert's episodes."""
+        return self.loss(batch, batch.action, None, self._draws)
+
+
+class FlowTrainer:
+    """Trains by flow matching, an update a batch of episodes."""
+
+    def __init__(self, agent: FlowAgent, config: FlowConfig, draws: Draws, monitor: Monitor) -> None:
+        self.agent, self.config, self.draws, self.monitor = agent, config, draws, monitor
+        self.done, self.total = 0, config.updates
+        self.optimizer = Adam([agent.policy], config.learning_rate, config.updates)
+
+    def learn(self, batch: Batch, label: Tensor) -> None:
+        """Take one update."""
+        loss = self.agent.loss(batch, label, self.config.steps, self.draws)
+        self.optimizer.step(loss)
+        self.done += 1
+        self.monitor.update(self.done, self.total, {"imitation": loss.mean().item()}, self.agent)
+
+
+def train(trials: Source, config: FlowConfig, rng: Rngs, monitor: Monitor | None = None) -> FlowAgent:
+    """Clone the expert's trials, which are in as many equal groups as there are generators in rng."""
+    given: list[Draws] = []
+
+    def new_agent(scales: Scales, draws: Draws) -> FlowAgent:
+        given.append(draws)
+        shape = {name: getattr(config, name) for name in ("width", "history", "ahead", "executed", "integration")}
+        return FlowAgent.blank(shape, scales, draws)
+
+    def new_trainer(agent: FlowAgent, steps: int, monitor: Monitor) -> FlowTrainer:
+        return FlowTrainer(agent, config, given[0], monitor)
+
+    episodes = (lambda: split_episodes(trials_of(trials))) if callable(trials) else split_episodes(trials)
+    return train_sequence(episodes, config, rng, new_agent, new_trainer, monitor)
+
+
+@uses(
+    "demonstrations",
+    cost=2,
+    on_control=FlowConfig(),
+    on_bandit=FlowConfig(updates=1500, executed=1, ahead=4, history=32),
+    smoke={"updates": 400},
+    smoke_bandit={"updates": 400},
+)
+def fit(given: Given) -> FlowAgent:
+    """Clone the demonstrations."""
+    return train(given.source, given.config, given.rngs, given.monitor)
