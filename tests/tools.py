@@ -26,6 +26,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "deconfounded_offline": {**OFFLINE, "online_steps": 64},
     "deconfounded_mean": {**FEW, "inference_steps": 64},
     "dagger": {"updates": 2, "rounds": 2, "batch": 4},
+    "dpt": {"updates": 2, "rounds": 2, "batch": 4, "width": 16, "heads": 2},
     "gail": {
         **{"width": 16, "rounds": 2, "envs": 2, "steps": 32},
         **{"epochs": 1, "minibatch": 32, "discriminator_updates": 2},
@@ -37,6 +38,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "palr": {"updates": 2, "batch": 4, "samples": 32},
     "dml_il": {"updates": 4, "batch": 4, "components": 2, "steps": 64},
     "dadp": {"inference_updates": 2, "inference_batch": 4, "inference_steps": 64, "imitation_updates": 2},
+    "flow_bc": {"updates": 2, "batch": 4, "steps": 32},
     "naive_rnn": {"updates": 2, "batch": 4},
     "oracle_bc": {"updates": 3, "batch": 64},
     "blind_bc": {"updates": 3, "batch": 64},

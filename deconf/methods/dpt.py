@@ -150,7 +150,7 @@ class DptAgent(TransformerAgent):
 
 
 def draw_queries(mask: Tensor, longest: int, config: DptConfig, draws: Draws) -> tuple[Tensor, Tensor]:
-    """Steps of queries [S, B, K] in trials of mask [S, B, T], and how many transitions each reads, `longest` at most."""
+    """Steps of queries [S, B, K] in trials of mask [S, B, T], and how many transitions each reads, up to `longest`."""
     steps = mask.sum(-1, keepdim=True).long()
     readable, (where, first, second) = (
         steps.clamp(max=longest),

@@ -1,19 +1,19 @@
 """Behavioural cloning as robotics trains it today: flow matching over chunks of actions, given a short history.
 
-After Diffusion Policy (Chi et al., 2023, arXiv 2303.04137), which draws a chunk of actions by denoising and executes its
-beginning before it draws the next (receding horizon); chunks as in ACT (Zhao et al., 2023, arXiv 2304.13705); and flow
-matching (Lipman et al., 2023, arXiv 2210.02747) in place of diffusion, as in pi0 (Black et al., 2024, arXiv 2410.24164):
-a straight path from noise x_0 ~ N(0, 1) to the chunk x_1, x_tau = (1 - tau) x_0 + tau x_1, which needs few steps of
-integration and has no noise schedule. It needs demonstrations alone. Its history has its own past actions, which it
-takes for the expert's, as `naive_rnn` does: a better model of the expert's actions is no cure for that. The history is
-cleared at each reset, as is usual in robotics, so that episodes after the first are no better than it.
+After Diffusion Policy (Chi et al., 2023, arXiv 2303.04137), which draws a chunk of actions by denoising and executes
+its beginning before it draws the next (receding horizon); chunks are ACT's too (Zhao et al., 2023, arXiv 2304.13705).
+Flow matching (Lipman et al., 2023, arXiv 2210.02747) takes the place of diffusion, as in pi0 (Black et al., 2024, arXiv
+2410.24164): paths are straight, from noise x_0 ~ N(0, 1) to a chunk x_1, with x_tau = (1 - tau) x_0 + tau x_1; there is
+no noise schedule, and few steps of integration are enough. It knows demonstrations alone. Its history has its own past
+actions, which it takes for the expert's, as `naive_rnn` does: to model the expert's actions better is no cure for that.
+The history is cleared at each reset, as is usual in robotics, so that later episodes are no better than the first.
 
 It departs from these papers as follows. Networks are small MLPs of standardised observations, not a U-Net or a
 transformer of images. The network predicts the end of the path, E[x_1 | x_tau, history]; the velocity follows from it,
-(x_1 - x_tau) / (1 - tau). Diffusion Policy reads past observations; here past actions are read too, because theta shows
-in how observations answer actions. Steps of a chunk after the end of an episode have no loss; the papers repeat the last
-action. Discrete actions are one-hot vectors in -1 and 1, to which noise flows as it does to numbers; the action is the
-largest of them. The exact flow ends in one-hot vectors with the expert's probabilities, and so this rule draws from them.
+(E[x_1] - x_tau) / (1 - tau). Diffusion Policy reads past observations; here past actions are read too, because theta
+shows in how observations answer actions. Steps of a chunk after the end of an episode have no loss; the papers repeat
+the last action. Discrete actions are vectors of -1 and one 1, to which noise flows as to numbers, and the action is the
+largest number's: where the flow is exact, it ends in such vectors, with the expert's probabilities.
 """
 
 import math
@@ -49,8 +49,8 @@ class FlowConfig(Configuration):
     width: int = 64
     history: int = 16  # past steps that the policy reads
     ahead: int = 8  # actions of a chunk
-    executed: int = 4  # of these, before the next chunk is drawn
-    integration: int = 8  # steps of Euler's method from noise to a chunk
+    executed: int = 1  # of these, before the next chunk is drawn
+    integration: int = 5  # steps of the midpoint method from noise to a chunk
     updates: int = 3000
     batch: int = 64
     steps: int = 512
@@ -84,7 +84,7 @@ class ChunkFlow(nn.Module):
         return self.net(torch.cat([x, *phases, embedded], -1))
 
     def loss(self, features: Tensor, chunk: Tensor, mask: Tensor, draws: Draws) -> Tensor:
-        """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A] of steps with a mask.
+        """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A].
 
         features [S, N, F], mask [S, N, ahead].
         """
@@ -96,14 +96,16 @@ class ChunkFlow(nn.Module):
     def sample(self, features: Tensor, steps: int, draws: Draws) -> Tensor:
         """Draw chunks [S, N, ahead, A], given features [S, N, F]."""
         x, embedded = draws.normal(features.shape[1], self.chunk), self.embed(features)
-        for i in range(steps):
-            end = self.end(x, torch.full_like(x[..., :1], i / steps), embedded)
-            x = x + (end - x) / (steps - i)
+        tau = torch.zeros_like(x[..., :1])
+        for _ in range(steps):
+            middle = x + (self.end(x, tau, embedded) - x) / (1 - tau) / (2 * steps)
+            half = tau + 1 / (2 * steps)
+            x, tau = x + (self.end(middle, half, embedded) - middle) / (1 - half) / steps, tau + 1 / steps
         return self.decode(x.unflatten(-1, (self.ahead, -1)))
 
 
 class FlowAgent(LearnedAgent):
-    """A policy of the latest observations and actions of the episode, which draws chunks and executes their beginnings."""
+    """A policy of the latest steps of the episode, which draws chunks of actions and executes their beginnings."""
 
     policy: ChunkFlow  # type: ignore[assignment]
 

@@ -41,7 +41,7 @@ from tests.tools import tiny_preset
 CONTROL = "slippery_cartpole"
 NEW = (
     *("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr"),
-    *("dml_il", "dadp"),
+    *("dml_il", "dadp", "dpt", "flow_bc"),
 )
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 
@@ -69,9 +69,10 @@ def test_tiers() -> None:
     """Tiers follow from declared data: rma alone sees theta."""
     tiers = {name: METHODS[name].tier for name in NEW}
     assert tiers == {
-        **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr", "dml_il", "dadp"), "1"),
+        **dict.fromkeys(("naive_transformer", "naive_obs", "naive_dropout", "palr", "dml_il", "dadp", "flow_bc"), "1"),
         **dict.fromkeys(("deconfounded_mean", "gail"), "2"),
         "rma": "sees theta",
+        "dpt": "3",
     }
     assert not set(DEFAULT) & set(NEW)
 

@@ -26,6 +26,8 @@ from deconfounded.deconf.methods import (
     deconfounded_mean,
     deconfounded_offline,
     dml_il,
+    dpt,
+    flow_bc,
     gail,
     naive_obs,
     naive_rnn,
@@ -147,7 +149,7 @@ class TestData:
         "method",
         [
             *("deconfounded", "deconfounded_offline", "deconfounded_mean", "gail"),
-            *("naive_rnn", "naive_obs", "naive_transformer", "palr", "dml_il", "dadp", "dagger"),
+            *("naive_rnn", "naive_obs", "naive_transformer", "palr", "dml_il", "dadp", "flow_bc", "dagger", "dpt"),
         ],
     )
     def test_methods_are_handed_no_theta(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,7 +167,9 @@ class TestData:
             "palr": palr,
             "dml_il": dml_il,
             "dadp": dadp,
+            "flow_bc": flow_bc,
             "dagger": dagger,
+            "dpt": dpt,
         }
         handed: list[Any] = []
 
@@ -180,14 +184,15 @@ class TestData:
         context = Context(task, tiny_preset(), [0])
         with pytest.raises(KeyboardInterrupt):
             fit(context, method)
-        if method != "dagger":
+        if method not in ("dagger", "dpt"):
             np.testing.assert_array_equal(handed[0].obs, Context(task, tiny_preset(), [0]).demonstrations.obs)
             assert handed[0].obs.shape[-1] == len(task.observation)
-        if method not in ("deconfounded", "deconfounded_mean", "dagger"):
+        if method not in ("deconfounded", "deconfounded_mean", "dagger", "dpt"):
             return
-        roll_out = handed[0] if method == "dagger" else handed[1]
+        asks = method in ("dagger", "dpt")
+        roll_out = handed[0] if asks else handed[1]
         given = roll_out(None)
-        trials = given[0] if method == "dagger" else given
+        trials = given[0] if asks else given
         env = envs.BatchEnv(task, 4)
         seed = stream(EXPLORATION, int(context.rngs[0].integers(2**31)))
         plain = run_trials(env, RandomAgent(task.action_space), task.episodes, [seed]).trials

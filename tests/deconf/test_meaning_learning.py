@@ -18,6 +18,8 @@ from deconfounded.deconf.methods import dagger as dagger_method
 from deconfounded.deconf.methods import rma
 from deconfounded.deconf.methods.dagger import DaggerAgent
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explorer
+from deconfounded.deconf.methods.dpt import DptAgent
+from deconfounded.deconf.methods.flow_bc import FlowAgent
 from deconfounded.deconf.methods.naive_obs import ObsAgent
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
@@ -83,12 +85,16 @@ def losses(batch: Batch) -> dict[str, Loss]:
     recurrent, blind = RecurrentAgent.new(8, scales, draws()), ObsAgent.new(8, scales, draws())
     transformer = TransformerAgent.new(shape, scales, draws())
     dagger = DaggerAgent.new(16, 3, False, scales, draws())
+    dpt = DptAgent.blank({**shape, "forgets": False}, scales, draws())
+    flow = FlowAgent.blank({"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}, scales, draws())
     adapter = rma.Adapter(8, 1, scales, draws())
     student = rma.RmaAgent(adapter, recurrent.policy)
     found: dict[str, Loss] = {
         "naive_rnn": lambda given: recurrent.loss(given, given.action, recurrent.memory.start(4))[0],
         "naive_obs": lambda given: blind.loss(given, given.action, blind.memory.start(4))[0],
         "naive_transformer": lambda given: transformer.held_out_loss(given),
+        "dpt": lambda given: dpt.loss(given, given.action),
+        "flow_bc": lambda given: flow.loss(given, given.action, None, draws()),
         "dagger": lambda given: dagger.loss(given, given.action, None, draws()),
         "rma": lambda given: student.loss(given, given.action, adapter.start(4))[0],
     }
