@@ -13,7 +13,7 @@ as long, and scored .11 on `swapped_lander`, not .9.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -116,44 +116,38 @@ class DaggerAgent(LearnedAgent):
         return self.loss(batch, batch.action, None, self._draws)
 
 
-class Rounds(Protocol):
-    """The part of a configuration that says how queries and updates take turns."""
-
-    rounds: int
-    updates: int
-    drifts: bool
-    device: str
-
-
-def labelled(query: Query, behaviour: Agent | None, config: Rounds, seeds: int) -> tuple[Signature, Batch, Tensor]:
+def labelled(
+    query: Query, behaviour: Agent | None, seeds: int, drifts: bool, device: str
+) -> tuple[Signature, Batch, Tensor]:
     """Roll-outs, and labels [S, B, T, A] aligned with their actions; where theta drifts, each episode is a trial."""
     trials, labels = query(behaviour)
-    unit = split_episodes if config.drifts else lambda trials: trials
+    unit = split_episodes if drifts else lambda trials: trials
     relabelled = Trials(trials.obs, labels, trials.mask, trials.actions)
-    batch, label = (Batch.of(unit(x), seeds, config.device) for x in (trials, relabelled))
+    batch, label = (Batch.of(unit(x), seeds, device) for x in (trials, relabelled))
     return Signature.of(trials), batch, label.action
 
 
-def by_round(config: Rounds) -> list[int]:
+def by_round(updates: int, rounds: int) -> list[int]:
     """Updates of each round: later rounds, with more labels, get more of them."""
-    share = config.updates / (config.rounds * (config.rounds + 1) / 2)
-    return [max(1, round(share * i)) for i in range(1, config.rounds + 1)]
+    share = updates / (rounds * (rounds + 1) / 2)
+    return [max(1, round(share * i)) for i in range(1, rounds + 1)]
 
 
 def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None = None) -> DaggerAgent:
     """In rounds, label roll-outs and train on all labels so far."""
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
-    signature, data, label = labelled(query, None, config, len(rngs))
+    asked = len(rngs), config.drifts, config.device
+    signature, data, label = labelled(query, None, *asked)
     agent = DaggerAgent.new(
         config.width, config.latent, config.drifts, Scales(signature, data, label, data.mask), draws
     )
-    updates = by_round(config)
+    updates = by_round(config.updates, config.rounds)
     optimizer, done = Adam([agent.memory, agent.policy], config.learning_rate, sum(updates)), 0
     agent.memory.whiten.updates_left = sum(updates) // 2  # moments change with each round's roll-outs
     for i in range(config.rounds):
         if i > 0:
-            _, more, new = labelled(query, agent, config, len(rngs))
+            _, more, new = labelled(query, agent, *asked)
             data, label = data.joined(more), torch.cat([label, new], 1)
         for _ in range(updates[i]):
             index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)

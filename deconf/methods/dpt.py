@@ -152,10 +152,8 @@ class DptAgent(TransformerAgent):
 def draw_queries(mask: Tensor, longest: int, config: DptConfig, draws: Draws) -> tuple[Tensor, Tensor]:
     """Steps of queries [S, B, K] in trials of mask [S, B, T], and how many transitions each reads, up to `longest`."""
     steps = mask.sum(-1, keepdim=True).long()
-    readable, (where, first, second) = (
-        steps.clamp(max=longest),
-        draws.uniform(3, mask.shape[1], config.queries).unbind(1),
-    )
+    readable = steps.clamp(max=longest)
+    where, first, second = draws.uniform(3, mask.shape[1], config.queries).unbind(1)
     anywhere, at_end = (first * steps).long().clamp(max=steps - 1), (first * readable).long().clamp(max=readable - 1)
     seen = (second * (readable + 1)).long().clamp(max=readable)
     return torch.where(where < config.anywhere, torch.stack([anywhere, seen]), at_end).unbind(0)  # type: ignore[return-value]
@@ -165,26 +163,24 @@ def train(query: Query, config: DptConfig, rng: Rngs, monitor: Monitor | None = 
     """In rounds, label roll-outs and train on all labels so far."""
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
-    signature, data, label = labelled(query, None, config, len(rngs))
+    asked = len(rngs), config.drifts, config.device
+    signature, data, label = labelled(query, None, *asked)
     shape = {"width": config.width, "layers": config.layers, "heads": config.heads, "forgets": config.drifts}
     scales = Scales(signature, data, label, data.mask)
     agent = DptAgent.blank({**shape, "window": data.mask.shape[2]}, scales, draws)
-    updates, begin = by_round(config), 0
-    optimizer, done = Adam([agent.net, agent.policy], config.learning_rate, sum(updates)), 0
+    updates = by_round(config.updates, config.rounds)
+    optimizer, begin, done = Adam([agent.net, agent.policy], config.learning_rate, sum(updates)), 0, 0
     checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=optimizer, draws=draws)
     if before := checkpoint.load():
         begin, data, label = before["round"], Batch(*before["data"]), before["label"]
         done = sum(updates[:begin])
     for i in range(begin, config.rounds):
         if i > 0:
-            _, more, new = labelled(query, agent, config, len(rngs))
+            _, more, new = labelled(query, agent, *asked)
             data, label = data.joined(more), torch.cat([label, new], 1)
         for _ in range(updates[i]):
-            index, longest = (
-                draws.integers(len(data), config.batch),
-                data.beginnings(done, config.shortest).mask.shape[2],
-            )
-            own = data.trials(index)
+            longest = data.beginnings(done, config.shortest).mask.shape[2]
+            own = data.trials(index := draws.integers(len(data), config.batch))
             where = draw_queries(own.mask, longest, config, draws)
             loss = agent.query_loss(own, take(label, index), own[:, :, :longest], *where)
             optimizer.step(loss)

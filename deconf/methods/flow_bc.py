@@ -11,9 +11,10 @@ The history is cleared at each reset, as is usual in robotics, so that later epi
 It departs from these papers as follows. Networks are small MLPs of standardised observations, not a U-Net or a
 transformer of images. The network predicts the end of the path, E[x_1 | x_tau, history]; the velocity follows from it,
 (E[x_1] - x_tau) / (1 - tau). Diffusion Policy reads past observations; here past actions are read too, because theta
-shows in how observations answer actions. Steps of a chunk after the end of an episode have no loss; the papers repeat
-the last action. Discrete actions are vectors of -1 and one 1, to which noise flows as to numbers, and the action is the
-largest number's: where the flow is exact, it ends in such vectors, with the expert's probabilities.
+shows in how observations answer actions. One action of a chunk is executed, not about half of them: these tasks have
+process noise and few steps a second, and an action that ignores the latest observation costs most of the score.
+Discrete actions are vectors of -1 and one 1, to which noise flows as to numbers, and the action is the largest
+number's: where the flow is exact, it ends in such vectors, with the expert's probabilities.
 """
 
 import math
@@ -28,7 +29,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source, take_steps, trials_of
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source, take, take_steps, trials_of
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
@@ -86,12 +87,12 @@ class ChunkFlow(nn.Module):
     def loss(self, features: Tensor, chunk: Tensor, mask: Tensor, draws: Draws) -> Tensor:
         """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A].
 
-        features [S, N, F], mask [S, N, ahead].
+        features [S, N, F], mask [S, N].
         """
         target = self.encode(chunk).flatten(2)
         tau, noise = draws.uniform(target.shape[1], 1), draws.normal(*target.shape[1:])
         error = self.end(torch.lerp(noise, target, tau), tau, self.embed(features)) - target
-        return masked_mean(error.square().unflatten(-1, (self.ahead, -1)).mean(-1).flatten(1), mask.flatten(1))
+        return masked_mean(error.square().mean(-1), mask)
 
     def sample(self, features: Tensor, steps: int, draws: Draws) -> Tensor:
         """Draw chunks [S, N, ahead, A], given features [S, N, F]."""
@@ -156,20 +157,18 @@ class FlowAgent(LearnedAgent):
 
     def loss(self, episodes: Batch, label: Tensor, steps: int | None, draws: Draws) -> Tensor:
         """The loss [S] of chunks of labels [S, B, T, A] from so many steps of episodes [S, B, T] on; None: from all."""
-        index = episodes.draw_steps(steps, draws)
-        at, length = index % episodes.mask.shape[2], episodes.mask.shape[2]
-        back = torch.arange(1, self.history + 1, device=index.device)
-        ahead = torch.arange(self.policy.ahead, device=index.device)
-        past, then = (
-            (index[..., None] - back).clamp(min=0),
-            (index[..., None] + ahead).clamp(max=label[0, ..., 0].numel() - 1),
-        )
-        rows = [take_steps(x, past.flatten(1)).unflatten(1, past.shape[1:]) for x in (episodes.obs, episodes.action)]
-        before = self.before(*rows, at[..., None] >= back)
+        index, length = episodes.draw_steps(steps, draws), episodes.mask.shape[2]
+        back, ahead = (torch.arange(n, device=index.device) for n in (self.history, self.policy.ahead))
+        past = index[..., None] - 1 - back
+        earlier = [take_steps(x, past.clamp(min=0).flatten(1)) for x in (episodes.obs, episodes.action)]
+        obs, action = (x.unflatten(1, past.shape[1:]) for x in earlier)
+        before = self.before(obs, action, (index % length)[..., None] > back)
         features = torch.cat([self.scales.obs(take_steps(episodes.obs, index)), before.flatten(2)], -1)
-        chunk, mask = (take_steps(x, then.flatten(1)).unflatten(1, then.shape[1:]) for x in (label, episodes.mask))
-        mask = mask * (at[..., None] + ahead < length) * take_steps(episodes.mask, index)[..., None]
-        return self.policy.loss(features, chunk, mask, draws)
+        episode = index // length
+        end = episode * length + take(episodes.mask.sum(2).long(), episode) - 1
+        then = (index[..., None] + ahead).minimum(end[..., None]).clamp(min=0)  # the last action is repeated
+        chunk = take_steps(label, then.flatten(1)).unflatten(1, then.shape[1:])
+        return self.policy.loss(features, chunk, take_steps(episodes.mask, index), draws)
 
     @torch.no_grad()
     def held_out_loss(self, batch: Batch) -> Tensor:

@@ -106,15 +106,18 @@ class TestFlow:
         assert same == [True, True, False]
 
     def test_the_history_of_training_is_that_of_deployment(self) -> None:
-        """Features of each step of an episode: the observation, and the three steps before it."""
+        """Features of each step of an episode: the observation, and the three steps before it.
+
+        Its chunk is of this action and the next; at the end of an episode the last is repeated.
+        """
         draws: Draws = streams(2)
         batch = random_batch(draws, 2, 6)
         shape = {"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}
         agent, given = FlowAgent.blank(shape, scales(batch), draws), []
         loss = agent.policy.loss
-        agent.policy.loss = lambda features, *rest: (given.append((features, *rest[:2])), loss(features, *rest))[1]  # type: ignore[method-assign]
+        agent.policy.loss = lambda features, *rest: (given.append((features, rest[0])), loss(features, *rest))[1]  # type: ignore[method-assign]
         agent.loss(batch, batch.action, None, draws)
-        features, chunk, mask = (x.unflatten(1, (2, 6)) for x in given[0])
+        features, chunk = (x.unflatten(1, (2, 6)) for x in given[0])
         agent.begin(4)
         agent.reset([np.random.default_rng(i) for i in range(2)])
         for t in range(6):
@@ -122,4 +125,4 @@ class TestFlow:
             torch.testing.assert_close(features[:, :, t], now)
             agent.remember(batch[:, :, t])
         assert torch.equal(chunk[:, :, :5, 1], batch.action[:, :, 1:])
-        assert mask[..., 1].tolist() == [[[1, 1, 1, 1, 1, 0]] * 2] * 2
+        assert torch.equal(chunk[:, :, 5, 1], batch.action[:, :, 5])
