@@ -11,10 +11,10 @@ The history is cleared at each reset, as is usual in robotics, so that later epi
 It departs from these papers as follows. Networks are small MLPs of standardised observations, not a U-Net or a
 transformer of images. The network predicts the end of the path, E[x_1 | x_tau, history]; the velocity follows from it,
 (E[x_1] - x_tau) / (1 - tau). Diffusion Policy reads past observations; here past actions are read too, because theta
-shows in how observations answer actions. One action of a chunk is executed, not about half of them: these tasks have
-process noise and few steps a second, and an action that ignores the latest observation costs most of the score.
-Discrete actions are vectors of -1 and one 1, to which noise flows as to numbers, and the action is the largest
-number's: where the flow is exact, it ends in such vectors, with the expert's probabilities.
+shows in how observations answer actions. One action of a chunk is executed, not about half of them: the tasks have
+process noise, and actions that ignore it cost most of the score. Discrete actions are vectors of -1 and one 1, to
+which noise flows as to numbers, and the action is the largest number's: where the flow is exact, it ends in such
+vectors, with the expert's probabilities.
 """
 
 import math
