@@ -80,9 +80,12 @@ class ChunkFlow(nn.Module):
         return self.scaler.inverse(x).clamp(-1, 1)
 
     def end(self, x: Tensor, tau: Tensor, embedded: Tensor) -> Tensor:
-        """The expected end [S, N, chunk] of paths that are at x [S, N, chunk] at times tau [S, N, 1]."""
+        """The expected end [S, N, chunk] of paths that are at x [S, N, chunk] at times tau [S, N, 1].
+
+        The network learns what differs from the expectation for chunks of unit size (Karras et al., 2022).
+        """
         phases = [(math.pi * k * tau).cos() for k in range(1, PHASES + 1)]
-        return self.net(torch.cat([x, *phases, embedded], -1))
+        return tau / (tau.square() + (1 - tau).square()) * x + self.net(torch.cat([x, *phases, embedded], -1))
 
     def loss(self, features: Tensor, chunk: Tensor, mask: Tensor, draws: Draws) -> Tensor:
         """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A].
