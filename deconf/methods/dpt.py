@@ -13,7 +13,8 @@ change of the observation in place of the next one. The query comes last, not fi
 values are computed once. Contexts are in order of time, with rotary positions; the authors shuffle theirs. The paper
 collects contexts and queries once, before training, queries from a distribution that covers the states that matter.
 Random actions do not come near these states on control tasks. So roll-outs are collected in rounds, the first with
-random actions, later ones with the agent's own.
+random actions, later ones with the agent's own; and half of the queries stand where their context ends, as in
+deployment. Where theta switches within an episode, the other half have labels of another theta than their context.
 """
 
 from collections.abc import Sequence
@@ -47,10 +48,10 @@ class DptConfig(Configuration):
     heads: int = 4
     rounds: int = 16
     updates: int = 800  # in all; later rounds, with more labels, get more of them
-    batch: int = 16  # trials
+    batch: int = 8  # trials
     shortest: float = 1 / 16  # least share of these trials that is their context: see Batch.beginnings
-    queries: int = 32  # of each context
-    anywhere: float = 1.0  # share of queries from anywhere in the trial; others are where their context ends
+    queries: int = 64  # of each context
+    anywhere: float = 0.5  # share of queries from anywhere in the trial; others are where their context ends
     learning_rate: float = 2e-3
     drifts: bool = False  # theta changes between episodes: the context is emptied at each
     device: str = "cpu"
@@ -194,7 +195,7 @@ def train(query: Query, config: DptConfig, rng: Rngs, monitor: Monitor | None = 
     "queries",
     cost=10,
     on_control=DptConfig(),
-    on_bandit=DptConfig(width=32, rounds=4, batch=64, shortest=1.0),
+    on_bandit=DptConfig(width=32, rounds=4, batch=32, shortest=1.0),
     smoke={"updates": 60, "rounds": 4},
     smoke_bandit={"updates": 200, "rounds": 4},
 )
