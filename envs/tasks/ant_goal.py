@@ -23,56 +23,30 @@ import numpy as np
 from gymnasium import spaces
 
 from deconfounded.envs import render
-from deconfounded.envs.physics import Edit, MujocoTask
-from deconfounded.envs.task import Array, Latent, Renderer, Streams
-from deconfounded.envs.tasks import gymnasium_body
+from deconfounded.envs.physics import Edit
+from deconfounded.envs.task import Array, Latent, Renderer
+from deconfounded.envs.tasks.ant import BODY, LEGS, Ant
 
 FAR = 1.0  # of goals, m
-STIFF, DAMPED = 150.0, 20.0  # of joints, N m/rad and N m s/rad
 BLUR = 1.6  # of bearings
-ANKLES = (1, -1, -1, 1)  # bent by, standing, rad
-LEGS = {f"{part}_{i + 1}": angle for i, bent in enumerate(ANKLES) for part, angle in (("hip", 0), ("ankle", bent))}
-ROOT = {"x": (-20, 20), "y": (-20, 20), "z": (-2, 5), **{f"rotation_{axis}": (-1, 1) for axis in "wxyz"}}
-MOVES = {**{f"{axis}_velocity": (-20, 20) for axis in "xyz"}, **{f"{axis}_turn": (-50, 50) for axis in "xyz"}}
 
 
-class AntGoal(MujocoTask):
-    """Joints root (free), and hip and ankle of each of four legs."""
+class AntGoal(Ant):
+    """The ant with bearings of its goal."""
 
     name = "ant_goal"
     latents = (Latent("goal_x", "m", -FAR, FAR), Latent("goal_y", "m", -FAR, FAR))
     horizon = 100
-    substeps = 4
     readings = 3
     moves_state = False
     expert_noise = 0.05
     controls = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([0.5, 0.35] * 4)  # rad; fourth leg first
     process_noise = {"root": (0, 0, 0.05, 0.15), **{joint: (0, 0.5) for joint in LEGS}}
     action_space = spaces.Box(-1.0, 1.0, (8,), np.float32)
-    observation = {
-        **{**ROOT, **{joint: (-3, 3) for joint in LEGS}, **MOVES},
-        **{f"{joint}_velocity": (-60, 60) for joint in LEGS},
-        **{"goal_distance": (-15, 30), "goal_cos": (-15, 15), "goal_sin": (-15, 15)},
-    }
-
-    def spec(self) -> mujoco.MjSpec:
-        """Gymnasium's ant with position actuators."""
-        spec = gymnasium_body.load("ant", 0.015)
-        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        for actuator in spec.actuators:
-            actuator.set_to_position(kp=STIFF, kv=DAMPED)
-            actuator.gear[0], actuator.ctrllimited = 1, False
-        spec.worldbody.add_camera(name="view", pos=[0, -3, 3], quat=[0.9239, 0.3827, 0, 0])
-        return spec
+    observation = {**BODY, "goal_distance": (-15, 30), "goal_cos": (-15, 15), "goal_sin": (-15, 15)}
 
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         """No change: theta affects no state."""
-
-    def init_state(self, rng: Streams) -> Array:
-        x, y, *bend = rng.uniform(np.full(2 + len(LEGS), -0.05), 0.05)
-        place = np.stack([x, y, np.full(len(x), 0.55), np.ones(len(x)), *np.zeros((3, len(x)))], -1)
-        legs = {joint: (angle + bent, 0) for (joint, angle), bent in zip(LEGS.items(), bend, strict=True)}
-        return self.state(root=(place, 0), **legs)
 
     def _bearings(self, state: Array, theta: Array) -> Array:
         """Distance of the goal, m, and cosine and sine of its direction [..., 3]."""
@@ -89,9 +63,7 @@ class AntGoal(MujocoTask):
         return -0.5 * np.square(off).sum(-1) - 3 * np.log(BLUR * np.sqrt(2 * np.pi))
 
     def observe(self, state: Array) -> Array:
-        angles, rates = ([read(state, joint) for joint in LEGS] for read in (self.qpos, self.qvel))
-        root = (self.qpos(state, "root"), np.stack(angles, -1), self.qvel(state, "root"), np.stack(rates, -1))
-        return np.concatenate([*root, state[..., -3:]], -1)
+        return np.concatenate([super().observe(state), state[..., -3:]], -1)
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
         distance = self._bearings(next_state, theta)[..., 0]
