@@ -1,9 +1,9 @@
 """An ant, lame in a hidden leg or several, has to keep up with a mark that moves along a road at a set pace.
 
-Tier 2. A hip turns by its command times its motor's strength. Legs of unequal strength turn the ant aside, weak ones let
-it fall behind: strides have to be longer or shorter in advance, as steering by heading and distance is soft. Process
-noise shakes the joints and hides in every step how far a hip follows. A clone takes its own commands, long for a weak
-leg, for signs of the strengths.
+Tier 2. A hip turns by its command times its motor's strength. Legs of unequal strength turn the ant aside, weak ones
+let it fall behind: commands have to be larger or smaller in advance, as the expert's steering by heading and distance
+is soft. Process noise shakes the joints, and hides in every step how far a hip follows. A clone takes its own commands,
+large ones for a weak leg, for signs of the strengths.
 
 Latents: strength_1 to strength_4, of the hips' motors of front left, rear left, rear right and front right leg, in
 units of the nominal one, log-uniform: a motor's torque is 150 (strength u - q) - 20 q' N m, u its command and q the
@@ -18,6 +18,7 @@ the mark. An episode is 120 steps of .06 s, and ends 1.5 m off the mark, or with
 import mujoco
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from deconfounded.envs import render
 from deconfounded.envs.physics import Edit
@@ -51,6 +52,14 @@ class LameAnt(Ant):
         **{name: bounds for name, bounds in BODY.items() if name not in "xy"},
     }
 
+    def spec(self) -> mujoco.MjSpec:
+        """The ant, with a camera that goes along."""
+        spec = super().spec()
+        spec.delete(spec.camera("view"))
+        camera = spec.camera("track")
+        camera.name, camera.pos, camera.alt.xyaxes = "view", [0, -3.6, 2.6], [1, 0, 0, 0, 0.6, 0.8]
+        return spec
+
     def apply_latent(self, edit: Edit, theta: Array) -> None:
         for i, strength in enumerate(theta):
             edit.actuator_gain(f"hip_{i + 1}", float(strength))
@@ -80,3 +89,19 @@ class LameAnt(Ant):
 
     def terminated(self, state: Array) -> Mask:
         return (np.linalg.norm(self._off(state), axis=-1) > LOST) | (upward(self.qpos(state, "root")[..., 3:]) < 0)
+
+    def renderer(self, theta: Array) -> Renderer:
+        """A picture in which a red disc is the mark."""
+        spec = self.spec()
+        self.decorate(spec)
+        render.chequer(spec, "MatPlane")
+        disc, place = mujoco.mjtGeom.mjGEOM_CYLINDER, [0, 0, 0.002]
+        spec.worldbody.add_site(name="mark", type=disc, size=[0.3, 0.002, 0], pos=place, rgba=[0.9, 0.3, 0.2, 1])
+        model = self.edited(spec.compile(), theta)
+        mark, draw_model = model.site("mark"), render.MujocoRenderer(model)
+
+        def draw(state: Array, action: Array) -> NDArray[np.uint8]:
+            mark.pos[0] = PACE * state[0]
+            return draw_model(state, action)
+
+        return draw
