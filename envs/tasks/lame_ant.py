@@ -7,12 +7,13 @@ large ones for a weak leg, for signs of the strengths.
 
 Latents: strength_1 to strength_4, of the hips' motors of front left, rear left, rear right and front right leg, in
 units of the nominal one, log-uniform: a motor's torque is 150 (strength u - q) - 20 q' N m, u its command and q the
-angle, rad. Noise a step: std .15 m/s and .4 rad/s of the torso, 1 rad/s of hips and .5 rad/s of ankles, none of
-positions.
+angle, rad. Noise a step: std .01 m, .015 rad, .15 m/s and .4 rad/s on each axis of the torso, .06 rad and 1 rad/s of
+hips, .01 rad and .5 rad/s of ankles.
 
-Action: commands to hips, rad, and to ankles, in units of .35 rad, lower if positive. The expert trots: its ten-step
-cycle is observed as a phase, which theta does not touch. Reward: .7 exp(-(d / .25)^2 / 2) + .3 exp(-d / .5), d m from
-the mark. An episode is 120 steps of .06 s, and ends 1.5 m off the mark, or with the ant on its back.
+Action: commands to hips, rad, and to ankles, in units of .35 rad, lower if positive. The expert trots, two legs across
+at a time: its cycle of ten steps is observed as a phase, which depends on time alone. Reward: .7 exp(-(d / .25)^2 / 2)
++ .3 exp(-d / .5), d m from the mark. An episode is 120 steps of .06 s, and ends 1.5 m off the mark, or with the ant on
+its back.
 """
 
 import mujoco
@@ -38,7 +39,7 @@ class LameAnt(Ant):
     """Walks along x."""
 
     name = "lame_ant"
-    latents = tuple(Latent(f"strength_{i}", "", 0.4, 2.4, "loguniform") for i in range(1, 5))
+    latents = tuple(Latent(f"strength_{i}", "", 0.5, 2.0, "loguniform") for i in range(1, 5))
     horizon = 120
     expert_noise = 0.02
     controls = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([1, 0.35, 1, 0.35, 1, -0.35, 1, -0.35])  # rad
