@@ -11,9 +11,9 @@ angle, rad. Noise a step: std .01 m, .015 rad, .15 m/s and .4 rad/s on each axis
 hips, .01 rad and .5 rad/s of ankles.
 
 Action: commands to hips, rad, and to ankles, in units of .35 rad, lower if positive. The expert trots, two legs across
-at a time: its cycle of ten steps is observed as a phase, which depends on time alone. Reward: .7 exp(-(d / .25)^2 / 2)
-+ .3 exp(-d / .5), d m from the mark. An episode is 120 steps of .06 s, and ends 1.5 m off the mark, or with the ant on
-its back.
+at a time: its cycle of ten steps is observed as a phase, which depends on time alone. An episode is 120 steps of .06 s,
+and ends 1.5 m off the mark, or with the ant on its back. Reward: .7 exp(-(d / .25)^2 / 2) + .3 exp(-d / .5), d m from
+the mark.
 """
 
 import mujoco
@@ -36,7 +36,7 @@ DIAGONAL = np.array((np.pi, 0, np.pi, 0))  # rad of the cycle
 
 
 class LameAnt(Ant):
-    """Walks along x."""
+    """The ant walks along x, beside it the mark, which is no body."""
 
     name = "lame_ant"
     latents = tuple(Latent(f"strength_{i}", "", 0.5, 2.0, "loguniform") for i in range(1, 5))
