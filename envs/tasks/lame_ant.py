@@ -39,7 +39,7 @@ class LameAnt(Ant):
     """The ant walks along x, beside it the mark, which is no body."""
 
     name = "lame_ant"
-    latents = tuple(Latent(f"strength_{i}", "", 0.5, 2.0, "loguniform") for i in range(1, 5))
+    latents = tuple(Latent(f"strength_{i}", "", 0.4, 2.4, "loguniform") for i in range(1, 5))
     horizon = 120
     expert_noise = 0.02
     controls = np.array([0, 0.9, 0, 0.9, 0, -0.9, 0, -0.9]), np.array([1, 0.35, 1, 0.35, 1, -0.35, 1, -0.35])  # rad
