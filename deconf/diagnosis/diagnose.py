@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.diagnosis import fits
 from deconfounded.deconf.diagnosis.held_out import Report
 from deconfounded.deconf.diagnosis.judgement import Diagnosis, judge
 from deconfounded.deconf.diagnosis.latent import in_range
@@ -15,7 +16,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 4  # raised when figures of the same trials change
+VERSION = 5  # raised when figures of the same trials change
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,12 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
             raise InputError(
                 f"{len(data)} trial{'s' * (len(data) > 1)}{kind} given; at least {config.least} are needed, each"
                 " under a theta of its own, so that some can be held out"
+            )
+        copied = sum(len(same) - 1 for same in fits.copies(data)[0])
+        if len(data) - copied < config.least:
+            raise InputError(
+                f"{len(data)} trials{kind} given, of which {copied} repeat{'s' * (copied == 1)} another; at least"
+                f" {config.least} different ones are needed"
             )
         actions = data.action[data.mask]
         if (actions == actions[0]).all():

@@ -277,8 +277,15 @@ def _explain(
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
-    """Trials for training, and that share of them that is held out."""
+    """Trials for training, and about that share of them that is held out: a trial and its copies are on one side."""
     order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
+    first = np.arange(len(trials))  # of the trials that are the same
+    for same in fits.copies(trials)[0]:
+        first[same] = same[0]
+    _, begins, group = np.unique(first[order], return_index=True, return_inverse=True)
+    order = order[np.argsort(begins[group], kind="stable")]  # copies follow each other
+    while count < len(order) - 1 and first[order[count]] == first[order[count - 1]]:
+        count += 1
     train, held_out = (
         Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions)
         for index in (order[count:], order[:count])

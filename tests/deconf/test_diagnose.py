@@ -40,6 +40,31 @@ def trials(n: int = 24, episodes: int = 2, steps: int = 3, seed: int = 0) -> Tri
     return Trials(rng.normal(size=(n, episodes, steps + 1, 2)), rng.uniform(-1, 1, (*shape, 1)), np.ones(shape, bool))
 
 
+def repeated(data: Trials, index: list[int]) -> Trials:
+    return Trials(data.obs[index], data.action[index], data.mask[index])
+
+
+class TestSplit:
+    """Trials for training and held-out ones."""
+
+    def test_a_trial_and_its_copies_are_on_one_side(self) -> None:
+        index = [*range(12), *range(12), 3, 3]
+        data = repeated(trials(12), index)
+        for seed in range(20):
+            parts = measures.split(data, 0.25, np.random.default_rng(seed))
+            train, held_out = ({obs.tobytes() for obs in part.obs} for part in parts)
+            assert not train & held_out
+            assert [len(part) for part in parts] == [26 - len(parts[1]), len(parts[1])]
+            assert 6 <= len(parts[1]) <= 9
+
+    def test_without_copies_the_share_is_exact(self) -> None:
+        data = trials(24)
+        train, held_out = measures.split(data, 0.25, np.random.default_rng(0))
+        order = np.random.default_rng(0).permutation(24)
+        assert np.array_equal(np.concatenate([held_out.obs, train.obs]), data.obs[order])
+        assert len(held_out) == 6
+
+
 class TestBadInput:
     @pytest.mark.parametrize(
         ("given", "message"),
@@ -52,6 +77,11 @@ class TestBadInput:
     def test_too_little(self, given, message: str) -> None:
         with pytest.raises(InputError, match=message):
             diagnose.check(given(), None, DiagnoseConfig())
+
+    def test_copies_do_not_count(self) -> None:
+        data = trials(26)
+        with pytest.raises(InputError, match="26 trials given, of which 3 repeat another; at least 24 different ones"):
+            diagnose.check(repeated(data, [0, 0, 0, 1, 1, *range(5, 26)]), None, DiagnoseConfig())
 
     def test_constant_actions(self) -> None:
         data = trials()
