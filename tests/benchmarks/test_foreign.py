@@ -14,9 +14,10 @@ HARMLESS = ("classic_reversedcart", "classic_mountainpower", "mujoco_pushedpole"
 
 
 def test_halves_are_alike() -> None:
-    for unseen in (False, True):
+    """But for the case that was learned from, which is seen since then."""
+    for unseen, tier_2 in ((False, 4), (True, 2)):
         tiers = [case.tier for case in CASES if case.unseen is unseen]
-        assert (tiers.count(1), tiers.count(2), tiers.count(3)) == (5, 3, 1)
+        assert (tiers.count(1), tiers.count(2), tiers.count(3)) == (5, tier_2, 1)
     assert len({case.reference.split(":")[0] for case in CASES}) >= 5
 
 

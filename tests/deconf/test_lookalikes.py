@@ -8,7 +8,7 @@ import torch
 
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.core.nets import LabelScaler, Scaler
-from deconfounded.deconf.diagnosis import judgement, latent, measures
+from deconfounded.deconf.diagnosis import fits, judgement, latent, measures
 from deconfounded.deconf.diagnosis.judgement import Diagnosis
 from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
@@ -105,6 +105,67 @@ def test_too_little_exploration_is_no_tier_3() -> None:
     diagnosis = diagnosed("wind", explored=24)
     assert diagnosis.tier != 3
     assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.found
+
+
+def tank(heat: float, lasting: float = 0.0, rough: float = 0.0) -> Trials:
+    """Explored trials of a tank whose temperatures tell of a hidden heat as soon as it has moved them.
+
+    lasting: correlation of gusts from step to step; rough: of the tank's response, which no smooth fit has.
+    """
+    rng, b, steps = np.random.default_rng(0), 64, 40
+    theta, gust = heat * rng.uniform(-1, 1, b), np.zeros(b)
+    obs, action = np.zeros((b, 1, steps + 1, 2)), rng.uniform(-1, 1, (b, 1, steps, 1))
+    obs[:, 0, 0] = rng.normal(0, 0.3, (b, 2))
+    for t in range(steps):
+        jacket, content = obs[:, 0, t].T
+        gust = lasting * gust + 0.4 * rng.standard_normal(b)
+        heating = 0.4 * action[:, 0, t, 0] + theta + rough * np.sin(9 * content)
+        obs[:, 0, t + 1, 0] = jacket + 0.4 * (content - jacket) + heating + gust
+        obs[:, 0, t + 1, 1] = content + 0.2 * (jacket - content) - 0.1 * content + 0.02 * rng.standard_normal(b)
+    return Trials(obs, action, np.ones((b, 1, steps), bool))
+
+
+class TestStatesThatTell:
+    """Dynamics that differ from trial to trial, by an amount that observations tell of."""
+
+    @pytest.fixture(autouse=True)
+    def _few_features(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(fits, "FINE", 16)
+
+    def differ(self, trials: Trials) -> float:
+        alike = fits.own_dynamics(trials, fits.Steps.of(trials))
+        assert alike is not None
+        return alike[0]
+
+    def test_least_squares_takes_it_for_an_effect_of_the_state(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """And the likelihood, in which trials have means, does not."""
+        assert self.differ(tank(0.3)) > 0.6
+        monkeypatch.setattr(fits, "trial_means", lambda basis, y, *rest: (y, np.zeros(y.shape[1])))
+        assert self.differ(tank(0.3)) == 0
+
+    @pytest.mark.parametrize("kind", [{}, {"lasting": 0.6}, {"rough": 0.3}], ids=["idle", "gusts", "misfit"])
+    def test_nothing_hidden(self, kind: dict[str, float]) -> None:
+        assert self.differ(tank(0, **kind)) == 0
+
+    def test_likelihood(self) -> None:
+        """Of one basis function, 1, against the density of the panel, by hand."""
+        rng = np.random.default_rng(0)
+        y, trial = rng.normal(size=(60, 1)), np.repeat(np.arange(20), 3)
+        y += 0.5 * rng.normal(size=20)[trial, None]
+        follows = np.concatenate([[False], np.diff(trial) == 0])
+        _, ratio = fits.trial_means(np.ones((60, 1)), y, trial, follows)
+
+        def likely(kept: float, share: float) -> float:
+            lag = np.abs(np.subtract.outer(range(3), range(3)))
+            cov = np.kron(np.eye(20), kept**lag / (1 - kept**2) + share)
+            solved = np.linalg.solve(cov, np.concatenate([y, np.ones((60, 1))], 1))
+            mean = solved[:, 0].sum() / solved[:, 1].sum()
+            rest = float((y[:, 0] - mean) @ (solved[:, 0] - mean * solved[:, 1]))
+            return -30 * np.log(rest) - np.linalg.slogdet(cov)[1] / 2
+
+        grid = {(k, r): likely(k, r) for k in fits.LASTING for r in fits.RATIOS}
+        by_hand = max(grid.values()) - max(grid[k, 0.0] for k in fits.LASTING)
+        assert ratio[0] == pytest.approx(by_hand, abs=0.02)
 
 
 def test_one_trial_does_not_own_a_likelihood() -> None:

@@ -65,5 +65,9 @@ _TIERS = {
     **dict.fromkeys(("mujoco:ArmTrembles", "mujoco:PushedPole", "motor:MotorIntegral"), 1),
     **dict.fromkeys(("lane:LaneHabits", "lane:LaneLate", "reactor:ReactorTwice", "motor:MotorCalm"), 1),
 }
-CASES = tuple(Case(reference, tier, i % 2 == 1) for i, (reference, tier) in enumerate(_TIERS.items()))
-"""Every other one is unseen. The order was fixed before any was diagnosed."""
+_LEARNED_FROM = ("reactor:ReactorHeat",)  # a wrong verdict, by which the diagnosis was changed
+CASES = tuple(
+    Case(reference, tier, i % 2 == 1 and reference not in _LEARNED_FROM)
+    for i, (reference, tier) in enumerate(_TIERS.items())
+)
+"""Every other one is unseen, but for those that were learned from. The order was fixed before any was diagnosed."""
