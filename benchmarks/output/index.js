@@ -288,6 +288,9 @@ function draw(details) {
   const rows = D.rows.filter((r) => r.task === details.dataset.task);
   if (!details.open || details.dataset.drawn) return;
   details.dataset.drawn = "yes";
+  const link = details.querySelector("a.film"), film = new Image();
+  film.onload = () => { link.firstElementChild.src = film.src; }; // a copy of the page alone keeps the still
+  if (link) film.src = link.href;
   adaptation(details.querySelector(".adaptation"), rows, { h: 290 });
   const box = details.querySelector(".learning");
   const trained = rows.filter((r) => !D.methods[r.method].deployment); // the same agent, deployed otherwise

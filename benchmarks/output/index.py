@@ -12,7 +12,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import scoring, statistics
-from deconfounded.benchmarks.output.pictures import colours
+from deconfounded.benchmarks.output.pictures import colours, encoded
 from deconfounded.envs.streams import Array
 
 NOTE = (
@@ -126,6 +126,13 @@ def certificate(docs: Path, task: envs.Task, certificate: dict[str, Any] | None)
         "file": f"certificates/{task.name}.json",
         "picture": _sized(docs, f"certificates/{task.name}.png"),
     }
+
+
+def stills(docs: Path) -> dict[str, Path]:
+    """By the name of a picture that the page links to, the file of the small one that it holds."""
+    pictures = [*docs.glob("*.webp"), *(docs / "certificates").glob("*.png")]
+    names = sorted(str(picture.relative_to(docs).as_posix()) for picture in pictures)
+    return {name: docs / "stills" / Path(name).with_suffix(".webp") for name in names}
 
 
 def _sized(docs: Path, name: str) -> dict[str, Any] | None:
@@ -242,11 +249,15 @@ def _figure(figure: Callable[..., Array], *runs: statistics.Runs) -> tuple[float
 def page(
     docs: Path, found: Found, certificates: dict[str, Any], command: Callable[..., str], tiers: dict[str, str]
 ) -> str:
-    """The file. tiers: what each tier of tasks says; command: what makes a task's results, or those of one method."""
+    """The file, which needs no other: a copy of it alone keeps its pictures, though films stand still.
+
+    tiers: what each tier of tasks says; command: what makes a task's results, or those of one method.
+    """
     content = data(docs, found, certificates, command)
     counts = [entry["n"] for entry in content["rows"]]
     opened = next((task["name"] for task in content["tasks"] if task["episodes"] > 1), "")
     held = " to ".join(dict.fromkeys(f"{scoring.coverage(n):.0%}" for n in (min(counts), max(counts))))
     head = {"records": sum(counts), "seeds": scoring.fewest_to_most(counts), "peer": PEER, "opened": opened}
     head |= {"held": held, "intervals": scoring.INTERVALS}
+    head["stills"] = {name: f"data:image/webp;base64,{encoded(file)}" for name, file in stills(docs).items()}
     return template("index.html.jinja").render(data=content, tiers=tiers, **head) + "\n"

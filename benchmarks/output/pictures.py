@@ -41,6 +41,8 @@ COLOURS = {
 }
 OTHERS = ("#d6006e", "#00857c", "#8c6d31", "#3b3bd1", "#b35900", "#66a61e", "#a020f0", "#843c39", "#0a6ebd", "#555500")
 
+STILL = {"width": 640, "quality": 60, "colours": 64}  # of films, of films, of charts
+
 
 def colour(method: str) -> str:
     """A method's own, or the first of OTHERS: for pictures of several from outside see `colours`."""
@@ -98,6 +100,30 @@ def save_figure(figure: Any, file: Path | io.BytesIO, dpi: int, mark: str = "") 
 def encoded(file: Path | io.BytesIO) -> str:
     """In base64, for a page that needs no other file."""
     return base64.b64encode(file.read_bytes() if isinstance(file, Path) else file.getvalue()).decode()
+
+
+def still(picture: Path, file: Path) -> None:
+    """Make a small .webp of a picture, for pages that hold it: a film's middle frame, or a chart in few colours.
+
+    Nothing is done if the file was made of this picture before.
+    """
+    from PIL import Image
+
+    made_of = mark(hashlib.sha256(picture.read_bytes()).hexdigest(), STILL)
+    if mark_of(file) == made_of:
+        return
+    with Image.open(picture) as image:
+        frames, buffer = getattr(image, "n_frames", 1), io.BytesIO()
+        image.seek(frames // 2)
+        whole = image.convert("RGB")
+        if frames > 1:
+            whole.thumbnail((STILL["width"], whole.height))
+        else:
+            whole = whole.quantize(STILL["colours"]).convert("RGB")
+        look = {"quality": STILL["quality"]} if frames > 1 else {"lossless": True}
+        whole.save(buffer, "webp", xmp=made_of.encode(), method=6, **look)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(file, buffer.getvalue())
 
 
 def mark(*made_of: Any) -> str:

@@ -24,7 +24,7 @@ from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import index, records
-from deconfounded.benchmarks.output.pictures import mark, mark_of
+from deconfounded.benchmarks.output.pictures import mark, mark_of, still
 from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, results, spectrum, validate
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS
 from deconfounded.envs.support.files import write_atomically
@@ -144,6 +144,11 @@ def write() -> str:
     Returns README's table of results.
     """
     found = results.published()
+    small = index.stills(DOCS)
+    for name, file in small.items():
+        still(DOCS / name, file)
+    for file in {*(DOCS / "stills").rglob("*.webp")} - {*small.values()}:
+        file.unlink()
     for file, text in texts(found).items():
         if not file.exists() or file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
