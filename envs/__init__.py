@@ -21,6 +21,19 @@ from deconfounded.envs.registry import TASKS, closest, get, make, make_dm, make_
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Task
 from deconfounded.envs.tasks import HARD, SUITE
+from deconfounded.envs.trial import TrialEnv
 
 __all__ = ["HARD", "SUITE", "TASKS", "BatchEnv", "DmEnv", "GymEnv", "GymVectorEnv", "InputError", "Latent"]
-__all__ += ["MujocoTask", "Task", "check_task", "closest", "get", "make", "make_dm", "make_vec", "names", "register"]
+__all__ += [
+    "MujocoTask",
+    "Task",
+    "TrialEnv",
+    "check_task",
+    "closest",
+    "get",
+    "make",
+    "make_dm",
+    "make_vec",
+    "names",
+    "register",
+]

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from deconfounded import envs
@@ -61,3 +62,49 @@ def test_vectors_are_gymnasium_s(mode: AutoresetMode) -> None:
     assert bool(ended) == (mode == AutoresetMode.SAME_STEP)
     with pytest.raises(envs.InputError, match=r"it must be AutoresetMode\.NEXT_STEP or SAME_STEP"):
         envs.make_vec(NAME, 3, autoreset_mode=AutoresetMode.DISABLED)
+
+
+@pytest.mark.parametrize("name", [NAME, "bandit"])
+def test_a_trial_as_one_episode(name: str) -> None:
+    """The same episodes in a row; it ends with the last alone, and flags where others start."""
+    plain, whole = (gymnasium.make(envs.get(name).gym_id, episodes=3) for _ in range(2))
+    whole = envs.TrialEnv(whole)
+    batch, width = whole.unwrapped.batch, plain.observation_space.shape[0]  # type: ignore[attr-defined, index]
+    discrete = plain.action_space if isinstance(plain.action_space, spaces.Discrete) else None
+    whole.action_space.seed(0)
+    for seed in (1, None):
+        ours, theirs = whole.reset(seed=seed)[0], plain.reset(seed=seed)[0]
+        theta, ended, over = batch.theta.copy(), 0, False
+        assert ours[-1] == 1
+        while not over:
+            same([ours[:width]], [theirs])
+            assert (batch.theta == theta).all()
+            action = whole.action_space.sample()
+            ours, reward, *flags, info = whole.step(action)
+            theirs, expected, *ends, _ = plain.step(action)
+            assert whole.observation_space.contains(ours)
+            assert reward == expected
+            over, ended = any(flags), ended + any(ends)
+            assert over == (ended == 3)
+            assert ours[-1] == (any(ends) and not over) == ("final_obs" in info)
+            if over:
+                assert flags == ends
+            elif any(ends):
+                same([info["final_obs"]], [theirs])
+                assert not ours[width:-1].any()
+                theirs = plain.reset()[0]
+            else:
+                before = np.arange(discrete.n) == action if discrete else action.clip(-1, 1)
+                np.testing.assert_allclose(ours[width:-1], before, rtol=1e-6)
+    with pytest.raises(envs.InputError, match="a trial had one episode; make the environment with episodes=5"):
+        envs.TrialEnv(envs.make(name))
+
+
+def test_a_reset_in_the_middle_starts_a_new_trial() -> None:
+    whole = envs.TrialEnv(envs.make(NAME, episodes=3))
+    batch = whole.unwrapped.batch  # type: ignore[attr-defined]
+    whole.reset(seed=0)
+    first = batch.theta.copy()
+    whole.step(whole.action_space.sample())
+    whole.reset()
+    assert (batch.theta != first).all()
