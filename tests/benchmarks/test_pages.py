@@ -324,10 +324,7 @@ def made() -> dict[str, Any]:
 class TestIndex:
     def test_rows_are_the_records(self, made: dict[str, Any]) -> None:
         """Each cell has as many seeds as records, and the last episode's score; differences are of these scores."""
-        lines = {
-            file.stem: [json.loads(line) for line in file.read_text().splitlines()]
-            for file in (DOCS / "records").glob("*.jsonl")
-        }
+        lines = {file.stem: records.of_task(DOCS / "records", file.stem) for file in (DOCS / "records").glob("*.jsonl")}
         for row in made["rows"]:
             returns = {
                 name: [one["returns"] for one in lines[row["task"]] if records.named(one) == name]
@@ -342,7 +339,7 @@ class TestIndex:
             assert row["first"]["value"] == pytest.approx(scores[0], abs=1e-4)
             assert row["regret"]["value"] == pytest.approx(len(scores) - scores.sum(), abs=1e-3)
             for measure in ("first", "regret"):
-                low, high = row[measure]["interval"]
+                low, high = row[measure]["interval"] or (row[measure]["value"],) * 2  # none of a single seed
                 assert low - 1e-4 <= row[measure]["value"] <= high + 1e-4
             assert f"--task {row['task']}" in row["command"]
         values = {(row["task"], row["method"]): row for row in made["rows"]}
