@@ -283,21 +283,13 @@ class TestHeadroom:
         assert "hidden_goal" not in text
         assert "| a | 2 | 0.60 (0.60 to 0.60) | 0.93 (0.93 to 0.93) | 0.47 (0.47 to 0.47) |" in text
 
-    @pytest.mark.parametrize(
-        ("verdict", "exact", "first", "last", "says"),
-        [
-            ("passed", 0.95, 0.7, 0.79, "yes, by the first and the last episode"),
-            ("passed", 0.95, 0.8, 0.95, "yes, by the first episode"),
-            ("passed", 0.95, 0.85, 0.9, "no: solved"),
-            ("passed", 0.85, 0.1, 0.1, "no: the exact policy does not reach it"),
-            ("failed", 0.95, 0.1, 0.1, "no: not certified"),
-        ],
-    )
-    def test_admitted(self, verdict: str, exact: float, first: float, last: float, says: str) -> None:
-        """A hard task is certified, can be done with the exact belief, and is not solved by learners."""
-        certificate = {"verdict": verdict, "interventional": {"score": [0.99, exact]}}
-        assert hard.admitted(certificate, first, last) == says
-        assert hard.admitted(None, first, last) == "no: not certified"
+    def test_hard_in(self) -> None:
+        """A task is hard where the best learner has .8 at most, and nobody counts who sees theta."""
+        assert hard.hard_in({"first": 0.7, "last": 0.8}) == "first, last"
+        assert hard.hard_in({"first": 0.81, "last": 0.79}) == "last"
+        assert hard.hard_in({"first": 0.81, "last": 0.9}) == "no"
+        text = hard.page([], {"gusty_drone": {"verdict": "passed", "interventional": {"score": [0.5, 0.97]}}})
+        assert "| wind, load | passed | 0.50 | 0.97 |  |  |  |  |  |  |" in text
 
     def test_best_learner(self) -> None:
         """Who sees theta and the exact policies are no learners."""
