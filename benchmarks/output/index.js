@@ -142,7 +142,7 @@ function fill(r) {
       <tr><td>regret<td>${two(r.regret.value)}<td class="soft">${range(r.regret.interval)}</tr>${minus.join("")}</table>
     <p class="soft">score by episode${r.trained > 1 ? ", beside the exact policies" : ""}</p><div class="a"></div>
     ${Object.keys(r.curve).map((kind, i) => `<p class="soft">${text(kind)} loss, over the share of training</p><div class="l${i}"></div>`).join("")}
-    <p class="soft">${text(r.data || "no data")}; ${r.cpu} s of CPU a seed</p><p><code class="run">${text(r.command)}</code></p>`;
+    <p class="soft">${text(r.data || "no data")}; ${r.cpu === null ? "trained on a GPU" : r.cpu + " s of CPU a seed"}</p><p><code class="run">${text(r.command)}</code></p>`;
   const beside = D.rows.filter((x) => x.task === r.task && D.methods[x.method].kind === "exact" && !D.methods[x.method].deployment && x !== r);
   adaptation(card.querySelector(".a"), [...beside, r], { still: true, h: 120, strong: r.method });
   Object.keys(r.curve).forEach((kind, i) => learning(card.querySelector(`.l${i}`), kind, [r], { still: true, h: 90 }));
@@ -248,7 +248,7 @@ const COLUMNS = [
   ["return", "return", (r) => r.return, (r) => r.return.toFixed(1)],
   ["objective", "Eq. (1)", (r) => r.objective, (r) => r.objective.toLocaleString("en")],
   ["data", "data, a seed", (r) => r.data, (r) => text(r.data), "left"],
-  ["cpu", "CPU s", (r) => r.cpu, (r) => r.cpu.toFixed(0)],
+  ["cpu", "CPU s", (r) => r.cpu, (r) => r.cpu === null ? "by GPU" : r.cpu.toFixed(0)],
   ["command", "command", (r) => r.command, (r) => `<code class="run">${text(r.command)}</code>`, "left"],
 ];
 

@@ -159,6 +159,7 @@ def page(results: dict[str, Any], folder: Path) -> str:
     filters: dict[str, Callable[..., Any]] = {
         "two_decimals": scoring.two_decimals,
         "interval": scoring.interval,
+        "cpu_seconds": scoring.cpu_seconds,
         "height": lambda value: 23 - 20 * min(max(value, -0.1), 1.1),
         "last_mean": lambda returns: np.mean(returns, 0)[-1],
     }

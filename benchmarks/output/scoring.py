@@ -130,7 +130,7 @@ def summarise(
             "tier": seeds[0]["tier"],
             "version": seeds[0]["method_version"],
             "budget": mean_budget([record["budget"] for record in seeds]),
-            "cpu_s": round(float(np.mean([record["cpu_s"] for record in seeds])), 1),
+            "cpu_s": _cpu_seconds(seeds),
         }
         if returns.shape[1] > episodes:
             methods[name]["score_beyond"] = scores[:, episodes:].mean(0).round(4).tolist()
@@ -222,6 +222,17 @@ def two_decimals(value: float) -> str:
     return f"{np.round(value, 2):z.2f}"
 
 
+def _cpu_seconds(seeds: Sequence[dict[str, Any]]) -> float | None:
+    """Mean of the records that were trained on a CPU; None if there are none: then a GPU did the work."""
+    seconds = [record["cpu_s"] for record in seeds if "trained on cuda" not in record.get("machine", "")]
+    return round(float(np.mean(seconds)), 1) if seconds else None
+
+
+def cpu_seconds(entry: dict[str, Any]) -> str:
+    """CPU seconds a seed, as tables show them."""
+    return "by GPU" if entry["cpu_s"] is None else f"{entry['cpu_s']:,.0f}"
+
+
 def budget(used: dict[str, int]) -> str:
     """The data that a seed used, as tables show it."""
     return ", ".join(f"{n:,} {kind.replace('_', ' ')}" for kind, n in used.items() if n)
@@ -233,7 +244,7 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
         scores, r2 = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
         returned = f"{np.mean(entry['return'], 0)[-1]:.1f}"
-        costs = (budget(entry["budget"]), f"{entry['cpu_s']:.0f}")
+        costs = (budget(entry["budget"]), cpu_seconds(entry))
         first = (two_decimals(entry["score_first"]), interval(entry["ci95_first"]))
         last = (two_decimals(entry["score_last"]), interval(entry["ci95"], len(entry["seeds"])))
         regret = (two_decimals(entry["regret"]), interval(entry["ci95_regret"]))

@@ -206,8 +206,8 @@ def costs(found: index.Found) -> str:
     by_task = {task.name: results["methods"] for task, results in found if task.name in TIMED}
     rows = []
     for method in METHODS:
-        seconds = [methods.get(method, {}).get("cpu_s") for methods in by_task.values()]
-        rows.append((method, *("" if cpu is None else f"{cpu:,.1f}" for cpu in seconds)))
+        entries = [methods.get(method) for methods in by_task.values()]
+        rows.append((method, *(scoring.cpu_seconds(entry) if entry else "" for entry in entries)))
     return markdown_table(("method", *by_task), rows)
 
 

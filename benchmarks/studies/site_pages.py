@@ -199,7 +199,7 @@ def _scores(name: str, found: index.Found) -> str:
             interval = scoring.interval(entry["ci95"], len(entry["seeds"]))
             last = scoring.two_decimals(entry["score_last"])
             link = f"[{task.name}](tasks.md#{task.name})"
-            rows.append((link, last, interval, exact, scoring.budget(entry["budget"]), f"{entry['cpu_s']:,.0f}"))
+            rows.append((link, last, interval, exact, scoring.budget(entry["budget"]), scoring.cpu_seconds(entry)))
     head = ("task", "last", "interval", "exact interventional", "data, a seed", "CPU s, a seed")
     text = "Scores in the last episode of a trial: 0 = random actions, 1 = the expert that sees theta."
     return f"{text} {scoring.INTERVALS}\n\n{markdown_table(head, rows)}" if rows else "There are no records."

@@ -236,6 +236,14 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     assert places == sorted(places)
 
 
+def test_cpu_seconds_are_of_a_cpu() -> None:
+    """What a GPU trained says nothing of the CPU seconds that a training takes."""
+    seeds = [{"cpu_s": 9.0, "machine": "x, trained on cpu"}, {"cpu_s": 1.0, "machine": "x, trained on cuda"}]
+    assert scoring._cpu_seconds(seeds) == 9
+    assert scoring._cpu_seconds(seeds[1:]) is None
+    assert [scoring.cpu_seconds({"cpu_s": each}) for each in (1234.5, None)] == ["1,234", "by GPU"]
+
+
 def test_a_certificate_asks_for_what_it_says() -> None:
     """The thresholds that the certificates in docs/ were judged by, the pages name, and a task is certified by."""
     required = {"blind_bc": "<= 0.7", "told_wrong_theta": "<= 0.65", "conditional_last": "<= 0.7"}
