@@ -48,10 +48,8 @@ def speed(args: argparse.Namespace) -> None:
     """Of all tasks with physics, or those asked for."""
     physics = [task for task in map(envs.get, envs.SUITE) if isinstance(task, envs.MujocoTask)]
     measured = stepping.by_task(args.tasks or physics)
-    peer = stepping.against_envpool()
-    print("envpool is not installed" if peer is None else f"share of raw mj_step: {peer['share_of_mj_step']}")
     about = {"machine": f"{platform.machine()}, {cores()} threads", "python": platform.python_version()}
-    made = {**about, "versions": identity.versions(), "tasks": measured, "envpool": peer}
+    made = {**about, "versions": identity.versions(), "tasks": measured}
     write_json(args.out / "speed.json", made)
     stepping.picture(measured, args.out / "speed.png")
 

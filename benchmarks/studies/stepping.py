@@ -1,15 +1,11 @@
 """How fast environments step: all ways of stepping side by side, in control steps a second.
 
 Our vector env in closed loop (observations, rewards and resets included), mujoco.rollout in open loop, gymnasium's
-SyncVectorEnv over our single env, and raw mj_step in one thread times the threads; and memory an environment. If
-`envpool` is installed (a peer: C++ threads), both engines in closed loop, on a cartpole each, as shares of raw mj_step
-on their own model.
+SyncVectorEnv over our single env, and raw mj_step in one thread times the threads; and memory an environment.
 """
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -83,34 +79,6 @@ def measure(task: envs.MujocoTask, n: int) -> dict[str, float]:
         counts["sync_vector_env"] = n * len(few)
     rates = {name: counts[name] / each for name, each in seconds(runs).items()}
     return {**rates, "kib": kib}
-
-
-def against_envpool() -> dict[str, Any] | None:
-    """Physics steps a second in closed loop over raw mj_step times threads, of ours and of envpool's cartpole."""
-    try:
-        import envpool  # type: ignore[import-not-found]
-
-        cartpole = files("dm_control") / "suite" / "cartpole.xml"  # what suite.load makes of it fails under MuJoCo 4
-    except ImportError:
-        return None
-    n = 64
-    theirs = envpool.make("CartpoleBalance-v1", env_type="gymnasium", num_envs=n, num_threads=cores())
-    theirs.reset()
-    task = envs.get("tilted_cartpole")
-    assert isinstance(task, envs.MujocoTask)
-    actions = np.random.default_rng(0).uniform(-1, 1, (200, n, 1))
-    runs = {
-        "ours": closed_loop(envs.make_vec(task.name, n), actions),
-        "envpool": lambda: [theirs.step(action) for action in actions],
-        "our mj_step": raw(task.model, 8000),
-        "its mj_step": raw(mujoco.MjModel.from_xml_path(str(cartpole)), 8000),
-    }
-    counts = {"ours": n * 200 * task.substeps, "envpool": n * 200, "our mj_step": 8000, "its mj_step": 8000}
-    rates = {name: counts[name] / each for name, each in seconds(runs).items()}
-    bounds = {"ours": "our mj_step", "envpool": "its mj_step"}
-    shares = {name: rates[name] / rates[bound] / cores() for name, bound in bounds.items()}
-    about = {"environments": n, "version": version("envpool")}
-    return {**about, "physics_steps_a_second": rates, "share_of_mj_step": shares}
 
 
 def by_task(tasks: Sequence[envs.Task]) -> dict[str, dict[str, dict[str, float]]]:
