@@ -15,9 +15,10 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands, report, verify
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import identity, job_files, progress, scheduler, sources
+from deconfounded.benchmarks.engine import identity, job_files, local, progress, scheduler, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.local import Here
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.deconf.methods import dagger
@@ -366,6 +367,7 @@ class TestVerify:
         verify.main()
         assert capsys.readouterr().out.endswith("bandit blind_bc 3: same bits\n")
         records.write(tmp_path, [{**record, "returns": [99.0], "bits": "0" * 64, "commit": "0" * 40}])
+        monkeypatch.setattr(local, "Local", Here)
         with pytest.raises(SystemExit) as ended:
             verify.main()
         assert ended.value.code == 1
