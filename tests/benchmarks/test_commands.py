@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -440,10 +440,11 @@ class TestScore:
 @pytest.mark.slow
 def test_certificate_fails_what_deserves_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cartpole without stakes: an expert told the wrong friction does as well, and so does cloning without memory."""
-    monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=500))
+    monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=200))
+    monkeypatch.setattr(NoStakes, "horizon", 100)
     task = NoStakes()
-    result = certify.certify(task, CallableExpert(task, feedback, "feedback"), trials=12, grid=7)
-    assert result["return_expert"] > 4 * result["return_random"]
+    result = certify.certify(task, CallableExpert(task, feedback, "feedback"), trials=8, grid=3)
+    assert result["return_expert"] > 2.5 * result["return_random"]
     assert result["verdict"] == "failed"
     assert not result["checks"]["told_wrong_theta"]["passed"]
     assert not result["checks"]["blind_bc"]["passed"]
@@ -517,8 +518,9 @@ def test_records_are_few_and_small() -> None:
 
 
 @pytest.mark.slow
-def test_pages_are_up_to_date() -> None:
+def test_pages_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     """What publish.py writes of tasks, certificates and results; docs/ has a row for each of the latter two."""
+    monkeypatch.setattr(records, "held", cache(records.held))  # pages read the same files
     for file, text in publish.texts(results.published()).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     docs = ROOT / "docs"

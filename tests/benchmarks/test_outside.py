@@ -623,6 +623,7 @@ class TestSaved:
         """Loaded, they return in the run's own trials what they returned in the run, though they trained two by two."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         monkeypatch.setattr(type(envs.get(task)), "horizon", 12)
+        monkeypatch.setattr(type(envs.get(task)), "episodes", 2)
         (tmp_path / "jobs").mkdir()
         for method in ("deconfounded", "naive_rnn", "deconfounded_discrete", "blind_bc"):
             job = BenchmarkJob(task, tiny_preset(), method, (0, 1), tmp_path / "jobs")

@@ -3,6 +3,7 @@
 import html
 import json
 import re
+from functools import partialmethod
 from pathlib import Path
 
 import numpy as np
@@ -274,6 +275,7 @@ def test_gain_by_memory() -> None:
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A page that needs no other file, a json that says the same; a second time nothing is measured again."""
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
+    monkeypatch.setattr(type(envs.get("bandit")), "horizon", 20)
     for name, data in zip(("expert", "explored"), _bandit(), strict=True):
         data.save(tmp_path / f"{name}.npz")
     options = ["--data", str(tmp_path / "expert.npz"), "--explore", str(tmp_path / "explored.npz")]
@@ -315,7 +317,7 @@ FEWER = {
 def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """Every line of docs/diagnose.md, on less data and with less training."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
+    monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", partialmethod(_tiny_init, refits=1))
     text = (ROOT / "docs" / "diagnose.md").read_text()
     for much, few in FEWER.items():
         assert much in text
@@ -325,6 +327,6 @@ def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert (tmp_path / "agent" / "agent.json").is_file()
 
 
-def _tiny_init(self: DiagnoseConfig) -> None:
-    for key, value in {"refits": 2, "least": 24, "amounts": TINY}.items():
+def _tiny_init(self: DiagnoseConfig, refits: int = 2) -> None:
+    for key, value in {"refits": refits, "least": 24, "amounts": TINY}.items():
         object.__setattr__(self, key, value)

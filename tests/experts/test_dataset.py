@@ -26,7 +26,8 @@ def test_the_same_in_another_process(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Seed 0's demonstrations, as a run has them: bit for bit, and what naive_rnn makes of them too."""
-    monkeypatch.setattr(type(envs.get(name)), "horizon", 25)
+    monkeypatch.setattr(type(envs.get(name)), "horizon", 8)
+    monkeypatch.setattr(type(envs.get(name)), "episodes", 2)
     context = Context(envs.get(name), tiny_preset(), [0])
     shown = context.demonstrations
     monkeypatch.chdir(tmp_path.parent)
