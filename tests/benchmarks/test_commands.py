@@ -525,6 +525,7 @@ def test_pages_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     docs = ROOT / "docs"
     of_results = re.findall(r"^\| \[(\w+)\]\(#", (docs / "results.md").read_text(), re.M)
+    of_results += re.findall(r"^## (\w+)", (docs / "hard.md").read_text(), re.M)
     assert sorted(of_results) == sorted(file.stem for file in (docs / "records").glob("*.jsonl"))
     certified = re.findall(r"^\| (\w+) \|.* (?:passed|failed) \|$", (docs / "concepts.md").read_text(), re.M)
     assert sorted(certified) == sorted(file.stem for file in (docs / "certificates").glob("*.json"))

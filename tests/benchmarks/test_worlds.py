@@ -54,7 +54,7 @@ def test_a_data_set(tmp_path: Path) -> None:
 def test_a_certificate_says_that_it_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memoryless_bc, "MemorylessConfig", partial(memoryless_bc.MemorylessConfig, updates=20))
     task = envs.get(CART)
-    result = certify.certify(task, policy.load(task), trials=4, grid=3)
+    result = certify.certify(task, policy.load(task), trials=8, grid=5)
     assert set(result["learned_dynamics"]) == {"r2", "exponent"}
     assert result["checks"]["told_wrong_theta"]["passed"]
     assert len(result["interventional"]["score"]) == len(result["conditional"]["score"]) == 5
