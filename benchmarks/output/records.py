@@ -31,7 +31,8 @@ MADE_OF = (  # what makes a record stale when it changes
     *("protocol", "task_version", "method_version", "settings", "expert", "expert_version"),
     *("salt", "outside", NAME),
 )
-SLOT = ("preset", NAME, "set", "salt", "method", "deployment", "seed")  # of which a task's file holds one record
+APART = ("preset", NAME, "set", "salt")  # of records that no table mixes
+SLOT = (*APART, "method", "deployment", "seed")  # of which a task's file holds one record
 
 
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
@@ -181,8 +182,9 @@ def _grouped(records: Sequence[Record], key: Callable[[Record], str]) -> dict[st
 def write(folder: Path, records: Sequence[Record]) -> None:
     """Add records to the files of their tasks in a folder, each file atomically.
 
-    A record takes the place of the one in its slot. One that was made of something else (another version, say) is kept
-    in the folder `superseded`. Raises InputError for what is no record, before anything is written.
+    A record takes the place of the one in its slot. One that was made of something else is kept in the folder
+    `superseded`, and so are those of an older version, of all seeds, which no table shows any more. Raises InputError
+    for what is no record, before anything is written.
     """
     from filelock import FileLock
 
@@ -198,7 +200,10 @@ def write(folder: Path, records: Sequence[Record]) -> None:
                 if before is not None and stale(before, record):
                     _append(folder / "superseded" / place(task), before)
                 kept[_slot(record)] = record
-            write_atomically(file, "".join(map(_line, kept.values())))
+            today, older = _newest(list(kept.values()))
+            for record in older:
+                _append(folder / "superseded" / place(task), record)
+            write_atomically(file, "".join(map(_line, today)))
 
 
 def _append(file: Path, record: Record) -> None:
@@ -216,12 +221,20 @@ def of_task(folder: Path, task: str, preset: str = "default", protocol: str = ST
     """The records of a task under an unchanged preset, by method and seed: of its newest version, and each method's."""
     plain: dict[str, Any] = {"preset": preset, "set": [], "salt": "", NAME: None, **named_protocol(protocol)}
     kept = [record for record in held(folder / place(task)) if all(record.get(key) == plain[key] for key in plain)]
+    return sorted(_newest(kept)[0], key=lambda record: (named(record), record["seed"]))
+
+
+def _newest(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
+    """Records of a task: of its newest version and of each method's, and the others. Presets are apart."""
     newest: dict[str, int] = {}
+    today = list(records)
     for name, version in (("task", "task_version"), ("method", "method_version")):
-        for record in kept:
-            newest[record[name]] = max(newest.get(record[name], 0), record[version])
-        kept = [record for record in kept if record[version] == newest[record[name]]]
-    return sorted(kept, key=lambda record: (named(record), record["seed"]))
+        of = {id(record): json.dumps([record[name], *(record.get(key) for key in APART)]) for record in today}
+        for record in today:
+            newest[of[id(record)]] = max(newest.get(of[id(record)], 0), record[version])
+        today = [record for record in today if record[version] == newest[of[id(record)]]]
+    chosen = set(map(id, today))
+    return today, [record for record in records if id(record) not in chosen]
 
 
 REFERENCED = ("task", "task_version", "protocol", NAME, "expert", "expert_version")  # what 0 and 1 are of

@@ -267,7 +267,7 @@ class TestRecords:
         assert made[0]["budget"] == {"expert_trials": 4}
 
     def test_one_in_a_slot(self, job: BenchmarkJob, tmp_path: Path) -> None:
-        """A newer record takes the place of an older one, which is kept apart if it was made of something else."""
+        """A newer record takes the place of an older one; what is of an older version is kept apart, of any seed."""
         one, two = kept(job)
         records.write(tmp_path, [one, two])
         records.write(tmp_path, [{**one, "cpu_s": 9.0}])
@@ -275,8 +275,8 @@ class TestRecords:
         assert not (tmp_path / "superseded").exists()
         newer = {**two, "method_version": 7}
         records.write(tmp_path, [newer])
-        assert records.read(tmp_path / "bandit.jsonl") == [{**one, "cpu_s": 9.0}, newer]
-        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two]
+        assert records.read(tmp_path / "bandit.jsonl") == [newer]
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two, {**one, "cpu_s": 9.0}]
         assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
 
     def test_nothing_is_written_of_what_is_none(self, job: BenchmarkJob, tmp_path: Path) -> None:
