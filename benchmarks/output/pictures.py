@@ -36,7 +36,7 @@ COLOURS = {
     "naive_obs": "#e6ab02",
     "naive_dropout": "#ad494a",
     "naive_transformer": "#e6550d",
-    "dpt": "#c51b8a",
+    "dpt": "#7a0177",
     "flow_bc": "#d95f0e",
 }
 OTHERS = ("#d6006e", "#00857c", "#8c6d31", "#3b3bd1", "#b35900", "#66a61e", "#a020f0", "#843c39", "#0a6ebd", "#555500")

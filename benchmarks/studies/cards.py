@@ -34,11 +34,12 @@ def nats(certificate: dict[str, Any]) -> list[str]:
 
 def certified(names: Sequence[str] = envs.SUITE) -> dict[str, dict[str, Any]]:
     """Those of the tasks that have a certificate in docs/, and what it holds."""
-    return {name: certificate for name in names if (certificate := _kept_certificate(name))}
+    return {name: certificate for name in names if (certificate := kept(certificate_of(name)))}
 
 
-def _kept_certificate(name: str) -> Any:
-    return kept(f"certificates/{'hard/' * (name in envs.HARD)}{name}")
+def certificate_of(name: str) -> str:
+    """Where in docs/ a task's certificate is kept, and its picture, without the end of their names."""
+    return f"certificates/{'hard/' * (name in envs.HARD)}{name}"
 
 
 def certificates(held: dict[str, Any]) -> str:
@@ -52,7 +53,7 @@ def certificates(held: dict[str, Any]) -> str:
 
 
 def _certificate(task: envs.Task) -> str:
-    certificate = _kept_certificate(task.name)
+    certificate = kept(certificate_of(task.name))
     if certificate is None:
         return "No certificate."
     checks = (f"{name} {check['measured']:.2f} ({check['required']})" for name, check in certificate["checks"].items())

@@ -96,7 +96,7 @@ class Site:
             above = "../" * page.count("/")
             return f'<a href="{above}interactive/index.html">{words[1:-1].strip("*")}</a>'
         if place == "docs/tasks.md" and anchor:
-            return f"{words}(/tasks/{anchor}.md)"
+            return f"{words}(/tasks/{re.sub(r'-v[0-9]+$', '', anchor)}.md)"
         if target := PAGES.get(place) or ELSEWHERE.get(place):
             return f"{words}(/{target}.md{'#' * bool(anchor and place in PAGES)}{anchor * (place in PAGES)})"
         if not (ROOT / place).exists():

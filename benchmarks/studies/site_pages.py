@@ -18,6 +18,7 @@ from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
 from deconfounded.deconf import methods
 from deconfounded.deconf.method import ENVIRONMENT, USES
 
+TASKS = (*envs.SUITE, *envs.HARD)
 MODULES = {  # of the API reference
     "Environments": (
         *("deconfounded", "deconfounded.envs", "deconfounded.envs.task", "deconfounded.envs.latent"),
@@ -42,7 +43,7 @@ MODULES = {  # of the API reference
             for place in (*methods.METHODS.values(), "sequence_bc", "memoryless_bc")
         )
     ),
-    "Tasks": tuple(f"deconfounded.envs.tasks.{name}" for name in envs.SUITE),
+    "Tasks": tuple(f"deconfounded.envs.tasks.{name}" for name in TASKS),
     "Diagnosis": tuple(
         f"deconfounded.deconf.diagnosis.{name}" for name in ("diagnose", "look", "exploration", "measures", "latent")
     ),
@@ -55,9 +56,10 @@ TYPICAL = {"control": "slippery_cartpole", "bandit": "bandit"}  # tasks whose am
 
 def pages(found: index.Found) -> dict[str, str]:
     """Markdown of each generated page, by its name; links are as in files of docs/."""
-    by_task, certified = {task.name: made for task, made in found}, cards.certified()
+    hard, certified = results.published(names=envs.HARD), cards.certified()
+    by_task = {task.name: made for task, made in (*found, *hard)}
     made = {"tasks/index": _tasks(by_task), "methods/index": _methods(found, certified), "commands": _commands()}
-    made |= {f"tasks/{name}": task_page(envs.get(name), by_task.get(name)) for name in envs.SUITE}
+    made |= {f"tasks/{name}": task_page(envs.get(name), by_task.get(name)) for name in TASKS}
     made |= {f"methods/{name}": method_page(name, found) for name in methods.METHODS}
     return made | _api()
 
@@ -80,7 +82,7 @@ def _headline(module: Any) -> str:
 def _tasks(by_task: dict[str, Any]) -> str:
     """The table of tasks."""
     rows = []
-    for name in envs.SUITE:
+    for name in TASKS:
         task = envs.get(name)
         latents = ", ".join(f"{lat.name} ({lat.unit})" if lat.unit else lat.name for lat in task.latents)
         tier = "none" if task.tier is None else str(task.tier)
@@ -91,7 +93,7 @@ def _tasks(by_task: dict[str, Any]) -> str:
     table = markdown_table(head, rows)
     text = "Tier needed: the lowest at which the interventional policy is identified. Scores are of the last episode."
     about = "Each page is made from the task's class, its certificate and its [records](records)."
-    return "\n\n".join(["# Tasks", f"{text} {about}", table, _toctree(envs.SUITE)]) + "\n"
+    return "\n\n".join(["# Tasks", f"{text} {about}", table, _toctree(TASKS)]) + "\n"
 
 
 def task_page(task: envs.Task, made: dict[str, Any] | None) -> str:
@@ -103,9 +105,9 @@ def task_page(task: envs.Task, made: dict[str, Any] | None) -> str:
         parts += [f"![expert, naive clone and deconfounded agent under one theta]({task.name}.webp)"]
         parts += ["*The expert, the naive clone and the deconfounded agent, under the same theta.*"]
     parts += [rest, f"Action: {_action(task)} Gymnasium id: `{task.gym_id}`."]
-    if (DOCS / f"certificates/{task.name}.png").exists():
-        files = f"[json](certificates/{task.name}.json)"
-        parts += ["## Certificate", f"![certificate of {task.name}](certificates/{task.name}.png)"]
+    if (DOCS / f"{(certificate := cards.certificate_of(task.name))}.png").exists():
+        files = f"[json]({certificate}.json)"
+        parts += ["## Certificate", f"![certificate of {task.name}]({certificate}.png)"]
         parts += [
             f"Made by `deconf certify --task {task.name}` ({files}); [what it measures](concepts.md#certificate)."
         ]

@@ -116,7 +116,7 @@ def test_intervals_over_tasks_are_of_95_percent() -> None:
 def seeds_of_records(episode: int) -> dict[str, dict[str, tuple[Array, Array]]]:
     """By task and method, the scores and returns of seeds in an episode: from the lines of docs/records alone."""
     by_task: dict[str, dict[str, tuple[Array, Array]]] = {}
-    for file in (ROOT / "docs" / "records").glob("*.jsonl"):
+    for file in (ROOT / "docs" / "records" / f"{name}.jsonl" for name in envs.SUITE):
         lines = [json.loads(line) for line in file.read_text().splitlines()]
         newest = max(line["task_version"] for line in lines)
         by_method: dict[str, list[Any]] = {}

@@ -50,7 +50,7 @@ def test_build(tmp_path: Path) -> None:
     """Without a warning or a dead link; a page for each task and method, with what such a page must have."""
     pytest.importorskip("myst_nb", reason="the extra docs is not installed")
     html = site.build(tmp_path, execute=False)
-    for name in envs.SUITE:
+    for name in (*envs.SUITE, *envs.HARD):
         page = (html / "tasks" / f"{name}.html").read_text("utf-8")
         parts = ("latent", "observation", "Action", "results", "expert", "versions")
         assert all(part in page for part in parts), name
