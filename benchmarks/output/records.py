@@ -168,8 +168,8 @@ def named(record: Record) -> str:
     return label(record["method"], record["deployment"])
 
 
-def _slot(record: Record) -> str:
-    return json.dumps([record.get(key) for key in SLOT])
+def _slot(record: Record, keys: Sequence[str] = SLOT) -> str:
+    return json.dumps([record.get(key) for key in keys])
 
 
 def _grouped(records: Sequence[Record], key: Callable[[Record], str]) -> dict[str, list[Record]]:
@@ -195,20 +195,23 @@ def write(folder: Path, records: Sequence[Record]) -> None:
         for task, new in _grouped(records, lambda record: record["task"]).items():
             file = folder / place(task)
             kept = {_slot(record): record for record in held(file)}
+            superseded = []
             for record in new:
                 before = kept.pop(_slot(record), None)
                 if before is not None and stale(before, record):
-                    _append(folder / "superseded" / place(task), before)
+                    superseded.append(before)
                 kept[_slot(record)] = record
-            today, older = _newest(list(kept.values()))
-            for record in older:
-                _append(folder / "superseded" / place(task), record)
+            today = _newest(list(kept.values()))
+            slots = set(map(_slot, today))
+            superseded += [record for slot, record in kept.items() if slot not in slots]
+            if superseded:
+                _append(folder / "superseded" / place(task), superseded)
             write_atomically(file, "".join(map(_line, today)))
 
 
-def _append(file: Path, record: Record) -> None:
+def _append(file: Path, records: Sequence[Record]) -> None:
     check_folder(file.parent)
-    write_atomically(file, (file.read_bytes() if file.exists() else b"") + _line(record).encode())
+    write_atomically(file, (file.read_bytes() if file.exists() else b"") + "".join(map(_line, records)).encode())
 
 
 def _line(record: Record) -> str:
@@ -221,20 +224,19 @@ def of_task(folder: Path, task: str, preset: str = "default", protocol: str = ST
     """The records of a task under an unchanged preset, by method and seed: of its newest version, and each method's."""
     plain: dict[str, Any] = {"preset": preset, "set": [], "salt": "", NAME: None, **named_protocol(protocol)}
     kept = [record for record in held(folder / place(task)) if all(record.get(key) == plain[key] for key in plain)]
-    return sorted(_newest(kept)[0], key=lambda record: (named(record), record["seed"]))
+    return sorted(_newest(kept), key=lambda record: (named(record), record["seed"]))
 
 
-def _newest(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
-    """Records of a task: of its newest version and of each method's, and the others. Presets are apart."""
-    newest: dict[str, int] = {}
-    today = list(records)
-    for name, version in (("task", "task_version"), ("method", "method_version")):
-        of = {id(record): json.dumps([record[name], *(record.get(key) for key in APART)]) for record in today}
-        for record in today:
-            newest[of[id(record)]] = max(newest.get(of[id(record)], 0), record[version])
-        today = [record for record in today if record[version] == newest[of[id(record)]]]
-    chosen = set(map(id, today))
-    return today, [record for record in records if id(record) not in chosen]
+def _newest(records: Sequence[Record]) -> list[Record]:
+    """Those of the newest version of their task and their method; presets, settings and protocols are apart."""
+    for kind in ("task", "method"):
+        versions: dict[str, int] = {}
+        groups = [_slot(record, (kind, *APART)) for record in records]
+        for group, record in zip(groups, records, strict=True):
+            versions[group] = max(versions.get(group, 0), record[f"{kind}_version"])
+        pairs = zip(groups, records, strict=True)
+        records = [record for group, record in pairs if record[f"{kind}_version"] == versions[group]]
+    return list(records)
 
 
 REFERENCED = ("task", "task_version", "protocol", NAME, "expert", "expert_version")  # what 0 and 1 are of

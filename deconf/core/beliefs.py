@@ -133,10 +133,14 @@ class EvidenceBelief(Belief):
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)
 
-    def forward(self, batch: Batch) -> Tensor:
-        terms = self._terms(batch)
+    def _lengthen(self, batch: Batch) -> None:
+        """Keep, in training, the length of the longest trial so far."""
         if self.training and torch.is_grad_enabled():
             self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
+
+    def forward(self, batch: Batch) -> Tensor:
+        terms = self._terms(batch)
+        self._lengthen(batch)
         return torch.cat([torch.zeros_like(terms[:, :, :1]), terms], 2).cumsum(2)
 
     def start(self, n: int) -> Tensor:
@@ -178,8 +182,7 @@ class ForgettingBelief(EvidenceBelief):
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
-        if self.training and torch.is_grad_enabled():
-            self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
+        self._lengthen(batch)
         sums = [terms.cumsum(2), *(faded_sum(terms, kept) for kept in self.KEPT)]
         return F.pad(torch.cat(sums, -1), (0, 0, 1, 0))
 

@@ -220,14 +220,14 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
                 best = max(best, (float(np.corrcoef(*ranks).min()), int(k)), key=lambda pair: pair[0])
         return best if best[0] > chance else (0.0, 0)
 
-    one = np.ones((len(rest), 1))
-    best = alike(kept, rest, np.concatenate([one, inputs], 1))
+    constant = np.ones((len(rest), 1))
+    best = alike(kept, rest, np.concatenate([constant, inputs], 1))
     if not best[0]:
         succeeds = (np.diff(steps.trial) == 0) & (np.diff(episode) == 0) & (np.diff(step) == 1)
         follows = np.concatenate([[False], succeeds])
         rest, likelier = trial_means(basis, rest, steps.trial, follows)
         own = likelier > deviations**2 / 2
-        best = alike(kept[own], rest[:, own], one)
+        best = alike(kept[own], rest[:, own], constant)
     return best if best[0] or chance <= least else None
 
 
@@ -247,12 +247,12 @@ def trial_means(basis: Array, y: Array, trial: Numbers, follows: NDArray[np.bool
     beta = np.zeros((basis.shape[1], y.shape[1]))
     for correlation in LASTING:
         first = np.where(follows[part], 1, (1 - correlation**2) ** 0.5)[:, None]
-        b, z, one = (
+        b, z, constant = (
             first * (x - correlation * follows[part, None] * np.roll(x, 1, 0))
             for x in (basis[part], y[part], np.ones((part.sum(), 1)))
         )
         gram, moment = b.T @ b + RIDGE * len(b) * np.eye(b.shape[1]), b.T @ z
-        p, q, size = (np.add.reduceat(x * one, begins) for x in (b, z, one))
+        p, q, size = (np.add.reduceat(x * constant, begins) for x in (b, z, constant))
         for ratio in RATIOS:
             weight = ratio / (1 + ratio * size)  # [B, 1]
             of_basis, of_y = gram - (weight * p).T @ p, moment - (weight * p).T @ q

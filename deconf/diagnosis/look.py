@@ -117,14 +117,9 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
             text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {_list(named)}."
-            text += (
-                " Where one is held out, its copy betrays it; keep one of each."
-                if kind
-                else (
-                    " A diagnosis never holds one out without its copies; still, they count as often as they are there."
-                )
-            )
-            yield Remark("duplicate", text, True)
+            apart = "A diagnosis never holds one out without its copies; still, they count as often as they are there."
+            betrays = "Where one is held out, its copy betrays it; keep one of each."
+            yield Remark("duplicate", f"{text} {betrays if kind else apart}", True)
     if repeated := [group for group in episodes if group not in whole]:
         names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
         again = sum(len(group) - 1 for group in repeated)

@@ -177,8 +177,8 @@ def moment_loss(residuals: Sequence[Tensor], mask: Tensor) -> Tensor:
 
     residuals: a - pi [S, K, A] in each. mask [S, K].
     """
-    one, other = residuals
-    return masked_mean((one * other).sum(-1), mask)
+    first, second = residuals
+    return masked_mean((first * second).sum(-1), mask)
 
 
 def train(trials: Trials, config: DmlConfig, rng: Rngs, monitor: Monitor | None = None) -> DmlAgent:

@@ -12,7 +12,7 @@ SUITE = (
     *("forked_path", "rolling_deck", "icy_stop", "weak_thruster", "dragged_sled", "cheetah_speed", "ant_goal"),
     *("curling", "swapped_lander", "windy_drone"),
 )
-# Where the exact policy succeeds; scores of learners without theta, and some certificates, are yet to be made.
+# Where the exact policy succeeds, and learners without theta less: docs/hard.md; some certificates are yet to be made.
 HARD = ("gusty_drone", "patchy_road", "loaded_arm", "loaded_drone", "lame_ant")
 
 for _name in (*SUITE, *HARD):  # a task's class has its file's name, in camel case
