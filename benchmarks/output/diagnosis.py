@@ -5,8 +5,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, encoded, panels
+from deconfounded.benchmarks.output.templates import template
 from deconfounded.deconf.diagnosis.judgement import Diagnosis, Figure
 from deconfounded.deconf.diagnosis.thresholds import GOOD, NEGLIGIBLE, STAKES
 from deconfounded.envs.support.files import write_atomically, write_json

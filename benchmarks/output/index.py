@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from PIL import Image
 
@@ -13,6 +12,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import scoring, statistics
 from deconfounded.benchmarks.output.pictures import colours, encoded
+from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.streams import Array
 
 NOTE = (
@@ -32,14 +32,6 @@ Scores = Mapping[str, Mapping[str, Mapping[int, float]]]
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
 COMPARED = (PEER, *EXACT[::-1])  # in paired differences
 Found = Sequence[tuple[envs.Task, dict[str, Any]]]
-
-
-def template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None) -> jinja2.Template:
-    """A page's, beside this file; filters: of its own."""
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    made = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    made.filters.update(filters or {})
-    return made.get_template(name)
 
 
 def measured(methods: dict[str, Any], measure: str) -> dict[str, dict[int, float]]:

@@ -14,8 +14,8 @@ from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.job_files import Finished
 from deconfounded.benchmarks.output import film, records, scoring
-from deconfounded.benchmarks.output.index import template
 from deconfounded.benchmarks.output.pictures import colour, colours, encoded, mark, panels
+from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
 

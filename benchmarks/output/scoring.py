@@ -8,7 +8,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES
@@ -41,6 +40,8 @@ def bootstrap(values: Array) -> Array | None:
     """
     if len(values) < 2:
         return None
+    from scipy import stats  # takes a second
+
     interval = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=0).confidence_interval
     return np.stack([interval.low, interval.high], -1)
 

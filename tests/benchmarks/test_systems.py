@@ -336,7 +336,7 @@ for line in sys.argv[1:]:
         assert not ended.code, line
 """  # in one process: each would import for seconds
         run = f"run --task \u00e9.py:Own --methods conditional --preset smoke --out {home}/r --set eval_trials=4"
-        told = python("-c", code, "--help", "run --list", run, cwd=home, **self.ASCII)
+        told = python("-c", code, "--help", "run --list", run, cwd=home, MUJOCO_GL="off", **self.ASCII)
         assert "usage: deconf" in told
         assert "bandit: best_arm" in told
         assert "caf\\udcc3\\udca9/r/report.html" in told

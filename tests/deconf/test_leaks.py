@@ -154,7 +154,8 @@ class TestData:
     )
     def test_methods_are_handed_no_theta(self, name: str, method: str, monkeypatch: pytest.MonkeyPatch) -> None:
         """Demonstrations are the context's, explorations a plain environment's: again from their seeds, bit for bit."""
-        monkeypatch.setattr(type(envs.get(name)), "horizon", 25)
+        monkeypatch.setattr(type(envs.get(name)), "horizon", 8)
+        monkeypatch.setattr(type(envs.get(name)), "episodes", 2)
         task = envs.get(name)
         modules = {
             "deconfounded": deconfounded,

@@ -76,8 +76,9 @@ def test_exact_policies_at_the_fork() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hidden_goal", "forked_path"])
-def test_tier_2_fails(name: str) -> None:
+def test_tier_2_fails(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Given what dynamics tell, the expert trials of both are a mixture, and so is what is cloned from them."""
+    monkeypatch.setattr(type(envs.get(name)), "episodes", EPISODES)
     task = envs.get(name)
     config = asdict(DeconfoundedConfig(rounds=2, inference_updates=120, imitation_updates=100, final_updates=200))
     amounts = replace(preset("default", task, "cpu"), expert_trials=48, explore_trials=16)

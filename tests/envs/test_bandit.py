@@ -9,7 +9,7 @@ from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, run_trials
 
-N = 20_000
+N = 6_000
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_beliefs_by_hand() -> None:
     ],
 )
 def test_exact_policies(env: envs.BatchEnv, who: str, pulls: float, curve: list[float]) -> None:
-    """Best-arm pulls of 100 and P(best arm) at t = 1, 5, 10, 20, 50, 100, within 4 standard errors of 20,000 trials."""
+    """Best-arm pulls of 100 and P(best arm) at t = 1, 5, 10, 20, 50, 100, within 4 standard errors."""
     expert = policy.load(env.task)
     agent = ExpertAgent(env, expert) if who == "expert" else ExactAgent(env, expert, who == "conditional")
     trials, returns, _ = run_trials(env, agent, 1, seed=5)

@@ -40,7 +40,7 @@ class TestTrials:
     @pytest.mark.parametrize("episodes", [1, 2])
     def test_vector_equals_single_environments(self, name: str, episodes: int, monkeypatch: pytest.MonkeyPatch) -> None:
         """Bit for bit, with keep_theta given by hand; theta is the next of its own stream after `episodes` of them."""
-        monkeypatch.setattr(type(envs.get(name)), "horizon", 25)
+        monkeypatch.setattr(type(envs.get(name)), "horizon", 12)
         task, n = envs.get(name), 2
         vec, single = envs.make_vec(name, n, episodes=episodes), [envs.make(name) for _ in range(n)]
         drawn = [thetas(task, 7 + i, 9) for i in range(n)]
@@ -153,7 +153,7 @@ class TestTimeLimits:
     @pytest.mark.slow
     def test_registered_limit_is_the_task_s(self, name: str) -> None:
         """The made environment truncates when ours does; only an episode that ends by itself then is called both."""
-        task, n = envs.get(name), 8
+        task, n = envs.get(name), 3
         assert gymnasium.spec(task.gym_id).max_episode_steps == task.horizon
         for seed in range(n):
             made, own = gymnasium.make(task.gym_id), envs.make(name)
@@ -174,14 +174,14 @@ class TestTimeLimits:
     def test_vectors_of_gymnasium(self, name: str) -> None:
         """By the vector entry point and in a SyncVectorEnv: the same bits, over an autoreset."""
         task = envs.get(name)
-        ours = gymnasium.make_vec(task.gym_id, num_envs=3, vectorization_mode="vector_entry_point")
-        sync = gymnasium.make_vec(task.gym_id, num_envs=3, vectorization_mode="sync")
+        ours = gymnasium.make_vec(task.gym_id, num_envs=2, vectorization_mode="vector_entry_point")
+        sync = gymnasium.make_vec(task.gym_id, num_envs=2, vectorization_mode="sync")
         assert isinstance(ours, envs.GymVectorEnv)
         assert isinstance(sync, SyncVectorEnv)
         assert ours.spec is not None
         assert ours.spec.max_episode_steps == task.horizon
         np.testing.assert_array_equal(ours.reset(seed=1)[0], sync.reset(seed=1)[0])
-        for action in flat(task, 3, task.horizon + 3):
+        for action in flat(task, 2, task.horizon + 3):
             mine, theirs = ours.step(action), sync.step(action)
             for x, y in zip(mine[:3], theirs[:3], strict=True):
                 np.testing.assert_array_equal(x, y)
