@@ -2,14 +2,17 @@
 PYTHON ?= python3
 VENV := .venv
 
-.PHONY: setup demo test quick lint docs notebooks
+.PHONY: setup demo test pytest quick lint docs notebooks
 
 setup: $(VENV)/installed
 
 demo: $(VENV)/installed
 	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
 
-test: lint
+test: $(VENV)/installed  # side by side, since mypy uses one core
+	$(MAKE) -j2 lint pytest
+
+pytest: $(VENV)/installed
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n auto --dist worksteal
 
 quick: $(VENV)/installed  # what one runs while editing

@@ -31,17 +31,24 @@ def rates() -> str:
 
 
 def _origins(made: list[dict[str, Any]]) -> str:
-    """Where what is kept was made, and of which code, each once."""
-    origins = {(row["machine"], row["versions"]["torch"], records.short_commit(row["commit"])): None for row in made}
-    return "; ".join(f"{machine}, torch {torch}, of {commit}" for machine, torch, commit in origins)
+    """Where what is kept was made, and of which commits, each once."""
+    commits: dict[str, list[str]] = {}
+    for row in made:
+        commits.setdefault(f"{row['machine']}, torch {row['versions']['torch']}", []).append(row["commit"])
+    return "; ".join(
+        f"{where}, of {', '.join(dict.fromkeys(map(records.short_commit, of)))}" for where, of in commits.items()
+    )
 
 
 def _outdated(rows: list[dict[str, Any]]) -> str:
     """Which verdicts are of earlier versions of the diagnosis, as a sentence after another."""
     from deconfounded.deconf.diagnosis.diagnose import VERSION  # torch takes seconds
 
-    old = [row["case"] for row in rows if "verdict" in row and row.get("diagnosis") != VERSION]
-    return f" Verdicts of an earlier version of the diagnosis: {', '.join(old)}." if old else ""
+    judged = [row for row in rows if "verdict" in row]
+    old = [row["case"] for row in judged if row.get("diagnosis") != VERSION]
+    if not old:
+        return ""
+    return f" Verdicts of an earlier version of the diagnosis: {'all' if len(old) == len(judged) else ', '.join(old)}."
 
 
 def validated() -> str:

@@ -152,7 +152,7 @@ for sys.argv in map(list, {lines}):
 @pytest.mark.slow
 def test_smoke_run_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """The whole command on the bandit; then a finished job is lost, and --resume makes the same numbers again."""
-    out, args = tmp_path / "out", ("run", "--task", "bandit", "--preset", "smoke", "--out")
+    out, args = tmp_path / "out", ("run", "--set", "eval_trials=256", "--task", "bandit", "--preset", "smoke", "--out")
     methods = ("--methods", "blind_bc", "conditional", "interventional")
     with monkeypatch.context() as patch:
         patch.setattr(film, "write", Mock(side_effect=envs.InputError("no GL for pictures")))
