@@ -8,7 +8,7 @@ of the result is checked. The tutorials are executed, which trains what they tra
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
@@ -188,6 +188,23 @@ def dead_links(folder: Path) -> list[str]:
     return dead
 
 
+def execute_side_by_side(tutorials: Sequence[Path], folder: Path) -> None:
+    """Execute tutorials, a process each, into a cache in the folder, from which Sphinx takes their outputs.
+
+    Raises InputError with the traceback of one that fails.
+    """
+    from jupyter_cache import get_cache
+    from jupyter_cache.executors import load_executor
+
+    cache = get_cache(folder)
+    for file in tutorials:
+        cache.add_nb_to_project(str(file), read_data={"name": "myst_nb_md", "type": "plugin"})
+    load_executor("temp-parallel", cache).run_and_cache(timeout=600)  # seconds a cell
+    for notebook in cache.list_project_records():
+        if notebook.traceback:
+            raise envs.InputError(f"{Path(notebook.uri).name} fails:\n{notebook.traceback}")
+
+
 def build(folder: Path, execute: bool = True) -> Path:
     """Stage and build the site in a folder; returns that of its html. Raises InputError for warnings and dead links.
 
@@ -197,12 +214,16 @@ def build(folder: Path, execute: bool = True) -> Path:
         from sphinx.cmd.build import main as sphinx
     except ModuleNotFoundError:
         raise envs.InputError("Sphinx is not installed; `pip install .[docs]` brings it") from None
-    for part in ("source", "extra", "html"):
+    for part in ("source", "extra", "html", "executed"):
         shutil.rmtree(folder / part, ignore_errors=True)
     site, html = Site(folder), folder / "html"
     site.write()
     places = ["-c", str(DOCS / "site"), "-d", str(folder / "doctrees"), str(site.source), str(html)]
-    options = ["-D", f"html_extra_path={site.extra}", "-D", f"nb_execution_mode={'force' if execute else 'off'}"]
+    if execute:
+        execute_side_by_side(sorted(site.source.glob("tutorials/*.md")), folder / "executed")
+    notebooks = ["-D", f"nb_execution_mode={'cache' if execute else 'off'}"]
+    notebooks += ["-D", f"nb_execution_cache_path={folder / 'executed'}"]
+    options = ["-D", f"html_extra_path={site.extra}", *notebooks]
     if sphinx(["-W", "--keep-going", "-q", "-E", *options, *places]):
         raise envs.InputError("Sphinx had warnings, see above")
     if dead := dead_links(html):
