@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks.output import records, scoring
+from deconfounded.benchmarks.output import aggregation, records, scoring
 
 LIBRARY = "deconfounded-imitation"
 ABOUT = f"`{LIBRARY}`, a benchmark of [deconfounded imitation learning](https://arxiv.org/abs/2211.02667)"
@@ -38,7 +38,7 @@ def _table(rows: dict[str, Any]) -> str:
 
 def _scores(record: records.Record, every: Sequence[records.Record]) -> tuple[float, str]:
     """The score in the last episode of a trial, and the section on scores."""
-    zero, one = records.references(record, every)
+    zero, one = aggregation.references(record, every)
     episodes = record["episodes"]
     score = scoring.normalise(np.array(record["returns"][:episodes]), zero, one)
     error = np.array(record["returns_sd"][:episodes]) / (one - zero) / record["eval_trials"] ** 0.5

@@ -1,6 +1,6 @@
 """Methods against others, by the same seeds: differences on each task, and over tasks; as text, csv, LaTeX, pictures.
 
-Scores are normalised by one rule (`records.references`). A method is compared on the tasks where both were run.
+Scores are normalised by one rule (`aggregation.references`). A method is compared on the tasks where both were run.
 """
 
 import csv
@@ -15,7 +15,7 @@ import numpy as np
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
 from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.published import RECORDS
-from deconfounded.benchmarks.output import records, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, records, scoring, statistics
 from deconfounded.benchmarks.output.pictures import colours, panels
 from deconfounded.benchmarks.output.records import Record
 from deconfounded.benchmarks.output.scoring import MEASURES, measured
@@ -44,7 +44,7 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
         if record["seed"] in of:
             what = f"{records.named(record)} on {record['task']} with seed {record['seed']}"
             raise InputError(f"there are two records of {what}; give one run of it")
-        zero, one = records.references(record, every)
+        zero, one = aggregation.references(record, every)
         of[record["seed"]] = scoring.normalise(np.array(record["returns"][: record["episodes"]]), zero, one)
 
     for record in every:
@@ -52,12 +52,12 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
             add(record)
     if not scores:
         raise InputError("the records given are of random and expert alone; give those of a method")
-    made_by = {record["task"]: records.referenced(record) for record in every}
+    made_by = {record["task"]: aggregation.referenced(record) for record in every}
     for task, made in made_by.items():
         for record in records.of_task(RECORDS, task, protocol=protocols[0]):
             name = records.named(record)
             ran = any(records.named(one) == name for one in every if one["task"] == task)
-            if records.referenced(record) == made and name in against and not ran:
+            if aggregation.referenced(record) == made and name in against and not ran:
                 add(record)
     for name in against:
         if name not in scores:

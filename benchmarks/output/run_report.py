@@ -13,7 +13,7 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.job_files import Finished
-from deconfounded.benchmarks.output import film, records, scoring
+from deconfounded.benchmarks.output import aggregation, film, records, scoring
 from deconfounded.benchmarks.output.pictures import colour, colours, encoded, mark, panels
 from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.support.errors import error_line
@@ -27,7 +27,7 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     """
     made = records.of_run(finished, about["preset"], about["set"], task.episodes)
     records.write(folder / "records", made)
-    results = {**records.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
+    results = {**aggregation.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
     write_json(folder / "results.json", results)
     write_atomically(folder / "rows.csv", scoring.csv_rows(task, results, finished))
     try:

@@ -20,8 +20,8 @@ from deconfounded.benchmarks.engine.job_files import Finished, by_method
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.benchmarks.output import scoring
+from deconfounded.benchmarks.output.aggregation import covered
 from deconfounded.benchmarks.output.pictures import colour, panels
-from deconfounded.benchmarks.output.records import covered
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent

@@ -183,7 +183,7 @@ def scaled(config: dict[str, Any], share: float) -> dict[str, Any]:
 def cost(args: argparse.Namespace) -> None:
     """Of some tasks: one seed of each learned method, with each share of its updates."""
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output import aggregation
     from deconfounded.benchmarks.output.index import last_scores
 
     for task in args.tasks or map(envs.get, COST):
@@ -192,7 +192,7 @@ def cost(args: argparse.Namespace) -> None:
             settings = replace(full, configs={name: scaled(config, share) for name, config in full.configs.items()})
             own = args.out / f"cost-{task.name}" / f"{share:g}"
             made = runs.run(task, settings, (*REFERENCES, *LEARNED), (0,), own)
-            results = records.gather(made)["methods"]
+            results = aggregation.gather(made)["methods"]
             last = last_scores(results)
             for method in LEARNED:
                 scores = [round(score, 4) for score in last[method].values()]

@@ -23,7 +23,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
-from deconfounded.benchmarks.output import index, records
+from deconfounded.benchmarks.output import aggregation, index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of, still
 from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, results, spectrum, validate
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS
@@ -71,7 +71,7 @@ def keep(run: Path) -> None:
     if len(files) != 1 or not (run / "adaptation.png").is_file():
         raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
     made = records.read(files[0])
-    results = records.gather(made, list(METHODS))
+    results = aggregation.gather(made, list(METHODS))
     if results["preset"] != "default" or {"set", "salt", records.NAME} & set(results):
         wrong = f"of preset {results['preset']}, or changed, or of another protocol"
         raise envs.InputError(f"{run} is {wrong}; pages show the default preset and the standard protocol alone")

@@ -9,7 +9,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD
-from deconfounded.benchmarks.output import index, records, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, index, records, scoring, statistics
 from deconfounded.benchmarks.output.index import NOTE, PEER, answers
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
@@ -42,7 +42,7 @@ TIMED = ("bandit", "tilted_cartpole", "slippery_cartpole")  # in docs/speed.md
 def published(protocol: str = STANDARD, names: Sequence[str] = envs.SUITE) -> index.Found:
     """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
     kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
-    return [(envs.get(name), records.gather(of, list(METHODS))) for name, of in kept.items() if of]
+    return [(envs.get(name), aggregation.gather(of, list(METHODS))) for name, of in kept.items() if of]
 
 
 def other_protocols() -> dict[str, index.Found]:

@@ -48,7 +48,8 @@ MODULES = {  # of the API reference
         f"deconfounded.deconf.diagnosis.{name}" for name in ("diagnose", "look", "exploration", "measures", "latent")
     ),
     "Results": tuple(
-        f"deconfounded.benchmarks.output.{name}" for name in ("records", "scoring", "statistics", "comparison")
+        f"deconfounded.benchmarks.output.{name}"
+        for name in ("records", "aggregation", "scoring", "statistics", "comparison")
     ),
 }
 TYPICAL = {"control": "slippery_cartpole", "bandit": "bandit"}  # tasks whose amounts a method's page shows

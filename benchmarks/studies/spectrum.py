@@ -104,7 +104,7 @@ def main() -> None:
     methods = commands.check(args, LEARNED, LEARNED)
     check_names("task", args.tasks, list(noise.BASES))
     from deconfounded.benchmarks.engine.presets import changed, preset
-    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output import aggregation
     from deconfounded.benchmarks.output.index import last_scores
 
     folder, points = args.out or Path("results") / "spectrum", list[Point]()
@@ -114,7 +114,7 @@ def main() -> None:
         settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
         certificate, wanted = runs.certificate(task, weights, own), (*REFERENCES, *EXACT, *methods)
         made = runs.run(task, settings, wanted, range(args.seeds), own, expert=weights, **options)
-        results = records.gather(made)
+        results = aggregation.gather(made)
         scores = last_scores(results["methods"])
         last = {method: [*scores[method].values()] for method in scores if method in wanted}
         about = {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}

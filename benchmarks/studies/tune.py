@@ -91,7 +91,7 @@ def main() -> None:
     args = parser.parse_args()
     check_names("method", args.methods or (), list(TRIED))
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output import aggregation
     from deconfounded.benchmarks.output.index import last_scores
 
     file, tasks = DOCS / "tuning.json", [envs.get(name) for name in TASKS]
@@ -109,7 +109,7 @@ def main() -> None:
         for task in tasks:
             # A folder a task: what does not depend on the setting, demonstrations and references, is made once.
             own, asked = args.out / task.name, (*REFERENCES, name)
-            results = records.gather(runs.run(task, settings[task.name], asked, SEEDS, own, base=base[task.name]))
+            results = aggregation.gather(runs.run(task, settings[task.name], asked, SEEDS, own, base=base[task.name]))
             row |= {"commit": results["commits"][-1], "machine": results["machine"], "versions": results["versions"]}
             entry = results["methods"][name]
             row["scores"][task.name] = [round(score, 4) for score in last_scores(results["methods"])[name].values()]

@@ -107,14 +107,14 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
     """Scores of the last episode: of the records in docs/, of docs/spectrum.json, or of a run made here."""
     from deconfounded.benchmarks.engine.catalogue import REFERENCES
     from deconfounded.benchmarks.engine.presets import preset
-    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output import aggregation, records
 
     if of := point(task):
         return {name: float(np.mean(of["scores"][name])) for name in LEARNED}
     made = records.of_task(DOCS / "records", task.name) or runs.run(
         task, preset("default", task, "cpu"), (*REFERENCES, *LEARNED), range(3), folder, expert=source
     )
-    methods = records.gather(made)["methods"]
+    methods = aggregation.gather(made)["methods"]
     return {name: float(methods[name]["score_last"]) for name in LEARNED}
 
 

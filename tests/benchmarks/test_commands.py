@@ -386,10 +386,6 @@ class TestFiles:
             read_sealed(tmp_path / "x.json")
 
 
-def test_time_worked_counts_overlaps_once() -> None:
-    assert records.covered([(5, 6), (0, 2), (1, 3)]) == 4
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("backend", ["off", "nonsense"])
 def test_no_gl_is_only_a_note(backend: str) -> None:

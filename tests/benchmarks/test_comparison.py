@@ -18,7 +18,7 @@ from deconfounded.benchmarks.engine import catalogue, job_files, presets, progre
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
-from deconfounded.benchmarks.output import comparison, pictures, records, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, comparison, pictures, records, scoring, statistics
 from deconfounded.envs.support.errors import InputError, error_line
 from tests.tools import tiny_preset
 
@@ -63,7 +63,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def record(method: str, seed: int, score: float, task: str = "curling") -> records.Record:
     """Of a method from outside on a task of the suite, with that score in each episode."""
     like = records.of_task(published.RECORDS, task)[0]
-    zero, one = records.references(like)
+    zero, one = aggregation.references(like)
     returns = [zero + score * (one - zero)] * len(like["returns"])
     return {**like, "method": method, "method_version": 0, "deployment": "", "seed": seed, "returns": returns}
 
@@ -162,12 +162,10 @@ class TestScores:
         kept = records.of_task(published.RECORDS, "curling")
         seeds = [[0, 1, 2], [0, 1, 2, 7, 8, 9]]
         both = [[r for r in kept if r["seed"] in (s if r["method"] in catalogue.REFERENCES else s[:3])] for s in seeds]
-        one, two = (records.gather(of)["methods"]["naive_rnn"] for of in both)
-        assert one["score"] == two["score"]
-        other = [{**r, "expert": "0" * 64} for r in both[0]]  # an expert of one's own: its run's own references
-        assert (
-            records.gather(other)["methods"]["expert"]["score"] != records.gather(both[0])["methods"]["expert"]["score"]
-        )
+        few, many = (aggregation.gather(of)["methods"] for of in both)
+        assert few["naive_rnn"]["score"] == many["naive_rnn"]["score"]
+        foreign = [{**r, "expert": "0" * 64} for r in both[0]]  # an expert of one's own: its run's own references
+        assert aggregation.gather(foreign)["methods"]["expert"]["score"] != few["expert"]["score"]
 
     def test_coverage(self) -> None:
         """Of the interval that tables show, by an independent simulation."""

@@ -16,7 +16,7 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.benchmark import evaluate, objective
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.output import records, run_report, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
 from deconfounded.deconf.methods import memoryless_bc
@@ -147,7 +147,7 @@ def some() -> Found:
     """Two tasks as the pages are made of them today."""
     tasks = [envs.get(name) for name in ("swapped_lander", "curling")]
     kept = [records.of_task(ROOT / "docs" / "records", task.name) for task in tasks]
-    return [(task, records.gather(of, list(METHODS))) for task, of in zip(tasks, kept, strict=True)]
+    return [(task, aggregation.gather(of, list(METHODS))) for task, of in zip(tasks, kept, strict=True)]
 
 
 @pytest.mark.slow

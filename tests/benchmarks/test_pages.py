@@ -15,7 +15,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import index, records, run_report, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure, still
 from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, publish, results, tune
@@ -498,7 +498,7 @@ class TestInABrowser:
 
 def test_report_in_a_browser(seen: "Page", errors: list[str], tmp_path: Path) -> None:
     """A run's report fits as well; its table scrolls, and each method has its curves."""
-    results = records.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
+    results = aggregation.gather(records.of_task(DOCS / "records", "slippery_cartpole"), list(METHODS))
     run_report.adaptation(results, tmp_path / "adaptation.png")
     run_report.learning(results, tmp_path / "learning.png")
     (tmp_path / "report.html").write_text(run_report.page(results, tmp_path))
@@ -551,7 +551,7 @@ def test_commands_of_numbers() -> None:
     task = envs.get("bandit")
     found = records.of_task(DOCS / "records", "bandit")
     outside = [{**one, "method": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
-    gathered = records.gather([*found, *outside], list(METHODS))
+    gathered = aggregation.gather([*found, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"
     episode = "deconfounded_discrete_episode"
     assert results.command(task, gathered, episode) == f"{start} --methods deconfounded_discrete"

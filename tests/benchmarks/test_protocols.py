@@ -17,7 +17,7 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import identity
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.published import RECORDS
-from deconfounded.benchmarks.output import comparison, records
+from deconfounded.benchmarks.output import aggregation, comparison, records
 from deconfounded.benchmarks.studies import table
 from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import RandomAgent
@@ -119,11 +119,11 @@ class TestTables:
         assert records.of_task(tmp_path, "curling", protocol="once") == others
         assert not (tmp_path / "superseded").exists()
         with pytest.raises(envs.InputError, match="protocol_name standard and once do not belong in one table"):
-            records.gather([*kept, *others])
-        assert records.gather(others)["protocol_name"] == "once"
+            aggregation.gather([*kept, *others])
+        assert aggregation.gather(others)["protocol_name"] == "once"
         less = [{**one, "returns": [value - 1 for value in one["returns"]]} for one in others]
-        own = [value + 1 for value in records.references(less[0], less)]
-        assert own == pytest.approx(records.references(others[0], others))
+        own = [value + 1 for value in aggregation.references(less[0], less)]
+        assert own == pytest.approx(aggregation.references(others[0], others))
 
     def test_compare_refuses_two(self, both: tuple[list[Any], list[Any]]) -> None:
         kept, others = both

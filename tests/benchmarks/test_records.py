@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine import identity, job_files, local, progress,
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.local import Here
-from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.output import aggregation, records
 from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.deconf.methods import dagger
 from deconfounded.envs.support.files import PARTIAL, write_sealed
@@ -342,7 +342,11 @@ class TestRecords:
     def test_never_mixed(self, job: BenchmarkJob, key: str) -> None:
         one, two = kept(job)
         with pytest.raises(envs.InputError, match=f"records with {key} .* do not belong in one table"):
-            records.gather([one, {**two, key: "other"}])
+            aggregation.gather([one, {**two, key: "other"}])
+
+
+def test_time_worked_counts_overlaps_once() -> None:
+    assert aggregation.covered([(5, 6), (0, 2), (1, 3)]) == 4
 
 
 class TestVerify:
