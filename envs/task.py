@@ -15,7 +15,6 @@ import copy
 import inspect
 from abc import ABC, abstractmethod
 from dataclasses import replace
-from functools import reduce
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, Self
 
@@ -27,6 +26,7 @@ from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.spaces import action_sizes
+from deconfounded.envs.theta import ThetaModel
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
@@ -59,12 +59,13 @@ class Simulator:
         return self.task.outcome(state, action, self.theta if rows is None else self.theta[rows])
 
 
-class Task(ABC):
+class Task(ThetaModel, ABC):
     """A family of MDPs M_theta with theta ~ p(theta), an observation that hides theta, and a reward for scoring.
 
     Transitions have two parts: a deterministic *outcome* (the next state of a physics engine, or the probability
     of a pay-out) and noise that acts on it, so that p(s'|s, a, theta) has a closed form. Sensors may depend on theta,
-    too: their readings are part of the state, and have a likelihood of their own (`sense`, `log_sense`).
+    too: their readings are part of the state, and have a likelihood of their own (`sense`, `log_sense`). How theta
+    is drawn, drifts and switches follows from the latents (`ThetaModel`, envs/theta.py).
     """
 
     name: ClassVar[str]
@@ -173,40 +174,11 @@ class Task(ABC):
         return action_sizes(self.action_space)[0]
 
     @property
-    def theta_width(self) -> int:
-        """F, the width of `encode_theta`."""
-        return sum(latent.features for latent in self.latents)
-
-    @property
     def gym_id(self) -> str:
         """Gymnasium's id of the task, such as deconf/SlipperyCartpole-v0."""
         return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
 
-    def sample_theta(self, rng: Streams) -> Array:
-        """Draws theta [N, L] ~ p(theta); rng has a generator for each environment."""
-        u = self.quantile(rng.random((rng.groups, len(self.latents))))
-        return np.stack([lat.ppf(u[:, i]) for i, lat in enumerate(self.latents)], -1)
-
-    def quantile(self, u: Array) -> Array:
-        """Uniform numbers [N, L] -> the quantiles of p(theta) at which theta is drawn; the same, unless restricted."""
-        return u
-
-    @property
-    def drifts(self) -> bool:
-        """Whether theta changes between the episodes of a trial."""
-        return any(lat.drift for lat in self.latents)
-
-    def drifted(self, theta: Array, rng: Streams) -> Array:
-        """Theta [N, L] of a trial's next episode; rng has a generator for each environment."""
-        normal = rng.standard_normal((rng.groups, len(self.latents)))
-        return np.stack([lat.drifted(theta[:, i], normal[:, i]) for i, lat in enumerate(self.latents)], -1)
-
-    @property
-    def switches(self) -> bool:
-        """Whether theta changes within episodes."""
-        return any(lat.switch for lat in self.latents)
-
-    def without_switches(self) -> "Task":
+    def without_switches(self) -> Self:
         """The same task, with a theta that holds still within episodes."""
         if not self.switches:
             return self
@@ -217,41 +189,6 @@ class Task(ABC):
         other = copy.copy(self)
         other.__dict__.update(attributes)
         return other
-
-    def theta_path(self, theta: Array, rng: Streams) -> Array:
-        """Theta [N, T + 1, L] at each step of an episode that starts with theta [N, L], and after its last step.
-
-        It does not depend on what happens in the episode: one that ends early is waited out.
-        """
-        u, path = rng.random((rng.groups, self.horizon, len(self.latents))), [theta]
-        for t in range(self.horizon):
-            pairs = enumerate(self.latents)
-            path.append(np.stack([lat.switched(path[-1][:, i], u[:, t, i]) for i, lat in pairs], -1))
-        return np.stack(path, 1)
-
-    def theta_grid(self, k: int) -> Array:
-        """A grid of equally likely thetas [K, L]. Of a single latent it has k values, K = k.
-
-        Of L latents it has all combinations of m values of each, K = m^L, with m = floor(k^(2 / (L + 1))), at least 2;
-        K may be more than k: of two latents, k = 21 makes 7 x 7. A categorical latent has all of its values, for any k.
-        """
-        axes = np.meshgrid(*(lat.grid(self._values_each(k)) for lat in self.latents), indexing="ij")
-        return np.stack([axis.ravel() for axis in axes], -1)
-
-    def _values_each(self, k: int) -> int:
-        return max(2, int(k ** (2 / (len(self.latents) + 1)))) if len(self.latents) > 1 else k
-
-    def transition(self, k: int) -> Array:
-        """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next episode | theta of this episode)."""
-        return reduce(np.kron, (lat.transition(self._values_each(k)) for lat in self.latents))
-
-    def switching(self, k: int) -> Array:
-        """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next step | theta of this step)."""
-        return reduce(np.kron, (lat.switching(self._values_each(k)) for lat in self.latents))
-
-    def encode_theta(self, theta: Array) -> Array:
-        """Features [..., F] of theta [..., L], of about unit size, for experts and oracles alone."""
-        return np.concatenate([lat.encode(theta[..., i]) for i, lat in enumerate(self.latents)], -1)
 
     def seen_theta(self, obs: Array, theta: Array) -> Array:
         """Features [N, F'] of theta [N, L] that experts are given at observations [N, O]; by default all."""
@@ -265,28 +202,6 @@ class Task(ABC):
     def acting_theta(self, theta: Array, state: Array) -> Array:
         """Those of the latents [N, L] that act on a step from states [N, S]; by default all."""
         return theta
-
-    def check_theta(self, theta: object, n: int) -> Array:
-        """Any array-like -> [N, L]. Raises InputError for a wrong shape or a value out of bounds."""
-        try:
-            array = np.asarray(theta)
-            if array.dtype.kind not in "iuf":
-                raise TypeError
-            array = np.broadcast_to(array.astype(float), (n, len(self.latents))).copy()
-        except (TypeError, ValueError):
-            right = f"{len(self.latents)} number(s), or one row for each of the {n} environment(s)"
-            raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None
-        self._check_bounds(array)
-        return array
-
-    def _check_bounds(self, theta: Array) -> None:
-        """Raises InputError for a theta [N, L] that cannot be drawn."""
-        for column, lat in zip(theta.T, self.latents, strict=True):
-            whole = lat.distribution == "categorical"
-            bad = column[~((column >= lat.low) & (column <= lat.high)) | whole & (column != np.floor(column))]
-            if bad.size:
-                right = f"a {'whole ' * whole}number from {lat.low:g} to {lat.high:g} {lat.unit}".rstrip()
-                raise InputError(f"{lat.name} of {self.name} was {bad[0]:g}; it must be {right}")
 
     def check_action(self, action: object, n: int, ignored: Mask | None = None) -> Array:
         """Any array-like -> [N, A] float. Raises InputError for a wrong shape, NaN, or an arm that does not exist.

@@ -21,7 +21,8 @@ from deconfounded.deconf.method import ENVIRONMENT, USES
 TASKS = (*envs.SUITE, *envs.HARD)
 MODULES = {  # of the API reference
     "Environments": (
-        *("deconfounded", "deconfounded.envs", "deconfounded.envs.task", "deconfounded.envs.latent"),
+        *("deconfounded", "deconfounded.envs", "deconfounded.envs.task"),
+        *("deconfounded.envs.theta", "deconfounded.envs.latent"),
         *("deconfounded.envs.physics", "deconfounded.envs.edits", "deconfounded.envs.noise", "deconfounded.envs.batch"),
         *("deconfounded.envs.adapters", "deconfounded.envs.registry", "deconfounded.envs.streams"),
         *("deconfounded.envs.blackbox", "deconfounded.envs.contract.check", "deconfounded.envs.support.errors"),
