@@ -73,7 +73,7 @@ class InContext(Transformer):
         turned = [x.flatten(0, 1)[:, None] for x in rotation(seen, self.width // self.heads)]
         x = self.embed(torch.cat([context, queries], 2))
         for i in range(self.depth):
-            qkv = self.attend[i](normed(x)).unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5).flatten(1, 2)
+            qkv = self.projected(i, x)
             before, after = qkv[..., :length, :], qkv[..., length:, :]
             (read, key), value = rotated(before[:2], turn), before[2]
             ask, own_key = rotated(after[:2], (turned[0], turned[1]))
@@ -81,8 +81,7 @@ class InContext(Transformer):
             mixed = [F.scaled_dot_product_attention(read, key, value, is_causal=True)] if i + 1 < self.depth else []
             mixed.append(F.scaled_dot_product_attention(ask, keys, values, mask))
             x = x[:, :, -count:] if i + 1 == self.depth else x  # nobody reads the context's last layer
-            x = x + self.mix[i](torch.cat(mixed, -2).unflatten(0, seen.shape[:2]).transpose(2, 3).flatten(3))
-            x = x + self.narrow[i](F.gelu(self.widen[i](normed(x))))
+            x = self.after_attention(i, x, torch.cat(mixed, -2))
         return normed(x)
 
 

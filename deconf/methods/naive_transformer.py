@@ -113,16 +113,21 @@ class Transformer(nn.Module):
         x = self.embed(tokens)
         turn = rotation(torch.arange(tokens.shape[2], device=tokens.device), self.width // self.heads)
         for i in range(self.depth):
-            x = x + self.mix[i](self._attention(self.attend[i](normed(x)), turn))
-            x = x + self.narrow[i](F.gelu(self.widen[i](normed(x))))
+            qkv = self.projected(i, x)
+            query, key = rotated(qkv[:2], turn)
+            mixed = F.scaled_dot_product_attention(query, key, qkv[2], is_causal=True)
+            x = self.after_attention(i, x, mixed)
         return normed(x)
 
-    def _attention(self, projected: Tensor, turn: tuple[Tensor, Tensor]) -> Tensor:
-        """[S, B, T, 3 W] -> [S, B, T, W]."""
-        qkv = projected.unflatten(-1, (3, self.heads, -1)).permute(3, 0, 1, 4, 2, 5)  # [3, S, B, H, T, D]
-        query, key = rotated(qkv[:2].flatten(1, 2), turn)
-        mixed = F.scaled_dot_product_attention(query, key, qkv[2].flatten(0, 1), is_causal=True)
-        return mixed.unflatten(0, projected.shape[:2]).transpose(2, 3).flatten(3)
+    def projected(self, layer: int, x: Tensor) -> Tensor:
+        """Queries, keys and values [3, S B, H, T, D] of a layer, from its inputs [S, B, T, W]."""
+        qkv = self.attend[layer](normed(x)).unflatten(-1, (3, self.heads, -1))
+        return qkv.permute(3, 0, 1, 4, 2, 5).flatten(1, 2)
+
+    def after_attention(self, layer: int, x: Tensor, mixed: Tensor) -> Tensor:
+        """Outputs [S, B, T, W] of a layer, from its inputs [S, B, T, W] and what its heads attend to [S B, H, T, D]."""
+        x = x + self.mix[layer](mixed.unflatten(0, x.shape[:2]).transpose(2, 3).flatten(3))
+        return x + self.narrow[layer](F.gelu(self.widen[layer](normed(x))))
 
     def layers(self, seed: int) -> list[tuple[Tensor, Tensor]]:
         """Bias and weight of a seed's linear maps, in the order of `step`."""
