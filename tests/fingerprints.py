@@ -180,8 +180,8 @@ def of_protocol(name: str) -> Numbers:
     seeds = [stream(purpose, seed, salt) for purpose in (1, 2, 3, 4) for seed in (0, 1) for salt in ("", "salt")]
     trials, returns, _ = run_trials(env, RandomAgent(task.action_space), 2, seeds[:2])
     theta = rng.uniform(-1, 1, (4, 2, 1))
-    known = rng.standard_normal((40, 6))
-    r2, _ = benchmark.probe(known, known[:, :2] + 0.3 * rng.standard_normal((40, 2)))
+    features = rng.standard_normal((40, 6))
+    r2, _ = benchmark.probe(features, features[:, :2] + 0.3 * rng.standard_normal((40, 2)))
     return {
         "seeds": sums(np.array(seeds) / 2**31),
         "observations": sums(trials.obs),

@@ -75,7 +75,7 @@ def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
 
 def processes(mark: str, *starts: str) -> list[tuple[int, str]]:
     """Number and command line of those with `mark` (NAME=value) in their environment, whose command line starts so."""
-    found = []
+    matching = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
             words, environ = ((folder / name).read_bytes() for name in ("cmdline", "environ"))
@@ -83,5 +83,5 @@ def processes(mark: str, *starts: str) -> list[tuple[int, str]]:
             continue
         line = words.decode(errors="replace")
         if mark.encode() in environ.split(b"\0") and line.startswith(starts):
-            found.append((int(folder.name), line))
-    return sorted(found)
+            matching.append((int(folder.name), line))
+    return sorted(matching)

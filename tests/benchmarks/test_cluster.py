@@ -127,7 +127,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     for job in local:
         job.run()
 
-    told: list[tuple[str, str | Exception]] = []
+    lines: list[tuple[str, str | Exception]] = []
     ticks: list[int] = []
     seen: list[str] = []
 
@@ -139,7 +139,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
             two.second = None
 
     def say(job: Job, line: str | Exception) -> None:
-        told.append((job.method, line))
+        lines.append((job.method, line))
 
     with cluster.Cluster(two.address) as engine:
         assert (engine.slots("cpu"), two.second is not None) == (2, True)
@@ -157,9 +157,9 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
         engine.run([*dawdling, *guests], tick, say)
     assert two.second is None
     assert sum(ticks) == sum(job.ticks for job in [*dawdling, guests[0]])
-    lost = [line for method, line in told if method == "naive_rnn" and "tried again" in str(line)]
+    lost = [line for method, line in lines if method == "naive_rnn" and "tried again" in str(line)]
     assert lost == ["its worker was lost; it is tried again"]
-    failed = [line for _, line in told if isinstance(line, Exception)]
+    failed = [line for _, line in lines if isinstance(line, Exception)]
     assert [str(error) for error in failed] == ["method my_guest_broken: no luck (ValueError, my_guest.py:18)"]
     spans = []
     for seed, mine, theirs in zip((0, 1), local, dawdling, strict=True):
@@ -195,17 +195,17 @@ def test_what_a_job_needs_travels(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     job = BenchmarkJob(task, tiny_preset(), "naive_rnn", (3, 4), tmp_path / "jobs", expert)
     for name in ("demonstrations-3.npz", "demonstrations-5.npz", ".naive_rnn-3-4.pt", ".naive_rnn-3.pt"):
         (job.folder / name).write_bytes(b"some")
-    found = cluster.given(job)
+    files = cluster.given(job)
     inside = {"jobs/demonstrations-3.npz", "jobs/.naive_rnn-3-4.pt"}
     theirs = {f"outside{tmp_path}/{name}" for name in ("own.py", "beside.py", "linear.py", "own_cartpole.xml")}
-    assert set(found) == inside | theirs
+    assert set(files) == inside | theirs
 
     before = identity.expert(envs.get("slippery_cartpole"), expert)
     sent = tmp_path / "sent"
     for name in theirs:
         (sent / name).parent.mkdir(parents=True, exist_ok=True)
-        (sent / name).write_bytes(found[name].read_bytes())
-        found[name].unlink()
+        (sent / name).write_bytes(files[name].read_bytes())
+        files[name].unlink()
     monkeypatch.setenv(outside.SENT, str(sent / "outside"))
     assert outside.here(tmp_path / "own.py") == sent / "outside" / Path(*tmp_path.parts[1:]) / "own.py"
     assert outside.file(expert) == outside.here(tmp_path / "linear.py")

@@ -106,18 +106,18 @@ def test_a_method_in_this_process_is_as_in_its_own(mine: Path) -> None:
     settings = presets.changed(presets.preset("smoke", envs.get("weak_thruster"), "cpu"), [f"{name}.updates=3"])
     settings = presets.changed(settings, ["eval_trials=4", "expert_trials=4", "explore_trials=4"])
     assert settings.configs[name]["updates"] == 3
-    found = []
+    returns = []
     for walled in (True, False):
         context = Context(envs.get("weak_thruster"), settings, [0])
         method = catalogue.METHODS[name]
         make: Callable[[], Any] = lambda c=context, m=method: Guest(c, name, m.reference, m.uses)  # noqa: E731
         agent = make() if walled else fit_guest(context, name, method)
         try:
-            found.append(evaluate(context, agent, True)[0]["returns"])
+            returns.append(evaluate(context, agent, True)[0]["returns"])
         finally:
             if isinstance(agent, Guest):
                 agent.close()
-    assert (found[0] == found[1]).all()
+    assert (returns[0] == returns[1]).all()
 
 
 def test_tracebacks_are_kept_until_it_works(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,5 +34,5 @@ def test_flipped_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jobs, "SAVE_EVERY_S", jobs.SAVE_EVERY_S)
     monkeypatch.setattr(CurveMonitor, "close", CurveMonitor.close)
     for kind, (file, read) in flips.files(tmp_path).items():
-        found = flips.flip(file, read, 12, seed=1)
-        assert set(found) <= {"noticed", "harmless"}, (kind, found)
+        outcomes = flips.flip(file, read, 12, seed=1)
+        assert set(outcomes) <= {"noticed", "harmless"}, (kind, outcomes)

@@ -87,15 +87,15 @@ def test_interrupted_training_goes_on(
     broken.run()
     assert seen[0] < seen[first] <= seen[first - 1]  # it went on
     for seed in (0, 1):
-        expected, found = whole.load(seed), broken.load(seed)
+        expected, resumed = whole.load(seed), broken.load(seed)
         assert expected is not None
-        assert found is not None
+        assert resumed is not None
         for key in expected.keys() - {"meta"}:
-            np.testing.assert_array_equal(found[key], expected[key], err_msg=key)
-        assert {k: v for k, v in found["meta"].items() if k not in ("spans", "train_s", "cpu_s")} == {
+            np.testing.assert_array_equal(resumed[key], expected[key], err_msg=key)
+        assert {k: v for k, v in resumed["meta"].items() if k not in ("spans", "train_s", "cpu_s")} == {
             k: v for k, v in expected["meta"].items() if k not in ("spans", "train_s", "cpu_s")
         }
-        assert len(found["meta"]["spans"]) == 2
+        assert len(resumed["meta"]["spans"]) == 2
     assert not list(broken.folder.glob(".*.pt"))
 
 
@@ -116,14 +116,14 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert references["interventional"]["pulls"] == pytest.approx(54.1, abs=1.5)
     assert references["conditional"]["online"][[0, 9, 99]] == pytest.approx([0.2, 0.306, 0.333], abs=0.05)
     assert references["expert"]["loss"] == pytest.approx(-0.6 * np.log(0.6) - 0.4 * np.log(0.1))
-    found = paper.summarise(finished, references)
-    assert found["deconfounded"]["budget"] == {"expert_trials": 8, "exploration_trials": 20}
-    assert found["naive_rnn"]["target"] == "conditional"
-    gap = np.abs(np.array(found["naive_rnn"]["online"]) - references["conditional"]["online"]).max()
-    assert found["naive_rnn"]["max_gap_online"] == pytest.approx(gap, abs=2e-4)
+    summary = paper.summarise(finished, references)
+    assert summary["deconfounded"]["budget"] == {"expert_trials": 8, "exploration_trials": 20}
+    assert summary["naive_rnn"]["target"] == "conditional"
+    gap = np.abs(np.array(summary["naive_rnn"]["online"]) - references["conditional"]["online"]).max()
+    assert summary["naive_rnn"]["max_gap_online"] == pytest.approx(gap, abs=2e-4)
     assert "20 exploration trials" in paper.write(task, {"set": []}, finished, references, tmp_path)
     results = json.loads((tmp_path / "results.json").read_text())
-    assert results["methods"] == found
+    assert results["methods"] == summary
     assert results["wall_s"] > 0
     assert len((tmp_path / "rows.csv").read_text().splitlines()) == 1 + len(finished)
     assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("figure2", "figure3", "tiers"))
@@ -199,7 +199,7 @@ def test_tensorboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job.run()
     kept = job.load(0)
     assert kept is not None
-    shown = EventAccumulator(str(tmp_path / "tensorboard" / "naive_rnn-0"))
-    shown.Reload()
-    curve = [[event.step, event.value] for event in shown.Scalars("loss/imitation")]
+    events = EventAccumulator(str(tmp_path / "tensorboard" / "naive_rnn-0"))
+    events.Reload()
+    curve = [[event.step, event.value] for event in events.Scalars("loss/imitation")]
     np.testing.assert_allclose(curve, kept["meta"]["curve"]["imitation"], rtol=1e-6)

@@ -99,8 +99,8 @@ def test_run_play_score(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.search(r"bend 0\.2 rad: returns [\d.]+ [\d.]+$", played.stdout.strip()), played.stderr
     scored = deconf(folder, "score", *agent, *mine, "--trials", "4", "--range", "bend=0.4:0.5", "--out", "s.json")
     assert scored.returncode == 0, scored.stderr
-    found = json.loads((folder / "s.json").read_text())
-    assert len(found["score"]) == 5
+    scores = json.loads((folder / "s.json").read_text())
+    assert len(scores["score"]) == 5
     wrong = deconf(folder, "play", *agent, "--task", "bandit")
     assert wrong.returncode == 2
     assert wrong.stderr.startswith("error: the agent in ")
@@ -128,10 +128,10 @@ def test_check(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         monkeypatch.setattr("sys.argv", ["deconf check", "--task", f"{folder}/{file}"])
         with pytest.raises(SystemExit) as ended:
             check.main()
-        told = capsys.readouterr().out
-        assert ended.value.code == code, told
-        assert ("FAIL" in told) == bool(code)
-    assert "FAIL noise_covers_every_coordinate_that_matters: theta moves a coordinate without process noise" in told
+        output = capsys.readouterr().out
+        assert ended.value.code == code, output
+        assert ("FAIL" in output) == bool(code)
+    assert "FAIL noise_covers_every_coordinate_that_matters: theta moves a coordinate without process noise" in output
 
 
 @pytest.mark.slow
@@ -152,10 +152,10 @@ def test_method_of_readme() -> None:
     space: dict[str, Any] = {}
     exec(code, space)
     context = Context(envs.get(CONTROL), tiny_preset(), [0])
-    shown = context.demonstrations
-    agent = space["fit"](SimpleNamespace(demonstrations=shown))
+    trials = context.demonstrations
+    agent = space["fit"](SimpleNamespace(demonstrations=trials))
     assert space["fit"].method.uses == ("demonstrations",)
-    obs, action = shown.obs[:, :, :-1][shown.mask], shown.action[shown.mask]
+    obs, action = trials.obs[:, :, :-1][trials.mask], trials.action[trials.mask]
     assert np.square(agent.act(obs) - action).mean() < 0.8 * action.var()
     assert np.abs(agent.act(10 * obs)).max() == 1
 
@@ -390,9 +390,9 @@ def test_guests_get_what_ours_get(tmp_path: Path) -> None:
     text = """
 @uses("demonstrations", "exploration", "queries", "theta")
 def fit(given):
-    shown, theta = given.demonstrations, given.theta
+    demonstrations, theta = given.demonstrations, given.theta
     free, (asked, labels) = given.explore(), given.query(Still(), 3)
-    np.savez("%s", shown=shown.obs, theta=theta, free=free.obs, asked=asked.action, labels=labels)
+    np.savez("%s", demonstrations=demonstrations.obs, theta=theta, free=free.obs, asked=asked.action, labels=labels)
     given.progress(1.0, imitation=0.5)
     return Still()
 """
@@ -401,7 +401,7 @@ def fit(given):
     agent.close()
     with np.load(out) as seen:
         other = Context(envs.get(CONTROL), tiny_preset(), [0])
-        np.testing.assert_array_equal(seen["shown"], other.demonstrations.obs)
+        np.testing.assert_array_equal(seen["demonstrations"], other.demonstrations.obs)
         np.testing.assert_array_equal(seen["theta"], other.task.encode_theta(other.demonstrated_theta))
         rngs = other.rngs
         np.testing.assert_array_equal(seen["free"], other.explore(None, rngs).obs)
@@ -423,7 +423,7 @@ BOUND = ("method-wrapper", "builtin_function_or_method", "wrapper_descriptor", "
 
 def hunt(start, skipped=(), limit=100_000):
     # Every number within reach, nearest first: attributes, containers, closures, globals, frames, our modules.
-    seen, found, kinds, queue = {}, [], set(), collections.deque(start)
+    seen, numbers, kinds, queue = {}, [], set(), collections.deque(start)
     while queue and len(seen) < limit:
         thing = queue.popleft()
         if id(thing) in seen or isinstance(thing, (bool, str, bytes, type(None))):
@@ -432,10 +432,10 @@ def hunt(start, skipped=(), limit=100_000):
         kinds.add(type(thing).__name__)
         if isinstance(thing, (int, float, np.number)):
             if abs(thing) < 1e30:
-                found.append(float(thing))
+                numbers.append(float(thing))
         elif isinstance(thing, np.ndarray):
             if thing.dtype.kind in "iuf" and thing.size < 100_000:
-                found.extend(thing.ravel().astype(float).tolist())
+                numbers.extend(thing.ravel().astype(float).tolist())
         elif isinstance(thing, dict):
             queue.extend((*thing.keys(), *thing.values()))
         elif isinstance(thing, (list, tuple, set, frozenset)):
@@ -453,7 +453,7 @@ def hunt(start, skipped=(), limit=100_000):
                     queue.append(getattr(thing, name))
                 except Exception:
                     pass
-    return found, kinds
+    return numbers, kinds
 """
 HIDDEN = {"BatchEnv", "Context", "Physics", "NetworkExpert", "Simulator"}
 
@@ -476,8 +476,8 @@ class Spy(Still):
         return super().act(obs)
 
 def write(hunted, name):
-    found, kinds = hunted
-    np.savez(f"{tmp_path}/{{name}}.npz", found=np.unique(found), kinds=sorted(kinds), words=sys.argv)
+    numbers, kinds = hunted
+    np.savez(f"{tmp_path}/{{name}}.npz", numbers=np.unique(numbers), kinds=sorted(kinds), words=sys.argv)
 
 @uses("demonstrations", "exploration", "queries")
 def fit(given):
@@ -494,14 +494,14 @@ def fit(given):
     hidden = np.concatenate([*thetas, *seeds, [4242424242, stream(EVALUATION, 0), stream(DEMOS, 0)]])
     for name in ("fit", "act40", "act80"):
         with np.load(tmp_path / f"{name}.npz") as hunted:
-            assert len(hunted["found"]) > (10_000 if name == "fit" else 100)
+            assert len(hunted["numbers"]) > (10_000 if name == "fit" else 100)
             assert {"Given", "Generator", "Trials" if name == "fit" else "frame"} <= set(hunted["kinds"])
             assert not HIDDEN & set(hunted["kinds"])
-            assert not np.isin(hidden, hunted["found"]).any()
+            assert not np.isin(hidden, hunted["numbers"]).any()
             assert "--salt" not in hunted["words"]
-    found, kinds = hunter()([context, Provider(context, ["theta"], []), stream(EVALUATION, 0)])
-    assert np.isin(context.env.theta, found).all()
-    assert np.isin(stream(EVALUATION, 0), found).all()
+    numbers, kinds = hunter()([context, Provider(context, ["theta"], []), stream(EVALUATION, 0)])
+    assert np.isin(context.env.theta, numbers).all()
+    assert np.isin(stream(EVALUATION, 0), numbers).all()
     assert HIDDEN - {"Simulator"} <= kinds
 
 
@@ -543,11 +543,11 @@ def test_a_hunter_finds_no_theta_in_what_ours_hold(monkeypatch: pytest.MonkeyPat
     hidden = np.concatenate([*thetas, *seeds, [917, stream(EVALUATION, 917, "salt"), stream(DEMOS, 917)]])
     assert len({tuple(each) for each in seeds}) == 5
     assert len(hunted) == 3
-    for (found, kinds), least in zip(hunted, (1000, 20, 20), strict=True):
-        assert len(found) > least
+    for (numbers, kinds), least in zip(hunted, (1000, 20, 20), strict=True):
+        assert len(numbers) > least
         assert {"Given", "Generator"} <= kinds
         assert not HIDDEN & kinds
-        assert not np.isin(hidden, found).any()
+        assert not np.isin(hidden, numbers).any()
 
 
 def hunter() -> Callable[..., tuple[list[float], set[str]]]:

@@ -87,11 +87,11 @@ def test_answers(score: float, naive: float, spread: float, word: str) -> None:
     runs = {"naive_rnn": (naive, 1), "deconfounded": (0.95, 1), "naive_transformer": (score, spread)}
     of = {name: {seed: mean + by * noise for seed, noise in seeds.items()} for name, (mean, by) in runs.items()}
     scores = {"a": of, "b": of, "lacking": {name: of[name] for name in ("naive_rnn", "deconfounded")}}
-    (told,) = answers(scores)
-    assert told.startswith(f"Does scale cure the delusion? {word}: naive_transformer {score:.2f} (")
-    assert f"naive_rnn {naive:.2f} (" in told
-    assert "deconfounded 0.95 (" in told
-    assert "over 2 tasks" in told
+    (sentence,) = answers(scores)
+    assert sentence.startswith(f"Does scale cure the delusion? {word}: naive_transformer {score:.2f} (")
+    assert f"naive_rnn {naive:.2f} (" in sentence
+    assert "deconfounded 0.95 (" in sentence
+    assert "over 2 tasks" in sentence
     assert answers({"lacking": scores["lacking"]}) == []
     assert answers({"a": {name: {0: 0.5} for name in runs}}) == [], "a seed alone has no interval"
 
@@ -101,10 +101,10 @@ class TestStatistics:
 
     def test_paired(self) -> None:
         """Differences .5, 1 and 0: mean .5, sd .5, and Student's t of two degrees is 4.302653."""
-        found = statistics.paired({0: 1.0, 1: 2.0, 2: 3.0, 7: 9.0}, {2: 3.0, 1: 1.0, 0: 0.5, 8: 0.0})
-        assert found is not None
-        assert (found.value, found.n) == (0.5, 3)
-        assert found.interval == pytest.approx((0.5 - 1.242069, 0.5 + 1.242069), abs=1e-6)
+        difference = statistics.paired({0: 1.0, 1: 2.0, 2: 3.0, 7: 9.0}, {2: 3.0, 1: 1.0, 0: 0.5, 8: 0.0})
+        assert difference is not None
+        assert (difference.value, difference.n) == (0.5, 3)
+        assert difference.interval == pytest.approx((0.5 - 1.242069, 0.5 + 1.242069), abs=1e-6)
         assert statistics.paired({0: 1.0}, {0: 0.25}) == statistics.Figure(np.float64(0.75), None, 1)
         assert statistics.paired({0: 1.0}, {1: 1.0}) is None
 
@@ -120,20 +120,20 @@ class TestStatistics:
 
     def test_improvement(self) -> None:
         """Of the pairs (1, 1), (1, 3), (2, 1), (2, 3) one and a half are won; the other task is won whole."""
-        one, other = [np.array([1.0, 2]), np.array([5.0])], [np.array([1.0, 3]), np.array([4.0, 3, 2])]
-        assert statistics.improvement(one[:1], other[:1]) == 0.375
-        assert statistics.improvement(one, other) == (0.375 + 1) / 2
+        first, second = [np.array([1.0, 2]), np.array([5.0])], [np.array([1.0, 3]), np.array([4.0, 3, 2])]
+        assert statistics.improvement(first[:1], second[:1]) == 0.375
+        assert statistics.improvement(first, second) == (0.375 + 1) / 2
 
     def test_over_tasks(self) -> None:
         """Seeds are drawn anew within a task; tasks that a method lacks are left out, and so is one without seeds."""
-        apart = {"a": np.zeros(4), "b": np.ones(4)}
-        found = statistics.over_tasks(statistics.iqm, apart)
-        assert found is not None
-        assert (found.value, found.interval, found.n) == (0.5, (0.5, 0.5), 8)
+        scores = {"a": np.zeros(4), "b": np.ones(4)}
+        estimate = statistics.over_tasks(statistics.iqm, scores)
+        assert estimate is not None
+        assert (estimate.value, estimate.interval, estimate.n) == (0.5, (0.5, 0.5), 8)
         spread = statistics.over_tasks(statistics.iqm, {"a": np.array([0.0, 1.0])})  # 0, .5 or 1, of odds 1 to 2 to 1
         assert spread is not None
         assert (spread.value, spread.interval) == (0.5, (0, 1))
-        lone = statistics.over_tasks(statistics.improvement, apart, {"b": np.array([2.0]), "a": np.array([])})
+        lone = statistics.over_tasks(statistics.improvement, scores, {"b": np.array([2.0]), "a": np.array([])})
         assert lone is not None
         assert (lone.value, lone.n) == (0, 4)
         single = statistics.over_tasks(statistics.iqm, {"a": np.array([0.3])})
@@ -174,10 +174,10 @@ class TestCurves:
 
     def test_rounds_are_not_bridged(self) -> None:
         """Where a curve goes without for longer than it is used to, there is a gap; seeds are averaged."""
-        one = {"a": {"update": [10, 20, 30, 90, 100], "loss": [1.0, 2.0, 3.0, 4.0, 5.0]}}
-        two = {"a": {"update": [10, 20, 30, 90, 100], "loss": [3.0, 2.0, 1.0, 4.0, 5.0]}}
+        seed_0 = {"a": {"update": [10, 20, 30, 90, 100], "loss": [1.0, 2.0, 3.0, 4.0, 5.0]}}
+        seed_1 = {"a": {"update": [10, 20, 30, 90, 100], "loss": [3.0, 2.0, 1.0, 4.0, 5.0]}}
         mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5]}
-        assert scoring.mean_curve([one, two]) == {"a": mean}
+        assert scoring.mean_curve([seed_0, seed_1]) == {"a": mean}
         assert scoring.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
 
     def test_records(self) -> None:
@@ -190,11 +190,11 @@ class TestCurves:
                 records.check({**record, "curve": curve}, "it")
 
 
-def entry(last: float, interval: float | None = 0.01, tier: str = "1", known: bool = True) -> dict[str, Any]:
+def entry(last: float, interval: float | None = 0.01, tier: str = "1", probed: bool = True) -> dict[str, Any]:
     """What `outcome` reads of a method."""
     seeds = [0] if interval is None else [0, 1, 2]
     band = None if interval is None else [last - interval, last + interval]
-    about = {"tier": tier, "theta_r2": [0.5] if known else [], "seeds": seeds, "deployment": ""}
+    about = {"tier": tier, "theta_r2": [0.5] if probed else [], "seeds": seeds, "deployment": ""}
     return {"score_last": last, "ci95": band, **about}
 
 
@@ -205,7 +205,8 @@ class TestOutcome:
         outcome = scoring.outcome(
             {
                 **self.EXACT,
-                **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5), "mute": entry(0.4, known=False)},
+                **{"good": entry(0.9), "unsure": entry(0.81, 0.05), "bad": entry(0.5)},
+                **{"mute": entry(0.4, probed=False)},
                 **{"good_episode": {**entry(0.1), "deployment": "episode"}, "oracle": entry(1, tier="sees theta")},
             }
         )
@@ -264,18 +265,18 @@ class TestHeadroom:
         """Certified tasks alone are counted; and it is time when enough are solved without queries."""
         better = {**self.METHODS, "a": scored("a", 0.6, 0.96)}
         tasks = [envs.get(name) for name in ("curling", "icy_road", "hidden_goal")]
-        found = [
+        published = [
             (task, {"methods": methods, "task_version": task.version})
             for task, methods in zip(tasks, (self.METHODS, better, better), strict=True)
         ]
         certified = {name: {"verdict": "passed"} for name in ("curling", "icy_road")}
-        text = headroom.page(found, certified, {})
+        text = headroom.page(published, certified, {})
         assert "- 1 of 2 tasks are solved (50%) in the last episode, of those without queries." in text
         assert "- 2 of 2 tasks are solved (100%) in the last episode, of all theta-blind methods." in text
         assert "**It is time.**" in text
-        apart = headroom.page(found[:1], certified, {"once": found[1:2]})
-        assert "It is not yet time" in apart
-        own = apart.partition("## Protocol once\n\nTrials of one episode.\n\n")[2]
+        page = headroom.page(published[:1], certified, {"once": published[1:2]})
+        assert "It is not yet time" in page
+        own = page.partition("## Protocol once\n\nTrials of one episode.\n\n")[2]
         assert "- 1 of 1 tasks are solved (100%) in the last episode, of those without queries." in own
         assert "| curling |" not in own
         ceilings = "| curling | 0.85, mode | 0.70 a_mode (2) | 0.10 b | 0.15 | 0.98 | 0.95 b (3) | 0.90 a | solved |"
@@ -297,8 +298,8 @@ class TestHeadroom:
         assert headroom.best_of(self.METHODS, "last")[0] == ("b", 0.95)
 
     def test_picture(self, tmp_path: Path) -> None:
-        found = [(envs.get("curling"), {"methods": self.METHODS})]
-        made = headroom.points(found, {"curling": {"verdict": "passed"}})
+        published = [(envs.get("curling"), {"methods": self.METHODS})]
+        made = headroom.points(published, {"curling": {"verdict": "passed"}})
         assert made == [("curling", {"first": (0.85, [0.7, 0.1]), "last": (0.98, [0.95, 0.9])})]
         headroom.picture(made, tmp_path / "headroom.png")
         assert (tmp_path / "headroom.png").stat().st_size > 5000
@@ -308,9 +309,9 @@ class TestHeadroom:
 def made() -> dict[str, Any]:
     """What docs/index.html shows."""
     text = (DOCS / "index.html").read_text()
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
-    assert found
-    return json.loads(found[1])
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert match
+    return json.loads(match[1])
 
 
 class TestIndex:
@@ -344,10 +345,10 @@ class TestIndex:
     def test_a_method_that_was_not_run(self) -> None:
         """It has figures of the tasks that it has, which say how many these are; one without any is not there."""
         scores = {"a": {"deconfounded": {0: 0.5, 1: 0.7}, "x": {0: 0.6}}, "b": {"deconfounded": {0: 0.9}}, "c": {}}
-        found = index.over_tasks(scores, ["a", "b", "c"])
-        assert {name: one["tasks"] for name, one in found["methods"].items()} == {"deconfounded": 2, "x": 1}
-        assert found["methods"]["x"]["iqm"] == {"value": 0.6, "interval": None, "n": 1}
-        won = found["methods"]["x"]["improvement"]
+        aggregated = index.over_tasks(scores, ["a", "b", "c"])
+        assert {name: method["tasks"] for name, method in aggregated["methods"].items()} == {"deconfounded": 2, "x": 1}
+        assert aggregated["methods"]["x"]["iqm"] == {"value": 0.6, "interval": None, "n": 1}
+        won = aggregated["methods"]["x"]["improvement"]
         assert (won["value"], won["n"], won["tasks"]) == (0.5, 2, 1)
 
     def test_links_and_size(self) -> None:
@@ -357,9 +358,9 @@ class TestIndex:
         named = {name for name in re.findall(r'(?:href|src)="([^"#]+)"', body) if not name.startswith("data:")}
         assert [name for name in named if not (DOCS / name).exists()] == []
         assert "//" not in "".join(named)
-        shown = re.findall(r'<img[^>]*\ssrc="([^"]+)"', body)
-        assert len(set(shown)) >= len(index.stills(DOCS)) == len(named & set(index.stills(DOCS))) > 30
-        assert all(source.startswith("data:image/webp;base64,") for source in shown)
+        sources = re.findall(r'<img[^>]*\ssrc="([^"]+)"', body)
+        assert len(set(sources)) >= len(index.stills(DOCS)) == len(named & set(index.stills(DOCS))) > 30
+        assert all(source.startswith("data:image/webp;base64,") for source in sources)
         assert len(text) < 2e6
 
 
@@ -420,8 +421,8 @@ class TestInABrowser:
         click = f"document.querySelector('#matrix button[data-key={task}]').click()"
         seen.evaluate(click)
         values = {row["method"]: row["value"] for row in of_task}
-        shown = seen.evaluate(CELLS.format(task))
-        assert [values[name] for name in shown] == [values[name] for name in expected]
+        names = seen.evaluate(CELLS.format(task))
+        assert [values[name] for name in names] == [values[name] for name in expected]
         seen.evaluate(click)
         assert [values[name] for name in seen.evaluate(CELLS.format(task))] == [values[name] for name in expected[::-1]]
         seen.evaluate("document.querySelector('#all button[data-key=cpu]').click()")
@@ -437,9 +438,9 @@ class TestInABrowser:
             choose(seen, measure=measure)
             values = {row["method"]: row[measure]["value"] for row in made["rows"] if row["task"] == task}
             seen.evaluate(f"document.querySelector('#matrix button[data-key={task}]').click()")
-            shown = [values[name] for name in seen.evaluate(CELLS.format(task))]
-            assert sorted(shown) in (shown, shown[::-1])
-            assert (shown[0] < shown[-1]) == (measure == "regret")
+            ordered = [values[name] for name in seen.evaluate(CELLS.format(task))]
+            assert sorted(ordered) in (ordered, ordered[::-1])
+            assert (ordered[0] < ordered[-1]) == (measure == "regret")
             over = made["over"][""]["methods"]["deconfounded"][measure]["value"]
             assert f"{over:.2f}" in seen.evaluate("document.getElementById('matrix').textContent")
             seen.evaluate("document.querySelector('#matrix button[data-key=\"\"]').click()")
@@ -475,9 +476,9 @@ class TestInABrowser:
         else:
             seen.evaluate(f"document.querySelector({json.dumps(cell)}).click()")
         assert seen.evaluate("document.querySelectorAll('#card svg').length") == 1 + len(row["curve"])
-        told = seen.evaluate("document.getElementById('card').innerText")
-        assert row["command"] in told
-        assert f"{row['n']} seeds" in told
+        card = seen.evaluate("document.getElementById('card').innerText")
+        assert row["command"] in card
+        assert f"{row['n']} seeds" in card
         box = seen.evaluate(
             "(b => [b.left, b.top, b.right, b.bottom])(document.getElementById('card').getBoundingClientRect())"
         )
@@ -491,8 +492,8 @@ class TestInABrowser:
     def test_curves_tell_on_hover(self, seen: "Page") -> None:
         chart = "details[open] .adaptation"
         seen.hover(f"{chart} svg")
-        told = seen.evaluate(f"document.querySelector('{chart} .readout').textContent")
-        assert re.fullmatch(r"\w+, episode \d+: \S+, \S+ to \S+, \d+ seeds", told)
+        readout = seen.evaluate(f"document.querySelector('{chart} .readout').textContent")
+        assert re.fullmatch(r"\w+, episode \d+: \S+, \S+ to \S+, \d+ seeds", readout)
         assert seen.evaluate(f"document.querySelectorAll('{chart} .mark.on').length") == 1
 
 
@@ -549,9 +550,9 @@ def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_commands_of_numbers() -> None:
     """Another way to deploy an agent is of its method's job; a method from outside is named by its file."""
     task = envs.get("bandit")
-    found = records.of_task(DOCS / "records", "bandit")
-    outside = [{**one, "method": "mine"} for one in found if one["method"] == "naive_rnn"][:2]
-    gathered = aggregation.gather([*found, *outside], list(METHODS))
+    ours = records.of_task(DOCS / "records", "bandit")
+    outside = [{**record, "method": "mine"} for record in ours if record["method"] == "naive_rnn"][:2]
+    gathered = aggregation.gather([*ours, *outside], list(METHODS))
     start = "python benchmarks/run.py --task bandit"
     episode = "deconfounded_discrete_episode"
     assert results.command(task, gathered, episode) == f"{start} --methods deconfounded_discrete"

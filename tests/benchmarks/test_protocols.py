@@ -106,32 +106,32 @@ def test_a_job_s_record_names_its_protocol(tmp_path: Path, monkeypatch: pytest.M
 def both() -> tuple[list[Any], list[Any]]:
     """Some records of a task under the standard protocol, and the same as if they were of another."""
     kept = records.of_task(RECORDS, "curling")
-    kept = [one for one in kept if one["method"] in ("random", "expert", "dagger") and one["seed"] < 2]
-    return kept, [{**one, "protocol_name": "once"} for one in kept]
+    kept = [record for record in kept if record["method"] in ("random", "expert", "dagger") and record["seed"] < 2]
+    return kept, [{**record, "protocol_name": "once"} for record in kept]
 
 
 class TestTables:
     def test_they_lie_side_by_side(self, both: tuple[list[Any], list[Any]], tmp_path: Path) -> None:
         """In a task's file, each with its own 0 and 1; what asks for no protocol gets the standard one."""
-        kept, others = both
-        records.write(tmp_path, [*kept, *others])
-        assert records.of_task(tmp_path, "curling") == kept
-        assert records.of_task(tmp_path, "curling", protocol="once") == others
+        standard, once = both
+        records.write(tmp_path, [*standard, *once])
+        assert records.of_task(tmp_path, "curling") == standard
+        assert records.of_task(tmp_path, "curling", protocol="once") == once
         assert not (tmp_path / "superseded").exists()
         with pytest.raises(envs.InputError, match="protocol_name standard and once do not belong in one table"):
-            aggregation.gather([*kept, *others])
-        assert aggregation.gather(others)["protocol_name"] == "once"
-        less = [{**one, "returns": [value - 1 for value in one["returns"]]} for one in others]
+            aggregation.gather([*standard, *once])
+        assert aggregation.gather(once)["protocol_name"] == "once"
+        less = [{**record, "returns": [value - 1 for value in record["returns"]]} for record in once]
         own = [value + 1 for value in aggregation.references(less[0], less)]
-        assert own == pytest.approx(aggregation.references(others[0], others))
+        assert own == pytest.approx(aggregation.references(once[0], once))
 
     def test_compare_refuses_two(self, both: tuple[list[Any], list[Any]]) -> None:
-        kept, others = both
+        standard, once = both
         with pytest.raises(envs.InputError, match="records of protocols standard and once are not to be compared"):
-            comparison.gathered([*kept, *others], [])
-        assert set(comparison.gathered(others, [])) == {"dagger"}
+            comparison.gathered([*standard, *once], [])
+        assert set(comparison.gathered(once, [])) == {"dagger"}
         with pytest.raises(envs.InputError, match="--against naive_rnn: no record is of it"):
-            comparison.gathered(others, ["naive_rnn"])
+            comparison.gathered(once, ["naive_rnn"])
 
     def test_what_is_missing(self, both: tuple[list[Any], list[Any]]) -> None:
         """A deployment without record, or a record of another protocol, is missing."""

@@ -186,12 +186,12 @@ class TestKeptFiles:
 
     def test_a_file_over_another_s(self, job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
         """What is shown again of a run has a seed once; demonstrations are those of their seed and expert."""
-        shown = job.context().demonstrations
+        demonstrations = job.context().demonstrations
         first, second = (job.folder / f"demonstrations-{seed}.npz" for seed in (0, 1))
         assert job.context().has_demonstrations(0)
         shutil.copy(second, first)
         assert not job.context().has_demonstrations(0)
-        assert job.context().demonstrations.sha256 == shown.sha256
+        assert job.context().demonstrations.sha256 == demonstrations.sha256
         assert job.context().has_demonstrations(0)
         assert not replace(job, preset=replace(job.preset, expert_trials=3)).context().has_demonstrations(0)
         shutil.copy(job.file(1), job.file(0))
@@ -218,17 +218,17 @@ class TestKeptFiles:
             flipped = bytearray(content)
             flipped[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
             job.file(0).write_bytes(bytes(flipped))
-            found = job.load(0)
-            if found is not None:
-                assert found["meta"] == expected["meta"]
-                np.testing.assert_array_equal(found["blind_bc/returns"], expected["blind_bc/returns"])
+            loaded = job.load(0)
+            if loaded is not None:
+                assert loaded["meta"] == expected["meta"]
+                np.testing.assert_array_equal(loaded["blind_bc/returns"], expected["blind_bc/returns"])
 
     def test_flipped_bits_of_experts_and_trials(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         task, rng = envs.get("tilted_cartpole"), np.random.default_rng(0)
         weights, trials = tmp_path / "tilted_cartpole.safetensors", tmp_path / "trials.npz"
         shutil.copy(policy.path(task).with_suffix(".json"), tmp_path)
-        shown = Trials(rng.random((2, 1, 4, 3)), rng.random((2, 1, 3, 1)), np.ones((2, 1, 3), bool))
-        shown.save(trials)
+        saved = Trials(rng.random((2, 1, 4, 3)), rng.random((2, 1, 3, 1)), np.ones((2, 1, 3), bool))
+        saved.save(trials)
         for file, content, load in (
             (weights, policy.path(task).read_bytes(), lambda: policy.load(task, weights)),
             (trials, trials.read_bytes(), lambda: Trials.load(trials)),
@@ -238,23 +238,23 @@ class TestKeptFiles:
                 flipped[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
                 file.write_bytes(bytes(flipped))
                 try:
-                    got = load()
+                    loaded = load()
                 except envs.InputError:
                     continue
-                assert isinstance(got, Trials)
-                np.testing.assert_array_equal(got.obs, shown.obs)
+                assert isinstance(loaded, Trials)
+                np.testing.assert_array_equal(loaded.obs, saved.obs)
 
     def test_a_second_command_waits_outside(self, tmp_path: Path) -> None:
-        told = pytest.raises(envs.InputError, match="another command is at work")
-        with commands.locked(tmp_path), told, commands.locked(tmp_path):
+        refused = pytest.raises(envs.InputError, match="another command is at work")
+        with commands.locked(tmp_path), refused, commands.locked(tmp_path):
             pass
         with commands.locked(tmp_path):
             pass
 
 
 def kept(job: BenchmarkJob) -> list[records.Record]:
-    found = [job.load(seed) for seed in job.seeds]
-    return [one for data in found if data is not None for one in records.of_job(data, "smoke", [], 1)]
+    results = [job.load(seed) for seed in job.seeds]
+    return [record for data in results if data is not None for record in records.of_job(data, "smoke", [], 1)]
 
 
 class TestRecords:

@@ -66,8 +66,8 @@ def test_what_the_certificate_foretold() -> None:
         {"certificate": {"verdict": verdict}, "scores": {"deconfounded": [0.8, 1.0], "naive_rnn": [naive, naive + 0.2]}}
         for verdict, naive in (("passed", 0.1), ("passed", 0.4), ("failed", 0.9))
     ]
-    told = spectrum.foretold(points)
-    assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10." in told
+    sentence = spectrum.foretold(points)
+    assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10." in sentence
     assert "failed, on 0, by (none)" in spectrum.foretold(points[:2])
 
 
@@ -87,15 +87,15 @@ def test_predicted_and_measured_gap(tmp_path: Path) -> None:
         "curling": methods(1, 0.3, 0.9, 0.5),
         "forked_path": methods(1, 0.1, 0.3, 0.9),
     }
-    found = [one for name, of in made.items() if (one := gap.gap(envs.get(name), of))]
-    np.testing.assert_allclose([one[1:] for one in found[::3]], [(0.5, 0.2), (0.9, -0.6)])
+    gaps = [each for name, of in made.items() if (each := gap.gap(envs.get(name), of))]
+    np.testing.assert_allclose([each[1:] for each in gaps[::3]], [(0.5, 0.2), (0.9, -0.6)])
     assert gap.gap(envs.get("bandit"), {"naive_rnn": {"score_last": 1.0}}) is None
-    text = gap.section(found)
+    text = gap.section(gaps)
     assert "is 1.00 over 3 tasks" in text
     assert "it is -0.78 over 4 tasks" in text
     assert "| forked_path | 0.90 | -0.60 |" in text
-    assert gap.section(found[:2]) == ""
-    gap.picture([(one.task.name, *one[1:]) for one in found], tmp_path / "gap.png")
+    assert gap.section(gaps[:2]) == ""
+    gap.picture([(each.task.name, *each[1:]) for each in gaps], tmp_path / "gap.png")
     assert (tmp_path / "gap.png").read_bytes().startswith(PNG)
 
 
@@ -116,9 +116,9 @@ def test_validation_has_what_the_spectrum_found() -> None:
 
 def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
     def row(case: str, right: bool, predicted: float, measured: float) -> dict[str, Any]:
-        told = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
+        verdict = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
         figures = {"stakes": {"value": 2 * predicted}}
-        return {"case": case, "task": case, **told, "predicted": predicted, "measured": measured, "figures": figures}
+        return {"case": case, "task": case, **verdict, "predicted": predicted, "measured": measured, "figures": figures}
 
     seen = [row("bandit", True, 0.1, 0.2), row("curling", False, 0.2, 0.9), row("icy_road", True, 0.3, 1.0)]
     ranked = "verdicts are right; the rank correlation of predicted and measured gaps is"

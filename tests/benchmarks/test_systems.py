@@ -72,16 +72,16 @@ import json, pickle, sys, gymnasium
 from pathlib import Path
 folder, data = map(Path, sys.argv[1:])
 vec = pickle.loads((folder / "vec.pickle").read_bytes())
-found = [vec.step(vec.action_space.low)[0].tolist()]
+observations = [vec.step(vec.action_space.low)[0].tolist()]
 import minari
 from gymnasium.envs.registration import EnvSpec
 for env in (
     gymnasium.make(EnvSpec.from_json((folder / "spec.json").read_text())),
     minari.MinariDataset(data / "data").recover_environment(),
 ):
-    found.append(env.reset(seed=3)[0].tolist())
+    observations.append(env.reset(seed=3)[0].tolist())
 from deconfounded import envs
-print(json.dumps([*found, envs.get("own_cartpole").reference]))
+print(json.dumps([*observations, envs.get("own_cartpole").reference]))
 """
         stepped, *first, reference = json.loads(python("-c", code, tmp_path, data, cwd=tmp_path))
         np.testing.assert_array_equal(stepped, vec.step(-np.ones((2, 1)))[0])
@@ -119,9 +119,9 @@ if __name__ == "__main__":
         env.close()
 """
         (tmp_path / "script.py").write_text(by_hand + code)
-        told = python("script.py", cwd=tmp_path).splitlines()
+        lines = python("script.py", cwd=tmp_path).splitlines()
         shape = (1, len(envs.get(CONTROL).observation))
-        assert told == [f"{tmp_path}/script.py:Own {shape}", f"beside:Own {shape}"]
+        assert lines == [f"{tmp_path}/script.py:Own {shape}", f"beside:Own {shape}"]
 
 
 def test_a_fork_steps_on() -> None:
@@ -135,13 +135,13 @@ vec = envs.make_vec("slippery_cartpole", 64)
 vec.reset(seed=0)
 vec.step(np.ones((64, 1)))
 child = os.fork()
-told = vec.step(np.ones((64, 1)))[0].tobytes().hex()
+observations = vec.step(np.ones((64, 1)))[0].tobytes().hex()
 if not child:
     del vec
-    print(told, flush=True)
+    print(observations, flush=True)
     sys.exit(0)
 assert os.waitpid(child, 0)[1] == 0
-print(told)
+print(observations)
 """
     if not hasattr(os, "fork"):
         pytest.skip("no fork here")
@@ -294,8 +294,8 @@ from deconfounded.experts import policy
 policy.load(env.unwrapped.task)
 print(json.dumps({name: one.__file__ for name, one in sys.modules.items() if name.partition(".")[0] == "deconfounded"}))
 """
-    told = python("-c", code, ROOT, json.dumps(setup["package-dir"]), cwd=tmp_path, PYTHONPATH=str(tmp_path))
-    for name, place in json.loads(told).items():
+    output = python("-c", code, ROOT, json.dumps(setup["package-dir"]), cwd=tmp_path, PYTHONPATH=str(tmp_path))
+    for name, place in json.loads(output).items():
         folder = next((ROOT / name.split(".")[1] for one in setup["package-dir"] if name.startswith(one)), tmp_path)
         assert Path(place).is_relative_to(folder), name
 
@@ -336,10 +336,10 @@ for line in sys.argv[1:]:
         assert not ended.code, line
 """  # in one process: each would import for seconds
         run = f"run --task \u00e9.py:Own --methods conditional --preset smoke --out {home}/r --set eval_trials=4"
-        told = python("-c", code, "--help", "run --list", run, cwd=home, MUJOCO_GL="off", **self.ASCII)
-        assert "usage: deconf" in told
-        assert "bandit: best_arm" in told
-        assert "caf\\udcc3\\udca9/r/report.html" in told
+        output = python("-c", code, "--help", "run --list", run, cwd=home, MUJOCO_GL="off", **self.ASCII)
+        assert "usage: deconf" in output
+        assert "bandit: best_arm" in output
+        assert "caf\\udcc3\\udca9/r/report.html" in output
         assert json.loads((home / "r" / "results.json").read_bytes())["task"] == "own"
 
     def test_names_that_the_locale_lacks(self, tmp_path: Path) -> None:

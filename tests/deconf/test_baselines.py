@@ -446,16 +446,16 @@ class TestGail:
         features, starts = torch.randn(4 * 7, 3, generator=draws), torch.zeros(4 * 7)
         starts[list(begin)] = 1
         lstm, state = torch.nn.LSTM(3, 5), tuple(torch.randn(1, 4, 5, generator=draws) for _ in range(2))
-        found, calls = [], list[object]()
+        results, calls = [], list[object]()
         lstm.register_forward_hook(lambda *call: calls.append(call))
         for policy in (SequencePolicy, SequencePolicy.__base__):
             lstm.zero_grad()
             out, after = policy._process_sequence(features, state, starts, lstm)
             (out.sum() + after[1].sum()).backward()
-            found.append([out, *after, *(weight.grad.clone() for weight in lstm.parameters())])
+            results.append([out, *after, *(weight.grad.clone() for weight in lstm.parameters())])
             if policy is SequencePolicy:
                 assert len(calls) == (7 if any(i % 7 for i in begin) else 1)
-        torch.testing.assert_close(*found, rtol=0, atol=1e-5)
+        torch.testing.assert_close(*results, rtol=0, atol=1e-5)
 
     def test_discriminator_tells_them_apart(self) -> None:
         """A constant against a random action: its logit, the reward, is above 0 for one, below for the other."""

@@ -89,7 +89,7 @@ def losses(batch: Batch) -> dict[str, Loss]:
     flow = FlowAgent.blank({"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}, scales, draws())
     adapter = rma.Adapter(8, 1, scales, draws())
     student = rma.RmaAgent(adapter, recurrent.policy)
-    found: dict[str, Loss] = {
+    by_name: dict[str, Loss] = {
         "naive_rnn": lambda given: recurrent.loss(given, given.action, recurrent.memory.start(4))[0],
         "naive_obs": lambda given: blind.loss(given, given.action, blind.memory.start(4))[0],
         "naive_transformer": lambda given: transformer.held_out_loss(given),
@@ -102,10 +102,10 @@ def losses(batch: Batch) -> dict[str, Loss]:
         model = new_model(kind, 3, 16, scales, draws()).eval()
         agent = DeconfoundedAgent.new(kind, 3, 16, scales, draws())
         belief = agent.model.belief(agent.model.final_memory(batch)).detach()
-        found[f"{kind} model"] = lambda given, model=model: model.loss(given, None, 0.1, draws())  # type: ignore[misc]
-        found[f"{kind} policy"] = lambda given, agent=agent, belief=belief: agent.loss(given, belief, None, draws())  # type: ignore[misc]
-        found[f"{kind} memory"] = lambda given, model=model: model.final_memory(given).flatten()  # type: ignore[misc]
-    return found
+        by_name[f"{kind} model"] = lambda given, model=model: model.loss(given, None, 0.1, draws())  # type: ignore[misc]
+        by_name[f"{kind} policy"] = lambda given, agent=agent, belief=belief: agent.loss(given, belief, None, draws())  # type: ignore[misc]
+        by_name[f"{kind} memory"] = lambda given, model=model: model.final_memory(given).flatten()  # type: ignore[misc]
+    return by_name
 
 
 def test_losses_and_memories_read_no_padding(batch: Batch) -> None:

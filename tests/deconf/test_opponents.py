@@ -36,13 +36,13 @@ class TestDpt:
         agent = DptAgent.blank(SHAPE, scales(batch), streams(2))
         context, queries, seen = agent.transitions(batch), agent.queries(batch.obs), torch.full((2, 3, 12), 5)
         first = agent.net.answers(context, queries, seen)
-        later, before, others = context.clone(), context.clone(), queries.clone()
+        later, before, other_queries = context.clone(), context.clone(), queries.clone()
         later[:, :, 5:] += 1
         before[:, :, 4] += 1
-        others[:, :, 1:] += 1
+        other_queries[:, :, 1:] += 1
         with torch.no_grad():
             torch.testing.assert_close(agent.net.answers(later, queries, seen), first)
-            torch.testing.assert_close(agent.net.answers(context, others, seen)[:, :, 0], first[:, :, 0])
+            torch.testing.assert_close(agent.net.answers(context, other_queries, seen)[:, :, 0], first[:, :, 0])
             assert ((agent.net.answers(before, queries, seen) - first).abs().amax(-1) > 1e-4).all()
 
     def test_queries_are_of_steps_that_took_place(self) -> None:

@@ -29,20 +29,20 @@ def test_the_same_in_another_process(
     monkeypatch.setattr(type(envs.get(name)), "horizon", 8)
     monkeypatch.setattr(type(envs.get(name)), "episodes", 2)
     context = Context(envs.get(name), tiny_preset(), [0])
-    shown = context.demonstrations
+    demonstrations = context.demonstrations
     monkeypatch.chdir(tmp_path.parent)
     monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", tmp_path.name])
     data.main()
-    assert f"{name}: 4 trials, sha256 {shown.sha256} -> {tmp_path}" in capsys.readouterr().out
+    assert f"{name}: 4 trials, sha256 {demonstrations.sha256} -> {tmp_path}" in capsys.readouterr().out
     code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
-    assert done.stdout.strip() == shown.sha256, done.stderr
+    assert done.stdout.strip() == demonstrations.sha256, done.stderr
     trials, theta = datasets.read(tmp_path), datasets.read_theta(tmp_path)
     np.testing.assert_array_equal(theta, context.demonstrated_theta)
     config = RecurrentConfig(updates=2, batch=4)
-    one, other = (naive_rnn.train(given, config, context.rngs) for given in (shown, trials))
-    for key, array in one.state()[1].items():
-        np.testing.assert_array_equal(array, other.state()[1][key])
+    expected, again = (naive_rnn.train(given, config, context.rngs) for given in (demonstrations, trials))
+    for key, array in expected.state()[1].items():
+        np.testing.assert_array_equal(array, again.state()[1][key])
     with pytest.raises(envs.InputError, match="is there already"):
         data.main()
 
@@ -53,14 +53,14 @@ def test_what_it_says(tmp_path: Path) -> None:
     collected = datasets.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
     returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5).returns
     place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
-    found = minari.MinariDataset(place / "data")
-    episodes = list(found.iterate_episodes())
+    dataset = minari.MinariDataset(place / "data")
+    episodes = list(dataset.iterate_episodes())
     assert [round(float(one.rewards.sum()), 9) for one in episodes] == returns.ravel().round(9).tolist()
     assert all(one.terminations[-1] or one.truncations[-1] for one in episodes)
     assert "EpisodeData" in repr(episodes[0])
-    assert (found.storage.metadata["ref_min_score"], found.storage.metadata["ref_max_score"]) == (1.0, 2.0)
-    assert found.env_spec.id == task.gym_id
-    about = list(found.storage.get_episode_metadata(range(15)))
+    assert (dataset.storage.metadata["ref_min_score"], dataset.storage.metadata["ref_max_score"]) == (1.0, 2.0)
+    assert dataset.env_spec.id == task.gym_id
+    about = list(dataset.storage.get_episode_metadata(range(15)))
     assert [(int(one["trial"]), int(one["episode"])) for one in about] == [(b, e) for b in range(3) for e in range(5)]
     assert not {"theta", "seed"} & set(vars(Trials.from_minari(place)))
     with pytest.raises(envs.InputError, match="obs 'theta' is no column"):

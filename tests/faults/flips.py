@@ -72,9 +72,9 @@ def files(folder: Path) -> dict[str, tuple[Path, Read]]:
     weights = folder / "tilted_cartpole.safetensors"
     for suffix in (".safetensors", ".json"):
         shutil.copy(policy.path(task).with_suffix(suffix), weights.with_suffix(suffix))
-    shown = folder / "trials.npz"
+    trials_file = folder / "trials.npz"
     rng = np.random.default_rng(0)
-    Trials(rng.random((4, 2, 9, 3)), rng.random((4, 2, 8, 1)), np.ones((4, 2, 8), bool)).save(shown)
+    Trials(rng.random((4, 2, 9, 3)), rng.random((4, 2, 8, 1)), np.ones((4, 2, 8), bool)).save(trials_file)
 
     def whole(trials: Trials) -> list[Any]:
         return [trials.obs, trials.action, trials.mask, trials.actions]
@@ -85,8 +85,8 @@ def files(folder: Path) -> dict[str, tuple[Path, Read]]:
         return type(loaded).__name__, loaded.state()
 
     def checkpoint() -> Any:
-        found = monitor.load()
-        return found and [found, monitor.kept, monitor.before, monitor.budget, monitor.cpu_before]
+        loaded = monitor.load()
+        return loaded and [loaded, monitor.kept, monitor.before, monitor.budget, monitor.cpu_before]
 
     def demonstrations() -> Any:
         return whole(job.context().demonstrations) if job.context().has_demonstrations(0) else None
@@ -101,7 +101,7 @@ def files(folder: Path) -> dict[str, tuple[Path, Read]]:
         "a checkpoint .pt": (monitor.file, checkpoint),
         "demonstrations .npz": (folder / "jobs" / "demonstrations-0.npz", demonstrations),
         "an expert's .safetensors": (weights, weights_read),
-        "Trials .npz": (shown, lambda: whole(Trials.load(shown))),
+        "Trials .npz": (trials_file, lambda: whole(Trials.load(trials_file))),
         "agent.safetensors": (agent / "agent.safetensors", state),
         "agent.json": (agent / "agent.json", state),
         "records .jsonl": (folder / "bandit.jsonl", lambda: records.read(folder / "bandit.jsonl")),
@@ -113,7 +113,7 @@ def flip(file: Path, read: Read, flips: int, seed: int) -> Counter[str]:
     """How many of so many flips are noticed, harmless, believed, or an error of another kind."""
     content, expected, rng = file.read_bytes(), read(), np.random.default_rng(seed)
     assert expected is not None
-    found: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     for _ in range(flips):
         at, bit = int(rng.integers(len(content))), int(rng.integers(8))
         flipped = bytearray(content)
@@ -122,13 +122,13 @@ def flip(file: Path, read: Read, flips: int, seed: int) -> Counter[str]:
         try:
             got = read()
         except envs.InputError as error:
-            found["noticed" if "\n" not in str(error) else "error: more than a line"] += 1
+            outcomes["noticed" if "\n" not in str(error) else "error: more than a line"] += 1
         except Exception as error:
-            found[f"error: {type(error).__name__} at byte {at}, bit {bit}"] += 1
+            outcomes[f"error: {type(error).__name__} at byte {at}, bit {bit}"] += 1
         else:
-            found["noticed" if got is None else "harmless" if equal(got, expected) else "believed"] += 1
+            outcomes["noticed" if got is None else "harmless" if equal(got, expected) else "believed"] += 1
     file.write_bytes(content)
-    return found
+    return outcomes
 
 
 def main() -> None:
@@ -139,10 +139,10 @@ def main() -> None:
     args, bad = parser.parse_args(), 0
     with tempfile.TemporaryDirectory() as scratch:
         for kind, (file, read) in files(Path(scratch)).items():
-            found = flip(file, read, args.flips, args.seed)
-            bad += args.flips - found["noticed"] - found["harmless"]
-            told = ", ".join(f"{count} {what}" for what, count in sorted(found.items(), reverse=True))
-            print(f"{kind:25} {file.stat().st_size:7,} bytes: {told}", flush=True)
+            outcomes = flip(file, read, args.flips, args.seed)
+            bad += args.flips - outcomes["noticed"] - outcomes["harmless"]
+            counts = ", ".join(f"{count} {what}" for what, count in sorted(outcomes.items(), reverse=True))
+            print(f"{kind:25} {file.stat().st_size:7,} bytes: {counts}", flush=True)
     print(f"{bad} believed, or an error of another kind")
     sys.exit(bad > 0)
 

@@ -174,8 +174,8 @@ def commands(folder: Path) -> Iterator[tuple[str, str]]:
     (folder / "folder").mkdir()
     (folder / "junk").write_bytes(b"\xff\x00 junk {")
     preset = tiny_preset()
-    shown = Context(envs.get("bandit"), preset, [0]).demonstrations
-    agent = train(shown, MemorylessConfig(updates=3, batch=64), [np.random.default_rng(0)])
+    demonstrations = Context(envs.get("bandit"), preset, [0]).demonstrations
+    agent = train(demonstrations, MemorylessConfig(updates=3, batch=64), [np.random.default_rng(0)])
     assert isinstance(agent, LearnedAgent)
     saved_agents.save(agent, folder / "agent", spaces=spaces(envs.get("bandit")))
     for command, (base, options) in ODD.items():
@@ -274,8 +274,8 @@ def called(call: Callable[[], Any]) -> str:
     except BaseException as error:
         at = traceback.extract_tb(error.__traceback__)[-1]
         theirs = "gymnasium" in at.filename or type(error).__module__.startswith("gymnasium")
-        told = f"{type(error).__name__}: {str(error)[:100]} ({Path(at.filename).name}:{at.lineno})"
-        return "told by gymnasium" if theirs else f"traceback: {told}"
+        line = f"{type(error).__name__}: {str(error)[:100]} ({Path(at.filename).name}:{at.lineno})"
+        return "told by gymnasium" if theirs else f"traceback: {line}"
     return "accepted"
 
 
@@ -283,7 +283,7 @@ def main() -> None:
     """The command line."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (MOST, MOST))
-    found: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     bad = []
     with tempfile.TemporaryDirectory() as scratch, contextlib.ExitStack() as marks, contextlib.chdir(scratch):
         for name in REACHED:
@@ -291,17 +291,17 @@ def main() -> None:
             importlib.import_module(place)
             marks.enter_context(mock.patch(f"{place}.{attribute}", side_effect=Reached))
         for what, became in commands(Path(scratch)):
-            found[f"commands: {became.partition(':')[0]}"] += 1
+            outcomes[f"commands: {became.partition(':')[0]}"] += 1
             if became != "told" and what not in ACCEPTED:
                 bad.append(f"{what} -> {became}")
                 print(bad[-1], flush=True)
     for what, call in calls().items():
         became = called(call)
-        found[f"calls: {became.partition(':')[0]}"] += 1
+        outcomes[f"calls: {became.partition(':')[0]}"] += 1
         if not became.startswith("told") and what not in ACCEPTED:
             bad.append(f"{what} -> {became}")
             print(bad[-1], flush=True)
-    print(f"{found.total()} odd inputs: {', '.join(f'{count} {what}' for what, count in sorted(found.items()))}")
+    print(f"{outcomes.total()} odd inputs: {', '.join(f'{count} {what}' for what, count in sorted(outcomes.items()))}")
     print(f"{len(bad)} to be mended")
     sys.exit(bool(bad))
 

@@ -54,7 +54,7 @@ def timeless(data: Any) -> Any:
 
 def came_out(out: Path) -> dict[str, str]:
     """SHA-256 of all that a finished run left, file by file, without what tells of time."""
-    found = {}
+    digests = {}
     for file in sorted(file for file in out.rglob("*") if file.is_file()):
         digest, name = hashlib.sha256(), str(file.relative_to(out))
         if file.suffix == ".npz":
@@ -74,8 +74,8 @@ def came_out(out: Path) -> dict[str, str]:
             continue
         else:
             digest.update(file.read_bytes())
-        found[name] = digest.hexdigest()
-    return found
+        digests[name] = digest.hexdigest()
+    return digests
 
 
 def main() -> None:
@@ -93,11 +93,11 @@ def main() -> None:
         if start(whole).wait():
             sys.exit(f"the undisturbed run failed: see {whole.with_suffix('.log')}")
         write_json(notes, {"seconds": time.monotonic() - begin, "kills": [], "finished": 0, "wrong": []})
-    known, expected = json.loads(notes.read_text()), came_out(whole)
-    while len(known["kills"]) < args.kills or (args.out / f"run{known['finished']}").exists():
-        out, done = args.out / f"run{known['finished']}", len(known["kills"])
+    state, expected = json.loads(notes.read_text()), came_out(whole)
+    while len(state["kills"]) < args.kills or (args.out / f"run{state['finished']}").exists():
+        out, done = args.out / f"run{state['finished']}", len(state["kills"])
         before, last = finished(out), done >= args.kills  # the last run may end
-        moment = float(np.random.default_rng([args.seed, done]).uniform(0, known["seconds"]))
+        moment = float(np.random.default_rng([args.seed, done]).uniform(0, state["seconds"]))
         run = start(out)
         try:
             code = run.wait(None if last else moment)
@@ -108,23 +108,23 @@ def main() -> None:
                 os.killpg(run.pid, signal.SIGKILL)
                 run.wait()
         lost = [name for name, content in before.items() if finished(out).get(name) != content]
-        known["wrong"] += [f"{out.name}: {name} was finished, and is another now" for name in lost]
+        state["wrong"] += [f"{out.name}: {name} was finished, and is another now" for name in lost]
         if code is None:
-            known["kills"].append(round(moment, 2))
+            state["kills"].append(round(moment, 2))
             print(
                 f"kill {done + 1} of {out.name} after {moment:.1f} s, {len(finished(out))} files finished", flush=True
             )
         else:
-            found = came_out(out)
-            differ = sorted(name for name in {*found, *expected} if found.get(name) != expected.get(name))
-            known["wrong"] += [f"{out.name}: ended with {code}"] * bool(code)
-            known["wrong"] += [f"{out.name}: {name} is not as in the undisturbed run" for name in differ]
-            known["finished"] += 1
-            print(f"{out.name} came to its end: {len(found)} files, {len(differ)} differ", flush=True)
-        write_json(notes, known)
-    print(f"{len(known['kills'])} kills, {known['finished']} runs came to their end, {len(known['wrong'])} wrong")
-    print("\n".join(known["wrong"]))
-    sys.exit(bool(known["wrong"]))
+            digests = came_out(out)
+            differ = sorted(name for name in {*digests, *expected} if digests.get(name) != expected.get(name))
+            state["wrong"] += [f"{out.name}: ended with {code}"] * bool(code)
+            state["wrong"] += [f"{out.name}: {name} is not as in the undisturbed run" for name in differ]
+            state["finished"] += 1
+            print(f"{out.name} came to its end: {len(digests)} files, {len(differ)} differ", flush=True)
+        write_json(notes, state)
+    print(f"{len(state['kills'])} kills, {state['finished']} runs came to their end, {len(state['wrong'])} wrong")
+    print("\n".join(state["wrong"]))
+    sys.exit(bool(state["wrong"]))
 
 
 if __name__ == "__main__":
