@@ -25,8 +25,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "verdict": diagnosis.verdict,
         "tier": diagnosis.tier,
         "headline": diagnosis.headline,
-        **{key: getattr(diagnosis, key) for key in ("found", "cost", "sure", "wrong")},
-        "agreeing": diagnosis.agreeing,
+        **{key: getattr(diagnosis, key) for key in ("found", "cost", "sure", "wrong", "agreeing", "dissenting")},
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
         "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
@@ -72,7 +71,7 @@ def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     read = f"trials = datasets.read({source}{columns})\n"
     if about["explore"]:
         sources = f"[{source}, {about['explore']['from']!r}]"
-        read = f"trials, explored = datasets.read_together({sources}{columns})  # with one range of actions\n"
+        read = f"trials, explored = datasets.read_together({sources}{columns})  # actions on the same scale\n"
     asked = next((name for name in WRITTEN if name in re.findall(r"\w+", diagnosis.next.fit)), "")
     own = WRITTEN[asked].format(log="explored" if about["explore"] else "trials") if asked else ""
     raw = "agent = trials.units.agent(agent)  # acts in the units of the log\n" if Units(**about["units"]).raw else ""
@@ -80,8 +79,15 @@ def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
 from deconfounded.deconf.methods import {method}
 from deconfounded.experts import datasets
 
-{read}{own}agent = {diagnosis.next.fit}
+{read}{own}agent = {diagnosis.next.fit}  # takes minutes, prints nothing
 {raw}agent.save("agent")
+
+# In your own program, after `import deconfounded`; obs: {", ".join(about["units"]["obs"])}
+# agent = deconfounded.load("agent")
+# agent.begin(1)  # when a trial starts
+# agent.reset([np.random.default_rng()])  # when an episode starts
+# action = agent.act(obs[None])[0]  # at each step; and when next_obs is there:
+# agent.observe(obs[None], action[None], next_obs[None], np.ones(1, bool))
 """
 
 
@@ -95,16 +101,16 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
         gain = figure["latent_gain"]
         predictors["latent from dynamics"] = (gain, colour("interventional"))
         source = (
-            f"A latent that is inferred from the dynamics alone accounts for {gain} of it (0 or less: for none). The"
-            " rest is, for the most part, evidence of the expert's past actions, and a clone's own actions are no"
-            " evidence."
+            f"A latent that is inferred from the dynamics alone improves the prediction by {gain} over latents of other"
+            " trials (0 or less: not at all). What a memory knows beyond that comes, for the most part, from the"
+            " expert's past actions, and a clone's own actions are no evidence."
         )
     sections = [
         (
             "Is there a latent, and where is its evidence?",
             f"A memory of the trial predicts the expert's action {memory} nats a step better than the present"
             f" observation alone; {NEGLIGIBLE} is negligible. {source}",
-            _bars(predictors, "nats a step over the present observation", NEGLIGIBLE),
+            _bars(predictors, "improvement of the prediction, nats a step", NEGLIGIBLE),
         )
     ]
     if "exploration_evidence" in figure:

@@ -59,7 +59,7 @@ def main() -> None:
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
     parser.add_argument("--protocol", default=STANDARD, help=f"of {', '.join(PROTOCOLS)}")
-    parser.add_argument("--list", action="store_true", help="tell what is missing, and stop")
+    parser.add_argument("--list", action="store_true", help="print what is missing or stale, and stop")
     args = parser.parse_args()
     tasks = fitting(args.protocol, published.tasks(args.tasks))
     asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
@@ -85,8 +85,12 @@ def main() -> None:
     there = {task.reference: records.held(kept / records.place(task.name)) for task in tasks}
     left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}
     if args.list:
+        lacking: dict[tuple[str, str], list[int]] = {}
         for job, seeds in left.items():
-            print(f"{job.task}, {job.method}: {len(seeds)} of {len(job.seeds)} seeds are missing")
+            lacking.setdefault((job.task, job.method), []).extend(seeds)
+        for (task_name, method), seeds_left in lacking.items():
+            print(f"{task_name}, {method}: seeds {' '.join(map(str, seeds_left))}")
+        print(f"{sum(map(len, lacking.values()))} seeds are missing or stale")
         return
     options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():

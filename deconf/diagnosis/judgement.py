@@ -58,7 +58,8 @@ class Figure(NamedTuple):
         return str(self)
 
     def __str__(self) -> str:
-        return f"{self.value:.2g} ({self.low:.2g} to {self.high:.2g})"
+        value, low, high = (f"{x:,.0f}" if abs(x) >= 100 else f"{x:.2g}" for x in self)
+        return f"{value} ({low} to {high})"
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Diagnosis:
     found, cost, sure, wrong: plain sentences on what was found, what it costs, how sure that is, and what a wrong
     verdict would look like. `reasons` have the figures. Figures are those of Findings, and three more. `gap`: the
     predicted loss by naive cloning, in scores by paired deviation; `gap_by_actions`: by Eq. (1); `ratio`: the evidence
-    of actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone.
+    of actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone;
+    dissenting: what the others say, each verdict once.
     """
 
     verdict: Verdict
@@ -79,6 +81,7 @@ class Diagnosis:
     found: str = ""
     agreeing: int = 0
     refits: int = 0
+    dissenting: tuple[str, ...] = ()
 
     @property
     def headline(self) -> str:
@@ -95,19 +98,20 @@ class Diagnosis:
         naive, latent = (self.figures[key] for key in ("naive", "latent"))
         lost, rest = (Figure(1 - x.value, 1 - x.high, 1 - x.low) for x in (naive, latent))
         return (
-            f"In the learned model of your system, a clone with a memory goes astray by {lost:%} of what an expert"
-            f" would who takes the hidden thing for another; one that infers it from what the world does by {rest:%}."
-            " The latter is what is possible in the model, not what a trained agent is promised to reach."
+            f"In the learned model of your system, a clone with a memory leaves the expert's course by {lost:%} of"
+            " what an expert would that acts on a wrong value of what is hidden. A policy that infers it from what the"
+            f" world does leaves it by {rest:%}: that is possible in the model, and no promise for a trained agent."
         )
 
     @property
     def sure(self) -> str:
         """How sure the verdict is."""
-        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone."
+        others = f" (the others: {', '.join(self.dissenting)})" if self.dissenting else ""
+        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone{others}."
         if self.verdict == "cannot tell":
             return text
         if self.agreeing < self.refits:
-            return f"Not very: {text}"
+            return f"Not very: {text} More trials make it surer."
         return f"Fairly: {text} They share most of their data and the same kind of model, so that this is no proof."
 
     @property
@@ -121,8 +125,9 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
     """The verdict, and why. explored: trials of exploration. Raises InputError if a figure is not finite."""
     diagnosis = _judge(refits, explored)
     alone = [_judge([refit], explored) for refit in refits] if len(refits) > 1 else [diagnosis]
-    agreeing = sum((one.verdict, one.tier) == (diagnosis.verdict, diagnosis.tier) for one in alone)
-    return replace(diagnosis, agreeing=agreeing, refits=len(refits))
+    others = [one for one in alone if (one.verdict, one.tier) != (diagnosis.verdict, diagnosis.tier)]
+    verdicts = dict.fromkeys(f"{one.verdict}{f', Tier {one.tier}' * (one.verdict == 'confounded')}" for one in others)
+    return replace(diagnosis, agreeing=len(alone) - len(others), refits=len(refits), dissenting=tuple(verdicts))
 
 
 def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
