@@ -220,6 +220,14 @@ class TestJudge:
         assert judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
+    def test_what_the_others_say(self) -> None:
+        """A verdict of three splits, of which two say something else if judged alone."""
+        diagnosis = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(latent_gain=2.0)])
+        assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.dissenting) == ("confounded", 1, ("cannot tell",))
+        assert "Not very: 1 of 3 random splits" in diagnosis.sure
+        assert "(the others: cannot tell)" in diagnosis.sure
+        assert judge([CLEAR] * 2).dissenting == ()
+
     def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
             judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
@@ -229,6 +237,7 @@ class TestJudge:
         figures = judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, expert_evidence=0.5)]).figures
         assert figures["naive"] == pytest.approx((0.3, 0.2, 0.5))
         assert figures["ratio"] == pytest.approx((200, 100, 250))
+        assert str(figures["ratio"]) == "200 (100 to 250)"
         assert "exploration_evidence" not in judge([CLEAR._replace(**ALONE)]).figures
 
 
