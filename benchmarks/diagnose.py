@@ -1,8 +1,9 @@
 """Is your data confounded? `deconf diagnose --data logs.csv --trial vehicle --obs 'speed*' --action throttle`
 
-It reads an expert's logs, and logs of exploration if you have some; it needs no theta and no simulator. Each trial is
-under a hidden theta of its own. `deconf look --help` says which data can be read; a look at them comes first. It writes
-index.html, diagnosis.json and the trials as .npz. If it was interrupted, the same command goes on.
+It reads an expert's logs, and logs of exploration (--explore), without which the verdict is never "confounded". Each
+trial is under a hidden condition of its own, theta, which the logs need not have; no simulator is needed. `deconf look
+--help` says which data can be read; a look at them comes first. It takes minutes, and writes index.html, diagnosis.json
+and the trials as .npz. If it was interrupted, the same command goes on.
 """
 
 import json

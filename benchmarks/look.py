@@ -21,7 +21,8 @@ COLUMNS = ("trial", "episode", "obs", "action")
 def add_data(parser: argparse.ArgumentParser) -> None:
     """Arguments that say what to read."""
     parser.add_argument("--data", type=place, nargs="+", required=True, metavar="PATH", help="logs of the expert")
-    parser.add_argument("--explore", type=place, nargs="+", metavar="PATH", help="theta-blind exploration, alike")
+    blind = "logs of exploration, which does not know what the expert knows; same columns"
+    parser.add_argument("--explore", type=place, nargs="+", metavar="PATH", help=blind)
     parser.add_argument("--trial", metavar="COLUMN", help="says which trial a row is of; else each episode is a trial")
     parser.add_argument("--episode", metavar="COLUMN", help="says which episode of the trial a row is of")
     parser.add_argument("--obs", nargs="+", metavar="COLUMN", default=[], help="observations; 'speed*' is a pattern")

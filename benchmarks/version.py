@@ -1,4 +1,4 @@
-"""Versions, machine and GL, for a report of a fault: `deconf version`"""
+"""Versions, machine and GL, for a bug report: `deconf version`"""
 
 import os
 import platform

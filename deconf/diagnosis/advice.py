@@ -61,8 +61,9 @@ QUERY = Next(
     "dagger.train(query, dagger.DaggerConfig(), np.random.default_rng(0))",
 )
 EXPLORE_FIRST = Next(
-    "Explore a little, by a memoryless clone with some random actions (deconf/diagnosis/exploration.py), and diagnose"
-    " again; or try Tier 1, Algorithm 3, which needs no more data.",
+    "Explore a little, by a behaviour that does not know what is hidden, varies its actions and stays where the expert"
+    " goes, such as a memoryless clone with some random actions; and diagnose again with it (--explore). Or try the"
+    " printed lines, which need no more data (Tier 1, Algorithm 3).",
     "deconfounded_offline.train(trials, deconfounded_offline.OfflineConfig(), np.random.default_rng(0))",
 )
 VARY_LATENT = Next("Record trials under other conditions too, and diagnose again.")
