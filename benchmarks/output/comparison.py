@@ -167,9 +167,8 @@ def tables(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str]) 
 def notes(scores: Scores) -> str:
     """What the figures are, and what their intervals hold."""
     fewest = min(len(seeds) for of in scores.values() for seeds in of.values())
-    held = (
-        f", which of {fewest} seeds hold the mean in {statistics.coverage(fewest):.0%} of cases" if fewest > 1 else ""
-    )
+    share = f"; of {fewest} seeds it contains the true value in {statistics.coverage(fewest):.0%} of cases"
+    held = share if fewest > 1 else ""
     return (
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
         " come with the package. Regret is the expert's score less the method's, summed over the episodes; less is"
