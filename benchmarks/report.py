@@ -21,7 +21,8 @@ def main() -> None:
         task, kind, _, _ = envs.get(about["reference"]), about["kind"], about["preset"], about["set"]
         task = applied(about.get("protocol_name", STANDARD), task)
     except (OSError, KeyError):
-        raise envs.InputError(f"{folder} holds no settings.json of a run; give a folder that run.py wrote") from None
+        says = f"{folder} holds no settings.json of a run; give a folder that `deconf run` wrote"
+        raise envs.InputError(says) from None
     finished = job_files.left_in(folder / "jobs")
     if kind != "BenchmarkJob" or not {"random", "expert"} <= {method for method, *_ in finished}:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")

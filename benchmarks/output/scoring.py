@@ -204,8 +204,8 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
 
 
 INTERVALS = (
-    "Intervals: percentile bootstrap over seeds. In brackets: how often an interval of that many seeds contains the true"
-    " mean, if scores are normally distributed."
+    "Intervals: percentile bootstrap over seeds. In brackets: how often an interval of that many seeds contains the"
+    " true mean, if scores are normally distributed."
 )
 DROPPED = (
     *("data, a seed", "theta R2 of each episode", "CPU s, a seed", "Eq. (1)", "return", "tier"),

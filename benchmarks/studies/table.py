@@ -57,7 +57,8 @@ def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
 
 def main() -> None:
     parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
-    parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help="default: the suite")
+    several = f"names, or {', '.join(published.GROUPS)}; default: suite"
+    parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help=several)
     parser.add_argument("--protocol", default=STANDARD, help=f"of {', '.join(PROTOCOLS)}")
     parser.add_argument("--list", action="store_true", help="print what is missing or stale, and stop")
     args = parser.parse_args()
