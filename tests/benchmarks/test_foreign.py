@@ -66,14 +66,14 @@ def test_scores() -> None:
 
 def test_report() -> None:
     row = {"world": "arm:Arm", "tier": 2, "unseen": False, "scores": {"naive_rnn": 0.2, "deconfounded": 0.9}}
-    said = {"verdict": "confounded", "diagnosed_tier": 3, "right": False, "predicted": 0.5}
+    wrong = {"verdict": "confounded", "diagnosed_tier": 3, "right": False, "predicted": 0.5, "splits": 3}
     unsure = {"verdict": "cannot tell", "diagnosed_tier": None, "right": None, "predicted": 0.0}
-    rows = [row | said, row | unsure | {"unseen": True}, row]
+    rows = [row | wrong | {"agreeing": 2}, row | wrong | {"agreeing": 3}, row | unsure | {"unseen": True}, row]
     assert report.summary(rows) == (
-        "Of the half by which thresholds are set, 0 of 1 verdicts are right, 1 wrong."
-        " Of the half by which they are judged, 0 of 1 verdicts are right, 0 wrong."
+        "Of the half by which thresholds are set, 0 of 2 verdicts are right, 2 wrong (1 of these with all splits"
+        " agreeing). Of the half by which they are judged, 0 of 1 verdicts are right, 0 wrong."
     )
     lines = report.table(rows).splitlines()
-    assert lines[2].endswith("| confounded, Tier 3 | wrong |")
-    assert lines[3].endswith("| cannot tell | cannot tell |")
-    assert lines[4].endswith("|  |  |")
+    assert lines[2].endswith("| confounded, Tier 3 | 2 of 3 | wrong |")
+    assert lines[4].endswith("| cannot tell |  | cannot tell |")
+    assert lines[5].endswith("|  |  |  |")

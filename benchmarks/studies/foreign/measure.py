@@ -144,6 +144,7 @@ def diagnosed(case: Case, folder: Path) -> str:
         case,
         diagnosis=VERSION,
         splits=diagnosis.refits,
+        agreeing=diagnosis.agreeing,
         verdict=diagnosis.verdict,
         diagnosed_tier=diagnosis.tier,
         right=None if diagnosis.verdict == "cannot tell" and not right else right,

@@ -19,8 +19,10 @@ def summary(rows: list[dict[str, Any]]) -> str:
         of = [row for row in rows if row["unseen"] is unseen and "verdict" in row]
         if not of:
             continue
-        wrong = sum(row["right"] is False for row in of)
-        share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {wrong} wrong"
+        wrong = [row for row in of if row["right"] is False]
+        sure = sum(row.get("agreeing") == row["splits"] for row in wrong)
+        share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {len(wrong)} wrong"
+        share += f" ({sure} of these with all splits agreeing)" * bool(wrong)
         both = [(row["predicted"], gap) for row in of if (gap := measured(row)) is not None]
         rank = stats.spearmanr(*zip(*both, strict=True)).statistic if len(both) > 2 else None
         alike = "" if rank is None else f"; the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
@@ -45,5 +47,6 @@ def table(rows: list[dict[str, Any]]) -> str:
         verdict += f", Tier {row['diagnosed_tier']}" if verdict == "confounded" else ""
         judged = JUDGED[row["right"]] if "verdict" in row else ""
         half = "judged" if row["unseen"] else "set"
-        lines.append((row["world"], str(row["tier"]), half, *cells, verdict, judged))
-    return markdown_table(("world", "tier needed", "half", *AGENTS, "diagnosis", ""), lines)
+        agree = f"{row['agreeing']} of {row['splits']}" if "agreeing" in row else ""
+        lines.append((row["world"], str(row["tier"]), half, *cells, verdict, agree, judged))
+    return markdown_table(("world", "tier needed", "half", *AGENTS, "diagnosis", "splits that agree", ""), lines)
