@@ -75,7 +75,7 @@ def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
     for name, column, scaled in zip(log.units.action, raw.T, steps.action.T, strict=True):
         a, b = np.quantile(column, [0.01, 0.99])
         said.append(f"{name} {a:.4g} to {b:.4g} ({(np.abs(scaled) > 0.999).mean():.0%} at an end of the range)")
-    yield Remark("range", f"Actions used, but for 1% at each side: {_list(said)}.")
+    yield Remark("range", f"Actions used, without the extreme 1% at each side: {_list(said)}.")
 
 
 def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -170,7 +170,7 @@ def _lag(trials: Trials) -> Iterator[Remark]:
         if lag <= 0 and left[1] < BETTER:
             yield Remark(
                 "lag",
-                "No earlier observation matches actions better than that of their own row: they are not logged late.",
+                "Actions match the observation of their own row better than earlier ones: they are not logged late.",
             )
         return
     motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
@@ -227,9 +227,9 @@ def _repeats(log: Log, steps: Steps) -> Iterator[Remark]:
         mean = 1 - float(((now - own) ** 2).mean(0).sum()) / total
         linear = 1 - (1 - mean) * min(1.0, fits.unexplained(now, log.obs[:, :, 1:-1][mask].astype(float), trial))
         text = (
-            f"Always the mean action errs by {np.sqrt(total):.2g} (rms, of ranges -1 to 1). Of that variance, repeating"
-            f" the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear function of"
-            f" the observation in each trial {linear:.0%}."
+            f"The mean action, always taken, errs by {np.sqrt(total):.2g} (rms, of actions scaled to -1 to 1). Of that"
+            f" variance the last action predicts {repeat:.0%}, the mean action of each trial {mean:.0%}, a linear"
+            f" function of the observation, fitted to each trial, {linear:.0%}."
         )
     high = repeat > REPEATED
     text += " A clone can score well by repeating itself; errors of its actions say little." * high
@@ -276,8 +276,8 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
         text = "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
     elif measured[0]:
         text = (
-            f"Trials differ in their dynamics: what one half of a trial does to {names[measured[1]]}, beyond a"
-            f" fit of all trials, the other does too (rank correlation {measured[0]:.2f})."
+            f"Trials differ in their dynamics: {names[measured[1]]} departs from a fit of all trials in the same way in"
+            f" both halves of a trial (rank correlation {measured[0]:.2f})."
         )
     elif blind:
         text = (
@@ -286,7 +286,7 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
         )
     else:
         text = (
-            "No difference in dynamics is seen between trials. An expert's actions, which make up for it, can hide it;"
-            " exploration would show it."
+            "No difference in dynamics is seen between trials. The expert's actions can hide one, as they make up for"
+            " it; exploration would show it (--explore)."
         )
     yield Remark("dynamics", text, blind and measured is not None and not measured[0])

@@ -118,7 +118,7 @@ def with_the_present_state(trials: Trials) -> Trials:
 
 
 PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a kind, and words of it
-    "nothing": (driven, set(), "lag", "No earlier observation matches actions better"),
+    "nothing": (driven, set(), "lag", "Actions match the observation of their own row better"),
     "late": (lambda: late(driven()), {"late"}, "late", "they are probably logged late. Move actions up by 1 row."),
     "two late": (lambda: late(late(driven())), {"late"}, "late", "they are probably logged late. Move actions up by 2"),
     "reaction": (lambda: driven(reaction=2), {"late"}, "late", "move what follows their own: a reaction time."),
@@ -166,7 +166,7 @@ def test_how_far_simple_guesses_get() -> None:
     own = np.broadcast_to(rng.uniform(-1, 1, (B, 1, 1, 1)), trials.action.shape)
     text = said(look(changed(trials, action=own)), "repeat")
     assert f"errs by {own.std():.2g} (rms" in text
-    assert "repeating the last action predicts 100%, the mean action of each trial 100%" in text
+    assert "the last action predicts 100%, the mean action of each trial 100%" in text
     white = rng.uniform(-1, 1, trials.action.shape)
     text = said(look(changed(trials, action=white)), "repeat")
     assert "predicts -10" in text or "predicts -9" in text
