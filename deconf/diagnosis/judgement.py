@@ -122,11 +122,17 @@ class Diagnosis:
 
 
 def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
-    """The verdict, and why. explored: trials of exploration. Raises InputError if a figure is not finite."""
+    """The verdict, and why. It cannot tell where less than half of the refits would give that verdict alone.
+
+    explored: trials of exploration. Raises InputError if a figure is not finite.
+    """
     diagnosis = _judge(refits, explored)
-    alone = [_judge([refit], explored) for refit in refits] if len(refits) > 1 else [diagnosis]
-    others = [one for one in alone if (one.verdict, one.tier) != (diagnosis.verdict, diagnosis.tier)]
-    verdicts = dict.fromkeys(f"{one.verdict}{f', Tier {one.tier}' * (one.verdict == 'confounded')}" for one in others)
+    alone = [(one.verdict, one.tier) for one in (_judge([refit], explored) for refit in refits)]
+    if 2 * alone.count((diagnosis.verdict, diagnosis.tier)) < len(refits) and diagnosis.verdict != "cannot tell":
+        found = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
+        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, found=found, next=MORE_TRIALS)
+    others = [one for one in alone if one != (diagnosis.verdict, diagnosis.tier)]
+    verdicts = dict.fromkeys(f"{verdict}{f', Tier {tier}' * (verdict == 'confounded')}" for verdict, tier in others)
     return replace(diagnosis, agreeing=len(alone) - len(others), refits=len(refits), dissenting=tuple(verdicts))
 
 

@@ -221,12 +221,16 @@ class TestJudge:
         assert judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
     def test_what_the_others_say(self) -> None:
-        """A verdict of three splits, of which two say something else if judged alone."""
-        diagnosis = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(latent_gain=2.0)])
-        assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.dissenting) == ("confounded", 1, ("cannot tell",))
-        assert "Not very: 1 of 3 random splits" in diagnosis.sure
+        """A verdict that most splits give alone stands, and says how sure it is; that of fewer does not."""
+        diagnosis = judge([CLEAR, CLEAR, CLEAR._replace(latent_gain=2.0)])
+        assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.dissenting) == ("confounded", 2, ("cannot tell",))
+        assert "Not very: 2 of 3 random splits" in diagnosis.sure
         assert "(the others: cannot tell)" in diagnosis.sure
         assert judge([CLEAR] * 2).dissenting == ()
+        few = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(latent_gain=2.0)])
+        assert (few.verdict, few.tier, few.agreeing, few.next) == ("cannot tell", None, 2, advice.MORE_TRIALS)
+        assert few.dissenting == ("confounded, Tier 2",)
+        assert "lead to different verdicts" in few.found
 
     def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
