@@ -39,3 +39,5 @@ def main() -> None:
     print(comparison.write(scores, methods, against, args.out))
     if presets := sorted({record["preset"] for record in every} - {"default"}):
         print(f"note: runs of preset {', '.join(presets)}; the records that come with the package are of default")
+    for line in comparison.outdated(every, against):
+        print(f"note: {line}")

@@ -28,6 +28,27 @@ Scores = Mapping[str, Mapping[str, Mapping[int, Array]]]
 """By method, task and seed: scores [E] of the episodes of a trial."""
 
 
+def published(every: Sequence[Record], against: Sequence[str]) -> list[Record]:
+    """Records that come with the package, of the same tasks and protocol: of those in `against` that no run has."""
+    chosen = []
+    for made in {record["task"]: record for record in every}.values():
+        task, ran = made["task"], {records.named(one) for one in every if one["task"] == made["task"]}
+        kept = records.of_task(RECORDS, task, protocol=made.get(records.NAME, STANDARD))
+        same = [record for record in kept if aggregation.referenced(record) == aggregation.referenced(made)]
+        chosen += [record for record in same if records.named(record) in {*against} - ran]
+    return chosen
+
+
+def outdated(every: Sequence[Record], against: Sequence[str]) -> list[str]:
+    """A line for each method whose `published` records are of another version than today's."""
+    versions = {record["method"]: record["method_version"] for record in published(every, against)}
+    return [
+        f"{name} is of version {version} in the records of the package; today's is {METHODS[name].version}"
+        for name, version in versions.items()
+        if version != METHODS[name].version
+    ]
+
+
 def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[str, dict[int, Array]]]:
     """Scores of all methods in records of runs, and of those in `against`: with the package where no run has them.
 
@@ -52,13 +73,8 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
             add(record)
     if not scores:
         raise InputError("the records given are of random and expert alone; give those of a method")
-    made_by = {record["task"]: aggregation.referenced(record) for record in every}
-    for task, made in made_by.items():
-        for record in records.of_task(RECORDS, task, protocol=protocols[0]):
-            name = records.named(record)
-            ran = any(records.named(one) == name for one in every if one["task"] == task)
-            if aggregation.referenced(record) == made and name in against and not ran:
-                add(record)
+    for record in published(every, against):
+        add(record)
     for name in against:
         if name not in scores:
             known = list(dict.fromkeys([*scores, *METHODS]))

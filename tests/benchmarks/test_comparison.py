@@ -220,6 +220,16 @@ class TestComparison:
         for name in ("comparison.pdf", "comparison.png", "over_tasks.csv", "over_tasks.tex", "tasks.csv"):
             assert (tmp_path / name).stat().st_size > 0
 
+    def test_records_of_older_versions_are_named(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        kept = records.of_task(published.RECORDS, "curling")
+        version, today = catalogue.METHODS["naive_rnn"].version, [r for r in kept if r["method"] == "naive_rnn"]
+        line = f"naive_rnn is of version {version - 1} in the records of the package; today's is {version}"
+        monkeypatch.setattr(comparison, "RECORDS", tmp_path)
+        for back, lines in ((0, []), (1, [line])):
+            records.write(tmp_path, [r | {"method_version": version - back, "bits": "0" * 64} for r in today])
+            assert comparison.outdated([record("mine", 0, 0.5)], ["naive_rnn"]) == lines
+            (tmp_path / "curling.jsonl").unlink()
+
     def test_a_mean_over_tasks(self) -> None:
         """Welch's interval holds the mean as often as it says, of three seeds."""
         rng, held = np.random.default_rng(0), []
