@@ -153,7 +153,7 @@ def measure(
     findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
-        of_trial = trait.fit(whole, held_out, alone.best, Signature.of(train), amounts.cloning, draws)
+        of_trial = trait.fit(whole, held_out, Signature.of(train), amounts.cloning, draws)
         stakes = _trait_stakes(of_trial, explanation, learned_env, amounts, rngs)
         findings = findings._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
     report(1)

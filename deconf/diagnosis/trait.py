@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
@@ -27,8 +27,8 @@ NOISE = 0.3  # of traits in training, so that they do not name trials
 class Trait(NamedTuple):
     """A policy given a trait, traits [1, B, D] of the trials of training, and its gain in held-out ones.
 
-    gain: log-likelihood of the actions of their second half, given the trait of the first, over the present observation
-    alone; nats a step.
+    gain: log-likelihood of the actions of their second half, given the trait of the first, over a policy that was
+    trained with traits of other trials, and has as much to overfit; nats a step.
     """
 
     policy: ActionHead
@@ -66,29 +66,42 @@ def _draw(data: Batch, draws: Draws) -> Batch:
     return Batch(obs, action, next_obs, data.mask.gather(2, order))
 
 
-def fit(
-    train: Batch, held_out: Batch, present: Tensor, signature: Signature, config: MemorylessConfig, draws: Draws
-) -> Trait:
-    """Train encoder and policy on halves of the trials, and measure the gain over `present` [1, B, T]."""
+def _per_step(trait: Tensor, steps: Batch) -> Tensor:
+    """Each trial's trait [S, B, D] at each of its steps."""
+    return trait[:, :, None].expand(-1, -1, steps.mask.shape[2], -1)
+
+
+def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessConfig, draws: Draws) -> Trait:
+    """Train an encoder on halves of the trials, clone policies given its traits, and measure the gain."""
     scales = Scales.of(signature, train)
     encoder = Encoder(config.width, scales, draws)
-    policy = ActionHead(signature.obs + TRAIT, config.width, scales, draws)
+    policy, own, other = (ActionHead(signature.obs + TRAIT, config.width, scales, draws) for _ in range(3))
 
-    def log_prob(steps: Batch, trait: Tensor) -> Tensor:
-        features = [scales.obs(steps.obs), trait[:, :, None].expand(-1, -1, steps.mask.shape[2], -1)]
-        return policy.log_prob(torch.cat(features, -1), steps.action)
+    def log_prob(of: ActionHead, steps: Batch, trait: Tensor) -> Tensor:
+        return of.log_prob(torch.cat([scales.obs(steps.obs), trait], -1), steps.action)
+
+    def blurred(trait: Tensor) -> Tensor:
+        return trait + NOISE * draws.normal(*trait.shape[1:])
 
     optimizer = Adam([encoder, policy], config.learning_rate, config.updates)
     for update in range(config.updates):
         parts = [_draw(half, draws) for half in halves(train.draw_trials(TRIALS, draws))]
         context, rest = parts if update % 2 else parts[::-1]
         trait = encoder(context)
-        trait = trait + NOISE * draws.normal(*trait.shape[1:])
-        loss = imitation_loss(log_prob(rest, trait).flatten(1), rest.mask.flatten(1))
+        loss = imitation_loss(log_prob(policy, rest, _per_step(blurred(trait), rest)).flatten(1), rest.mask.flatten(1))
         optimizer.step(loss + 1e-3 * trait.square().mean((1, 2)))
     with torch.no_grad():
+        traits = encoder(train)
+    for clone, given in ((own, traits), (other, traits.roll(1, 1))):
+        optimizer = Adam([clone], config.learning_rate, config.updates)
+        for _ in range(config.updates):
+            index = train.draw_steps(config.batch, draws)
+            steps, trait = train.steps(index), take(given, index // train.mask.shape[2])
+            optimizer.step(imitation_loss(log_prob(clone, steps, blurred(trait)), steps.mask))
+    with torch.no_grad():
         early, late = halves(held_out)
-        return Trait(policy, encoder(train), typical(log_prob(late, encoder(early)) - present, late))
+        trait = _per_step(encoder(early), late)
+        return Trait(own, traits, typical(log_prob(own, late, trait) - log_prob(other, late, trait), late))
 
 
 class TraitPolicy(LatentPolicy):

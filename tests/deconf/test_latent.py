@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.diagnosis import latent, measures
+from deconfounded.deconf.diagnosis import latent, measures, trait
 from deconfounded.deconf.diagnosis.measures import Amounts, split
 from deconfounded.deconf.diagnosis.thresholds import NO_EVIDENCE
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
@@ -103,3 +103,20 @@ def test_theta_that_drifts() -> None:
     explanation = measures._explain(expert, explored, amounts, Draws([rng], "cpu"), lambda share: None)
     assert explanation.latents.shape[1] == 4 * 48
     assert explanation.exploration_evidence == pytest.approx(4, rel=0.35)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("size", "least", "most"), [(0.4, 0.2, 1.0), (0.0, -0.1, 0.1)])
+def test_a_trait_s_gain_is_over_a_policy_that_fits_as_well(size: float, least: float, most: float) -> None:
+    """Actions of a rough function of the state, which no clone fits in so few updates, and of a side of each trial."""
+    rng = np.random.default_rng(0)
+    side, obs = rng.choice([-1, 1], (48, 1, 1, 1)), rng.uniform(-1, 1, (48, 1, 41, 1))
+    action = size * side + 0.5 * np.sin(9 * obs[:, :, :-1]) + 0.05 * rng.standard_normal((48, 1, 40, 1))
+    train, held_out = (
+        Trials(obs[i], action[i].clip(-1, 1), np.ones((len(obs[i]), 1, 40), bool))
+        for i in (slice(0, 36), slice(36, None))
+    )
+    config = MemorylessConfig(updates=100, batch=256, width=32, learning_rate=6e-3)
+    data = Batch.of(train, 1), Batch.of(held_out, 1)
+    gain = trait.fit(*data, Signature.of(train), config, Draws([rng], "cpu")).gain
+    assert least < gain < most
