@@ -16,7 +16,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 7  # raised when figures or verdicts of the same trials change
+VERSION = 8  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)

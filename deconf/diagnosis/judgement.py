@@ -183,7 +183,8 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         seen = in_exploration is not None and min(in_exploration.low, figures["expert_evidence"].low) > DIFFERS
         if seen and not alike:
             reasons.append(_rollouts(figures))
-            if at_stake and max(gap.low, by_actions.low) > SMALL_GAP and figures["latent_gain"].low > 0:
+            loses = at_stake and max(gap.low, by_actions.low) > SMALL_GAP and model.value < MAX_MODEL_DEVIATION
+            if loses and figures["latent_gain"].low > 0:
                 found = (
                     "Your system differs from trial to trial, and the expert seems to act on it: the clone with a"
                     " memory found nothing of that in the logs, and would lose by it."

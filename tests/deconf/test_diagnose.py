@@ -179,6 +179,7 @@ class TestJudge:
             ({"naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({"memory_gain": 0.0, "latent_gain": 0.05}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"memory_gain": 0.0, "latent_gain": 0.05, "model_deviation": 5.0}, "not confounded", 1, advice.CLONE),
             ({"memory_gain": 0.0, "latent_gain": -0.1}, "not confounded", 1, advice.CLONE),
             ({"memory_gain": 0.0, "latent_gain": 0.3, "dynamics_differ": 0.0}, "cannot tell", None, advice.VARY_LATENT),
             ({"memory_gain": 0.0, "exploration_evidence": 0.0}, "cannot tell", None, advice.MORE_TRIALS),
