@@ -26,6 +26,12 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "local", Here)
 
 
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run in this process draws nothing: pictures take longer than a small run."""
+    monkeypatch.setattr("deconfounded.benchmarks.output.run_report.pictures", lambda *_: None)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Without dm_control there is no walker."""
     if find_spec("dm_control") is not None:

@@ -70,6 +70,7 @@ def deconf_process(folder: Path, *args: str) -> subprocess.CompletedProcess[str]
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_pictures")
 def test_run_play_score(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run of one's own task with one's own expert and method; its agents are then played, and scored anew."""
     assert len([line for line in (folder / "my_rnn.py").read_text().splitlines() if line]) <= 60
