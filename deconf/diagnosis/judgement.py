@@ -106,8 +106,8 @@ class Diagnosis:
     @property
     def sure(self) -> str:
         """How sure the verdict is."""
-        others = f" (the others: {', '.join(self.dissenting)})" if self.dissenting else ""
-        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone{others}."
+        dissent = f" (the others: {', '.join(self.dissenting)})" if self.dissenting else ""
+        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone{dissent}."
         if self.verdict == "cannot tell":
             return text
         if self.agreeing < self.refits:
@@ -127,13 +127,13 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
     explored: trials of exploration. Raises InputError if a figure is not finite.
     """
     diagnosis = _judge(refits, explored)
-    alone = [(one.verdict, one.tier) for one in (_judge([refit], explored) for refit in refits)]
+    alone = [(split.verdict, split.tier) for split in (_judge([refit], explored) for refit in refits)]
     if 2 * alone.count((diagnosis.verdict, diagnosis.tier)) < len(refits) and diagnosis.verdict != "cannot tell":
-        found = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
-        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, found=found, next=MORE_TRIALS)
-    others = [one for one in alone if one != (diagnosis.verdict, diagnosis.tier)]
-    verdicts = dict.fromkeys(f"{verdict}{f', Tier {tier}' * (verdict == 'confounded')}" for verdict, tier in others)
-    return replace(diagnosis, agreeing=len(alone) - len(others), refits=len(refits), dissenting=tuple(verdicts))
+        reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
+        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, found=reason, next=MORE_TRIALS)
+    dissent = [verdict for verdict in alone if verdict != (diagnosis.verdict, diagnosis.tier)]
+    verdicts = dict.fromkeys(f"{name}{f', Tier {tier}' * (name == 'confounded')}" for name, tier in dissent)
+    return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(verdicts))
 
 
 def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
