@@ -63,6 +63,16 @@ class Belief(nn.Module, ABC):
         """
         return self.prior_mean.new_zeros(len(self.prior_mean))
 
+    read_width: int
+
+    @abstractmethod
+    def read(self, memory: Tensor) -> Tensor:
+        """What networks read [..., read_width] of memories [..., M]."""
+
+    @abstractmethod
+    def empty(self, memory: Tensor) -> Tensor:
+        """Whether memories [..., M] hold no evidence, so that the belief is the prior, [..., 1]."""
+
     @abstractmethod
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std [..., D] of q_phi given memories [..., M]."""
@@ -105,11 +115,20 @@ class EvidenceBelief(Belief):
         self.products = products if products <= MAX_PRODUCTS else 0
         inputs = signature.obs + signature.action_features
         self.expected = Mlp(inputs, width, signature.obs, draws)
-        self.evidence = Mlp(inputs + signature.obs + self.products, width, width // 4, draws)
+        self.evidence = self._evidence_network(width, inputs, draws)
         self.width, self.features = width, width // 4 + signature.obs + self.products
         self.whiten = Whitener(self.features, draws)
-        self.out = Mlp(2 * self.features + 1, width, 2 * latent, draws)
+        self.read_width = 2 * self.features + 1
+        self.out = Mlp(self.read_width, width, 2 * latent, draws)
         self.register_buffer("longest", torch.tensor(0.0))
+
+    def _evidence_network(self, width: int, inputs: int, draws: Draws) -> Mlp:
+        """The network whose outputs are summed. inputs: the width of an observation and an action."""
+        return Mlp(inputs + self.inputs.signature.obs + self.products, width, width // 4, draws)
+
+    def _evidence(self, given: list[Tensor], innovation: Tensor, direct: list[Tensor]) -> Tensor:
+        """The evidence [..., width // 4] of transitions. given: observation and action; direct: what is summed too."""
+        return self.evidence(torch.cat([*given, *direct], -1))  # type: ignore[no-any-return]
 
     def _innovation(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Scaled observations and actions of transitions, and the scaled change [..., O] less its expectation."""
@@ -128,8 +147,8 @@ class EvidenceBelief(Belief):
             direct = [innovation]
             if self.products:
                 direct.append((action[..., None] * innovation[..., None, :]).flatten(-2))
-            inputs = torch.cat([obs, action, *direct], -1)
-        evidence = self.whiten(torch.cat([self.evidence(inputs), *direct], -1), batch.mask)
+        evidence = self._evidence([obs, action], innovation, direct)
+        evidence = self.whiten(torch.cat([evidence, *direct], -1), batch.mask)
         mask = batch.mask[..., None]
         return torch.cat([evidence * mask, mask], -1)
 
@@ -149,21 +168,41 @@ class EvidenceBelief(Belief):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)
 
-    def _read(self, memory: Tensor, longest: Tensor | float) -> Tensor:
-        """The inputs [..., 2 F + 1] of the network that reads a sum of evidence and its count."""
-        scale = (longest / memory[..., -1:]).clamp(max=1) if longest else 1.0
-        total, n = memory[..., :-1] * scale, 1 + memory[..., -1:] * scale
-        return torch.cat([total / n, total / n.sqrt(), n.log() - 2], -1)
+    def _rescaled(self, total: Tensor, longest: Tensor | float) -> Tensor:
+        """What is read [..., 2 F + 1] of a sum of evidence and its count [..., F + 1]."""
+        scale = (longest / total[..., -1:]).clamp(max=1) if longest else 1.0
+        evidence, n = total[..., :-1] * scale, 1 + total[..., -1:] * scale
+        return torch.cat([evidence / n, evidence / n.sqrt(), n.log() - 2], -1)
 
-    def _gaussian(self, inputs: Tensor, empty: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and std that the network says; those of the prior where there is no evidence."""
-        mean, raw = self.out(inputs).chunk(2, -1)
-        std = (F.softplus(raw) + 1e-6).sqrt()
-        prior_mean, prior_std = self.prior(mean)
-        return torch.where(empty, prior_mean, mean), torch.where(empty, prior_std, std)
+    def read(self, memory: Tensor) -> Tensor:
+        return self._rescaled(memory, self.longest)
+
+    def empty(self, memory: Tensor) -> Tensor:
+        return memory[..., self.features : self.features + 1] == 0
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        return self._gaussian(self._read(memory, self.longest), memory[..., -1:] == 0)
+        mean, raw = self.out(self.read(memory)).chunk(2, -1)
+        std = (F.softplus(raw) + 1e-6).sqrt()
+        prior_mean, prior_std = self.prior(mean)
+        empty = self.empty(memory)
+        return torch.where(empty, prior_mean, mean), torch.where(empty, prior_std, std)
+
+
+class InnovationBelief(EvidenceBelief):
+    """The order-free belief whose evidence is linear in innovations, sum_t G(s_t, a_t) (s'_t - E[s' | s_t, a_t]).
+
+    That is the sufficient statistic of a linear-Gaussian effect of theta, s' = f(s, a) + g(s, a) theta + noise, with
+    gains G = g^T Sigma^-1, which are learned. Evidence that depends on states otherwise tells of theta by where a trial
+    went: a controller that is wrong about theta drifts to one side. This holds of exploration, but not of the expert's
+    trials, so that their latents differ from those by which an agent acts.
+    """
+
+    def _evidence_network(self, width: int, inputs: int, draws: Draws) -> Mlp:
+        return Mlp(inputs, width, width // 4 * self.inputs.signature.obs, draws)
+
+    def _evidence(self, given: list[Tensor], innovation: Tensor, direct: list[Tensor]) -> Tensor:
+        gains = self.evidence(torch.cat(given, -1)).unflatten(-1, (-1, innovation.shape[-1]))
+        return (gains * innovation[..., None, :]).sum(-1)
 
 
 class ForgettingBelief(EvidenceBelief):
@@ -178,7 +217,8 @@ class ForgettingBelief(EvidenceBelief):
     def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(latent, width, scales, draws)
         self.sums = 1 + len(self.KEPT)
-        self.out = Mlp(self.sums * (2 * self.features + 1), width, 2 * latent, draws)
+        self.read_width *= self.sums
+        self.out = Mlp(self.read_width, width, 2 * latent, draws)
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
@@ -204,11 +244,11 @@ class ForgettingBelief(EvidenceBelief):
         faded = [part * (1 - (1 - kept) * mask) for part, kept in zip(faded, self.KEPT, strict=True)]
         return torch.cat([part + terms for part in (whole, *faded)], -1)
 
-    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+    def read(self, memory: Tensor) -> Tensor:
         whole, *faded = memory.chunk(self.sums, -1)
-        parts = [self._read(whole, self.longest)]
-        parts += [self._read(part, 1 / (1 - kept)) for part, kept in zip(faded, self.KEPT, strict=True)]
-        return self._gaussian(torch.cat(parts, -1), whole[..., -1:] == 0)
+        parts = [self._rescaled(whole, self.longest)]
+        parts += [self._rescaled(part, 1 / (1 - kept)) for part, kept in zip(faded, self.KEPT, strict=True)]
+        return torch.cat(parts, -1)
 
 
 def faded_sum(x: Tensor, kept: float) -> Tensor:
@@ -266,6 +306,7 @@ class GruBelief(Belief):
         super().__init__(latent, draws)
         self.memory = GruMemory(width, scales, draws)
         self.inputs = self.memory.inputs
+        self.read_width = width
         self.out = Linear(width, 2 * latent, draws)
         with torch.no_grad():
             for layer in self.inputs.embed_obs:
@@ -283,6 +324,12 @@ class GruBelief(Belief):
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return self.memory.update(memory, step)
+
+    def read(self, memory: Tensor) -> Tensor:
+        return memory
+
+    def empty(self, memory: Tensor) -> Tensor:
+        return torch.zeros_like(memory[..., :1], dtype=torch.bool)
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = self.out(memory).chunk(2, -1)

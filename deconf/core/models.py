@@ -12,13 +12,18 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
-BELIEFS = {"evidence": EvidenceBelief, "forgetting": ForgettingBelief, "gru": GruBelief}
+BELIEFS = {
+    "innovations": InnovationBelief,
+    "evidence": EvidenceBelief,
+    "forgetting": ForgettingBelief,
+    "gru": GruBelief,
+}
 
 
 class LatentModel(nn.Module, ABC):

@@ -19,9 +19,10 @@ from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
 from deconfounded.deconf.core.deployment import Way, acted_on, deployments
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
-from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
+from deconfounded.deconf.core.models import LatentModel, VariationalModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
+from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -35,12 +36,12 @@ Explore = Callable[[Agent | None], Trials]
 
 @dataclass(frozen=True)
 class DeconfoundedConfig(Configuration):
-    """Hyperparameters for each seed. Each round explores, then updates the model, then the policy.
+    """Hyperparameters for each seed. Each round explores, then updates the model, the online belief and the policy.
 
     The discrete model has an exact likelihood: beta, warm_up, inference_steps and fit_prior do not apply to it.
     """
 
-    model: Literal["evidence", "forgetting", "gru", "discrete"] = "evidence"
+    model: Literal["innovations", "evidence", "forgetting", "gru", "discrete"] = "innovations"
     width: int = 64
     latent: int = 8  # dimensions of theta_hat, or its number of values if discrete
     beta: float = 1e-3
@@ -64,11 +65,15 @@ class DeconfoundedConfig(Configuration):
 
 
 class DeconfoundedAgent(LearnedAgent):
-    """Algorithm 2, posterior sampling. way: how it takes theta_hat from its belief (`core/deployment.py`)."""
+    """Algorithm 2, posterior sampling. way: how it takes theta_hat from its belief (`core/deployment.py`).
+
+    `online`: its belief in the course of a trial; None: that is the model's own.
+    """
 
     def __init__(self, model: LatentModel, policy: ActionHead, way: Way = "step") -> None:
         super().__init__(policy)
         self.model, self.way = model, way
+        self.online: OnlineBelief | None = None
 
     @staticmethod
     def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "DeconfoundedAgent":
@@ -76,19 +81,29 @@ class DeconfoundedAgent(LearnedAgent):
         model = new_model(kind, latent, width, scales, draws)
         return DeconfoundedAgent(model, ActionHead(model.inputs.obs_width + latent, width, scales, draws))
 
+    def add_online(self, draws: Draws) -> None:
+        """Give it an untrained belief for the course of a trial."""
+        model = self.model
+        assert isinstance(model, VariationalModel)
+        self.online = OnlineBelief(model.encoder, model.latent, model.width, draws)
+
     @classmethod
     def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         sizes = (shape["model"], shape["latent"], shape["width"])
         agent = cls.new(*sizes, scales, draws)
         agent.way = shape["way"]
+        if shape["online"]:
+            agent.add_online(draws)
         return agent
 
     def shape(self) -> dict[str, Any]:
         model = self.model
-        return {"model": model.kind, "latent": model.latent, "width": model.width, "way": self.way}
+        sizes = {"model": model.kind, "latent": model.latent, "width": model.width}
+        return sizes | {"online": self.online is not None, "way": self.way}
 
     def parts(self) -> dict[str, nn.Module]:
-        return {"model": self.model, "policy": self.policy}
+        own: dict[str, nn.Module] = {"model": self.model, "policy": self.policy}
+        return own | {"online": self.online} if self.online else own
 
     def begin(self, n: int) -> None:
         super().begin(n)
@@ -99,10 +114,16 @@ class DeconfoundedAgent(LearnedAgent):
         self._latent: Tensor | None = None
         self._memory = self.model.forget(self._memory)
 
+    def belief(self) -> Tensor:
+        """The belief [S, N, P] given the trial so far."""
+        if self.online is None:
+            return self.model.belief(self._memory)
+        assert isinstance(self.model, VariationalModel)
+        return self.online(self.model.encoder, self._memory)  # type: ignore[no-any-return]
+
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] for the next action."""
-        belief = self.model.belief(self._memory)
-        self._latent = acted_on(self.model, self.way, belief, self._draws, self._latent)
+        self._latent = acted_on(self.model, self.way, self.belief(), self._draws, self._latent)
         return self._latent
 
     def choose(self, obs: Tensor) -> Tensor:
@@ -128,7 +149,7 @@ class DeconfoundedAgent(LearnedAgent):
 
     @torch.no_grad()
     def features(self) -> NDArray[np.float32]:
-        mean = self.model.mean(self.model.belief(self._memory))
+        mean = self.model.mean(self.belief())
         return mean.flatten(0, 1).cpu().numpy()
 
 
@@ -141,6 +162,7 @@ class Explorer(DeconfoundedAgent):
 
     def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
         super().__init__(agent.model, agent.policy)
+        self.online = agent.online
         self.latents, self.random_share = latents, random_share
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
@@ -176,7 +198,9 @@ def train(
     draws = Draws(rngs, device)
     scales = Scales.of(signature, expert, explored)
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
-    model, policy = agent.model, agent.policy
+    if config.model == "innovations":
+        agent.add_online(draws)
+    model, policy, online = agent.model, agent.policy, agent.online
     inference_batch = config.inference_batch
     if config.drifts:
         model.kept.fill_(0.5)  # during exploration
@@ -194,9 +218,7 @@ def train(
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
     begin, done = 0, 0
-    checkpoint = Checkpoint(
-        monitor, rngs, model=model, policy=policy, inference=inference, imitation=imitation, draws=draws
-    )
+    checkpoint = Checkpoint(monitor, rngs, **agent.parts(), inference=inference, imitation=imitation, draws=draws)
     if before := checkpoint.load():
         begin, belief, latents, explored = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
         expert = Batch(*before["expert"]) if before["expert"] else expert
@@ -219,6 +241,8 @@ def train(
         latents = model.sample(belief, draws)
         if config.fit_prior:
             model.set_prior(belief, draws)
+        if online is not None and isinstance(model, VariationalModel):
+            online.fit(model, explored, config.inference_updates, config.shortest, draws)
         for _ in range(config.imitation_updates):
             imitate(done, imitation)
             done += 1
@@ -282,7 +306,7 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 
 
 @uses(
-    *USES, version=3, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+    *USES, version=4, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""

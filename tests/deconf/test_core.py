@@ -16,7 +16,14 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief, GruMemory
+from deconfounded.deconf.core.beliefs import (
+    Belief,
+    EvidenceBelief,
+    ForgettingBelief,
+    GruBelief,
+    GruMemory,
+    InnovationBelief,
+)
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import DiscreteModel, VariationalModel, final_belief
@@ -114,7 +121,7 @@ class TestEquations:
         assert std.grad is not None
 
 
-@pytest.mark.parametrize("kind", [EvidenceBelief, ForgettingBelief, GruBelief])
+@pytest.mark.parametrize("kind", [InnovationBelief, EvidenceBelief, ForgettingBelief, GruBelief])
 @pytest.mark.parametrize("name", ["bandit", "slippery_cartpole"])
 class TestBeliefs:
     def make(self, kind: type[Belief], name: str) -> tuple[Belief, Batch, Trials]:
@@ -150,7 +157,7 @@ class TestBeliefs:
         mean, _ = belief.posterior(belief(data[:, :, :shortest])[:, :, -1])
         mean_turned, _ = belief.posterior(belief(turned)[:, :, -1])
         same = torch.allclose(mean, mean_turned, atol=1e-4)
-        assert same == (kind is EvidenceBelief)
+        assert same == (kind in (InnovationBelief, EvidenceBelief))
 
     def test_hindsight(self, kind: type[Belief], name: str) -> None:
         """A memory of whole trials, each of whose steps counts the less the further it is from where theta is asked."""
@@ -490,7 +497,7 @@ class TestMethods:
         assert 22 < run_trials(envs.BatchEnv(env.task, 500), agent, 1, 3).returns.mean() < 42
 
     @pytest.mark.slow
-    @pytest.mark.parametrize("kind", ["evidence", "forgetting", "gru", "discrete"])
+    @pytest.mark.parametrize("kind", ["innovations", "evidence", "forgetting", "gru", "discrete"])
     def test_deconfounded_runs_and_repeats(self, kind: str) -> None:
         """The same seed gives the same agent, and neither training nor acting touches torch's global generator."""
         trials, env = demonstrations("slippery_cartpole", 8)

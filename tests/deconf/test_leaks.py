@@ -249,7 +249,7 @@ def make(kind: str, name: str = CONTROL) -> tuple[LatentModel, Batch, Draws, Dec
     return model.eval(), data, draws, DeconfoundedAgent(model, policy_)
 
 
-@pytest.mark.parametrize("kind", ["evidence", "forgetting", "gru", "discrete"])
+@pytest.mark.parametrize("kind", ["innovations", "evidence", "forgetting", "gru", "discrete"])
 class TestLatents:
     def test_training_draws_theta_hat(self, kind: str) -> None:
         """The same update twice: only the noise of theta_hat differs, and so does the loss."""
@@ -279,7 +279,7 @@ class TestLatents:
             assert (held == held[:, :1]).all() == (way != "episode"), "it is drawn anew in each trial"
             assert (other.model, agent.way) == (agent.model, "step")
         mean, std = (1 / 3, (2 / 9) ** 0.5) if kind == "discrete" else (None, None)
-        if kind == "evidence":
+        if kind in ("innovations", "evidence"):
             mean, std = 0.0, 1.0
         if mean is not None and std is not None:
             torch.testing.assert_close(first.mean(1), torch.full((2, 3), mean), rtol=0, atol=4 * std / 20)

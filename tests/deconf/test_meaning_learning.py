@@ -98,7 +98,7 @@ def losses(batch: Batch) -> dict[str, Loss]:
         "dagger": lambda given: dagger.loss(given, given.action, None, draws()),
         "rma": lambda given: student.loss(given, given.action, adapter.start(4))[0],
     }
-    for kind in ("evidence", "gru", "discrete"):
+    for kind in ("innovations", "evidence", "gru", "discrete"):
         model = new_model(kind, 3, 16, scales, draws()).eval()
         agent = DeconfoundedAgent.new(kind, 3, 16, scales, draws())
         belief = agent.model.belief(agent.model.final_memory(batch)).detach()

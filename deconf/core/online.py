@@ -1,0 +1,77 @@
+"""The belief in the course of a trial about the latent that the whole trial will give."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.beliefs import Belief
+from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.nets import gaussian_log_prob
+from deconfounded.deconf.equations import masked_mean
+
+MEMORIES, PER_TRIAL = 32768, 64  # on which the network is trained, about; at most so many of a trial of exploration
+BATCH, RATE, LEAST = 1024, 3e-3, 0.01  # memories an update; learning rate; least std, in units of the prior's
+
+
+class OnlineBelief(nn.Module):
+    """q(theta_hat_H | tau_:t), a Gaussian: a second network that reads the memory of a model's encoder.
+
+    The policy is cloned given latents of whole trials, theta_hat_H, and deployed on what beginnings tell of them. Eq.
+    (6) with a beta far below 1 does not train q_phi for that: its std says little of how far its mean is from
+    theta_hat_H (ten times as far and more, early in a trial), and its mean may lie where no trial's latent is. This
+    network is trained on exploration to give the density of theta_hat_H, inferred by q_phi on the whole trial. It gives
+    the std, and what is to be added to q_phi's mean: nothing, at first, and where a trial is nearly over.
+    """
+
+    def __init__(self, encoder: Belief, latent: int, width: int, draws: Draws) -> None:
+        super().__init__()
+        self.net = Mlp(encoder.read_width, width, 2 * latent, draws)
+        for parameter in self.net[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, encoder: Belief, memory: Tensor) -> Tensor:
+        """Memories [S, ..., M] -> mean and std [S, ..., 2 D]; those of the prior where there is no evidence."""
+        added, raw = self.net(encoder.read(memory)).chunk(2, -1)
+        with torch.no_grad():
+            mean, _ = encoder.posterior(memory)
+        prior_mean, prior_std = encoder.prior(mean)
+        empty = encoder.empty(memory)
+        mean = torch.where(empty, prior_mean, mean + prior_std * added)
+        std = torch.where(empty, prior_std, prior_std * (F.softplus(raw) + LEAST))
+        return torch.cat([mean, std], -1)
+
+    def fit(self, model: VariationalModel, explored: Batch, updates: int, shortest: float, draws: Draws) -> None:
+        """Train on trials [S, B, T] of exploration, most on their beginnings: `shortest` as in Batch.beginnings."""
+        memory, theta_hat = memories(model, explored, shortest, draws)
+        _, prior_std = model.encoder.prior(theta_hat)
+        optimizer = Adam([self], RATE, updates)
+        for _ in range(updates):
+            index = draws.integers(memory.shape[1], BATCH)
+            mean, std = self(model.encoder, take(memory, index)).chunk(2, -1)
+            unit = prior_std.expand_as(mean[:, :1])
+            log_prob = gaussian_log_prob(take(theta_hat, index) / unit, mean / unit, std / unit)
+            optimizer.step(-masked_mean(log_prob, torch.ones_like(log_prob)))
+
+
+@torch.no_grad()
+def memories(
+    model: VariationalModel, trials: Batch, shortest: float, draws: Draws, part: int = 64
+) -> tuple[Tensor, Tensor]:
+    """Memories [S, K, M] before random steps of trials [S, B, T], and the latents [S, K, D] that these trials give.
+
+    Of each trial as many steps, at most PER_TRIAL, uniform among its first n, where n is log-uniform between the share
+    `shortest` of its steps and all.
+    """
+    steps = trials.mask.shape[2]
+    each = max(1, min(PER_TRIAL, MEMORIES // len(trials)))
+    share = shortest ** draws.uniform(len(trials), each) * draws.uniform(len(trials), each)
+    step = (share * trials.mask.sum(2, keepdim=True)).long()
+    read = []
+    for i in torch.arange(len(trials), device=step.device).split(part):
+        memory = model.encoder(trials[:, i])[:, :, :-1]
+        where = step[:, i] + steps * torch.arange(len(i), device=step.device)[:, None]
+        read.append(take(memory.flatten(1, 2), where.flatten(1)))
+    return torch.cat(read, 1), model.mean(final_belief(model, trials)).repeat_interleave(each, 1)

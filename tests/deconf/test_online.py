@@ -1,0 +1,113 @@
+"""The belief in the course of a trial, and evidence that is linear in innovations, where the exact belief is known."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from deconfounded.deconf.core import online
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.beliefs import EvidenceBelief, InnovationBelief
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.online import OnlineBelief
+
+STEPS = 24
+
+
+def streams(seeds: int = 1) -> Draws:
+    return Draws([np.random.default_rng(i) for i in range(seeds)], "cpu")
+
+
+def pushed(n: int, told: NDArray[np.float64] | None, rng: np.random.Generator) -> tuple[NDArray[np.float64], Batch]:
+    """A hidden force theta ~ N(0, 1) on a ball, and a controller that takes it for `told` (None: that of another)."""
+    theta, place = rng.normal(size=n), np.zeros(n)
+    told = rng.normal(size=n) if told is None else told
+    seen, actions = [place], []
+    for _ in range(STEPS):
+        actions.append(-0.5 * place - told + 0.1 * rng.normal(size=n))
+        place = place + actions[-1] + theta + rng.normal(size=n)
+        seen.append(place)
+    obs, action = (torch.tensor(np.stack(x, 1)[..., None], dtype=torch.float32)[None] for x in (seen, actions))
+    return theta, Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, STEPS))
+
+
+@pytest.fixture(scope="module")
+def model() -> tuple[VariationalModel, Batch]:
+    """A model with InnovationBelief, and the trials of a wrong controller on which it was trained."""
+    _, data = pushed(256, None, np.random.default_rng(0))
+    draws, signature = streams(), Signature(1, 1, 0, False)
+    made = VariationalModel("innovations", 2, 32, Scales.of(signature, data), draws)
+    optimizer = Adam([made], 5e-3, 400)
+    for update in range(400):
+        batch = data.beginnings(update, 0.1).draw_trials(16, draws)
+        made.learn(optimizer, batch, 256, 1e-3 * min(1, update / 200), draws)
+    made.set_prior(final_belief(made, data), draws)
+    return made.eval(), data
+
+
+def test_evidence_is_linear_in_innovations() -> None:
+    """Changes that are as expected are no evidence, whatever the states; twice the innovation is twice the evidence."""
+    _, data = pushed(8, None, np.random.default_rng(0))
+    belief = InnovationBelief(2, 16, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
+    other = EvidenceBelief(2, 16, belief.inputs.scales, streams()).eval()
+
+    def evidence(of: EvidenceBelief, times: float) -> torch.Tensor:
+        inputs = torch.cat([of.inputs.obs(data.obs), of.inputs.action(data.action)], -1)
+        change = of.change.inverse(of.expected(inputs) + times)
+        return of(Batch(data.obs, data.action, data.obs + change, data.mask))[..., : of.width // 4]
+
+    with torch.no_grad():
+        assert evidence(belief, 0).abs().max() < 1e-4
+        torch.testing.assert_close(evidence(belief, 2), 2 * evidence(belief, 1), rtol=1e-3, atol=1e-4)
+        assert evidence(belief, 1).abs().max() > 0.1
+        assert evidence(other, 0).abs().max() > 0.1, "that of EvidenceBelief is not"
+
+
+def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch]) -> None:
+    made, data = model
+    belief = OnlineBelief(made.encoder, 2, 16, streams())
+    memory = made.encoder(data)
+    mean, std = belief(made.encoder, memory).chunk(2, -1)
+    torch.testing.assert_close(mean, made.encoder.posterior(memory)[0])
+    torch.testing.assert_close(mean[:, :, 0], made.encoder.prior_mean[:, None].expand_as(mean[:, :, 0]))
+    torch.testing.assert_close(std[:, :, 0], made.encoder.prior_std[:, None].expand_as(std[:, :, 0]))
+
+
+def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[VariationalModel, Batch]) -> None:
+    """On trials that it has not seen: squared errors are 1 to 2 of its variance, and hundreds of the model's own."""
+    made, data = model
+    belief = OnlineBelief(made.encoder, 2, 32, streams())
+    belief.fit(made, data, 400, 0.1, streams())
+    _, fresh = pushed(400, None, np.random.default_rng(1))
+    with torch.no_grad():
+        memory = made.encoder(fresh)
+        final = made.encoder.posterior(memory[:, :, -1])[0]
+        none = belief(made.encoder, memory[:, :, 0]).chunk(2, -1)[0]
+        torch.testing.assert_close(none, made.encoder.prior_mean[:, None].expand_as(none))
+        for t in (2, 6, 12):
+            mean, std = belief(made.encoder, memory[:, :, t]).chunk(2, -1)
+            own_mean, own_std = made.encoder.posterior(memory[:, :, t])
+            apart, own_apart = (((x - final) / y).square().mean().item() for x, y in ((mean, std), (own_mean, own_std)))
+            assert 0.5 < apart < 4
+            assert own_apart > 50
+            assert (mean - final).square().mean() < 1.02 * (own_mean - final).square().mean()
+
+
+def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of steps that took place, more of the first ones."""
+    _, data = pushed(70, None, np.random.default_rng(0))
+    data.mask[:, ::2, 10:] = 0
+    made = VariationalModel("innovations", 2, 8, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
+    number, step = torch.arange(70.0)[None, :, None].expand(-1, -1, STEPS), torch.arange(float(STEPS)).expand(1, 70, -1)
+    data = Batch(torch.stack([number, step], -1), data.action, data.next_obs, data.mask)
+    monkeypatch.setattr(made.encoder, "forward", lambda batch: torch.cat([batch.obs, batch.obs[:, :, -1:]], 2))
+    monkeypatch.setattr(online, "final_belief", lambda *_: data.obs[:, :, 0].repeat(1, 1, 2))
+    memory, latent = online.memories(made, data, 0.1, streams())
+    assert memory.shape == (1, 70 * online.PER_TRIAL, 2)
+    assert torch.equal(memory[..., 0], latent[..., 0])
+    short, whole = (memory[0, memory[0, :, 0] % 2 == rest, 1] for rest in (0, 1))
+    assert short.max() == 9
+    assert whole.max() > 20
+    assert (whole < STEPS / 4).float().mean() > 0.5
