@@ -43,9 +43,9 @@ class OnlineBelief(nn.Module):
         std = torch.where(empty, prior_std, prior_std * (F.softplus(raw) + LEAST))
         return torch.cat([mean, std], -1)
 
-    def fit(self, model: VariationalModel, explored: Batch, updates: int, shortest: float, draws: Draws) -> None:
-        """Train on trials [S, B, T] of exploration, most on their beginnings: `shortest` as in Batch.beginnings."""
-        memory, theta_hat = memories(model, explored, shortest, draws)
+    def fit(self, model: VariationalModel, explored: Batch, updates: int, draws: Draws) -> None:
+        """Train on trials [S, B, T] of exploration."""
+        memory, theta_hat = memories(model, explored, draws)
         _, prior_std = model.encoder.prior(theta_hat)
         optimizer = Adam([self], RATE, updates)
         for _ in range(updates):
@@ -57,18 +57,14 @@ class OnlineBelief(nn.Module):
 
 
 @torch.no_grad()
-def memories(
-    model: VariationalModel, trials: Batch, shortest: float, draws: Draws, part: int = 64
-) -> tuple[Tensor, Tensor]:
+def memories(model: VariationalModel, trials: Batch, draws: Draws, part: int = 64) -> tuple[Tensor, Tensor]:
     """Memories [S, K, M] before random steps of trials [S, B, T], and the latents [S, K, D] that these trials give.
 
-    Of each trial as many steps, at most PER_TRIAL, uniform among its first n, where n is log-uniform between the share
-    `shortest` of its steps and all.
+    Of each trial as many steps, at most PER_TRIAL, more of the first ones: the density of step t goes by 1 / sqrt(t).
     """
     steps = trials.mask.shape[2]
     each = max(1, min(PER_TRIAL, MEMORIES // len(trials)))
-    share = shortest ** draws.uniform(len(trials), each) * draws.uniform(len(trials), each)
-    step = (share * trials.mask.sum(2, keepdim=True)).long()
+    step = (draws.uniform(len(trials), each).square() * trials.mask.sum(2, keepdim=True)).long()
     read = []
     for i in torch.arange(len(trials), device=step.device).split(part):
         memory = model.encoder(trials[:, i])[:, :, :-1]

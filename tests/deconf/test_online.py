@@ -79,7 +79,7 @@ def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[V
     """On trials that it has not seen: squared errors are 1 to 2 of its variance, and hundreds of the model's own."""
     made, data = model
     belief = OnlineBelief(made.encoder, 2, 32, streams())
-    belief.fit(made, data, 400, 0.1, streams())
+    belief.fit(made, data, 400, streams())
     _, fresh = pushed(400, None, np.random.default_rng(1))
     with torch.no_grad():
         memory = made.encoder(fresh)
@@ -104,10 +104,10 @@ def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.Monkey
     data = Batch(torch.stack([number, step], -1), data.action, data.next_obs, data.mask)
     monkeypatch.setattr(made.encoder, "forward", lambda batch: torch.cat([batch.obs, batch.obs[:, :, -1:]], 2))
     monkeypatch.setattr(online, "final_belief", lambda *_: data.obs[:, :, 0].repeat(1, 1, 2))
-    memory, latent = online.memories(made, data, 0.1, streams())
+    memory, latent = online.memories(made, data, streams())
     assert memory.shape == (1, 70 * online.PER_TRIAL, 2)
     assert torch.equal(memory[..., 0], latent[..., 0])
     short, whole = (memory[0, memory[0, :, 0] % 2 == rest, 1] for rest in (0, 1))
     assert short.max() == 9
     assert whole.max() > 20
-    assert (whole < STEPS / 4).float().mean() > 0.5
+    assert abs((whole < STEPS / 4).float().mean() - 0.5) < 0.1
