@@ -24,6 +24,7 @@ class Belief(nn.Module, ABC):
     """q_phi(theta_hat | tau) and the prior p(theta_hat), a diagonal Gaussian: N(0, 1) until `set_prior`."""
 
     inputs: Inputs
+    read_width: int
     prior_mean: Tensor
     prior_std: Tensor
 
@@ -62,8 +63,6 @@ class Belief(nn.Module, ABC):
         change: gives the scaled changes [S, K, O] that are to be expected; None: those of the steps.
         """
         return self.prior_mean.new_zeros(len(self.prior_mean))
-
-    read_width: int
 
     @abstractmethod
     def read(self, memory: Tensor) -> Tensor:

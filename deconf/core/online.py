@@ -8,9 +8,8 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.layers import Mlp
-from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import gaussian_log_prob
-from deconfounded.deconf.equations import masked_mean
 
 MEMORIES, PER_TRIAL = 32768, 64  # on which the network is trained, about; at most so many of a trial of exploration
 BATCH, RATE, LEAST = 1024, 3e-3, 0.01  # memories an update; learning rate; least std, in units of the prior's
@@ -51,9 +50,8 @@ class OnlineBelief(nn.Module):
         for _ in range(updates):
             index = draws.integers(memory.shape[1], BATCH)
             mean, std = self(model.encoder, take(memory, index)).chunk(2, -1)
-            unit = prior_std.expand_as(mean[:, :1])
-            log_prob = gaussian_log_prob(take(theta_hat, index) / unit, mean / unit, std / unit)
-            optimizer.step(-masked_mean(log_prob, torch.ones_like(log_prob)))
+            log_prob = gaussian_log_prob(take(theta_hat, index) / prior_std, mean / prior_std, std / prior_std)
+            optimizer.step(-log_prob.mean(-1))
 
 
 @torch.no_grad()
@@ -65,9 +63,10 @@ def memories(model: VariationalModel, trials: Batch, draws: Draws, part: int = 6
     steps = trials.mask.shape[2]
     each = max(1, min(PER_TRIAL, MEMORIES // len(trials)))
     step = (draws.uniform(len(trials), each).square() * trials.mask.sum(2, keepdim=True)).long()
-    read = []
+    read, inferred = [], []
     for i in torch.arange(len(trials), device=step.device).split(part):
-        memory = model.encoder(trials[:, i])[:, :, :-1]
-        where = step[:, i] + steps * torch.arange(len(i), device=step.device)[:, None]
+        memory = model.encoder(trials[:, i])
+        where = step[:, i] + (steps + 1) * torch.arange(len(i), device=step.device)[:, None]
         read.append(take(memory.flatten(1, 2), where.flatten(1)))
-    return torch.cat(read, 1), model.mean(final_belief(model, trials)).repeat_interleave(each, 1)
+        inferred.append(model.mean(model.belief(memory[:, :, -1])))
+    return torch.cat(read, 1), torch.cat(inferred, 1).repeat_interleave(each, 1)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 
 from deconfounded.deconf.core import online
 from deconfounded.deconf.core.adam import Adam
@@ -20,23 +19,22 @@ def streams(seeds: int = 1) -> Draws:
     return Draws([np.random.default_rng(i) for i in range(seeds)], "cpu")
 
 
-def pushed(n: int, told: NDArray[np.float64] | None, rng: np.random.Generator) -> tuple[NDArray[np.float64], Batch]:
-    """A hidden force theta ~ N(0, 1) on a ball, and a controller that takes it for `told` (None: that of another)."""
-    theta, place = rng.normal(size=n), np.zeros(n)
-    told = rng.normal(size=n) if told is None else told
+def pushed(n: int, rng: np.random.Generator) -> Batch:
+    """A hidden force theta ~ N(0, 1) on a ball, and a controller that takes it for another's."""
+    theta, assumed, place = rng.normal(size=n), rng.normal(size=n), np.zeros(n)
     seen, actions = [place], []
     for _ in range(STEPS):
-        actions.append(-0.5 * place - told + 0.1 * rng.normal(size=n))
+        actions.append(-0.5 * place - assumed + 0.1 * rng.normal(size=n))
         place = place + actions[-1] + theta + rng.normal(size=n)
         seen.append(place)
     obs, action = (torch.tensor(np.stack(x, 1)[..., None], dtype=torch.float32)[None] for x in (seen, actions))
-    return theta, Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, STEPS))
+    return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, STEPS))
 
 
 @pytest.fixture(scope="module")
 def model() -> tuple[VariationalModel, Batch]:
     """A model with InnovationBelief, and the trials of a wrong controller on which it was trained."""
-    _, data = pushed(256, None, np.random.default_rng(0))
+    data = pushed(256, np.random.default_rng(0))
     draws, signature = streams(), Signature(1, 1, 0, False)
     made = VariationalModel("innovations", 2, 32, Scales.of(signature, data), draws)
     optimizer = Adam([made], 5e-3, 400)
@@ -49,7 +47,7 @@ def model() -> tuple[VariationalModel, Batch]:
 
 def test_evidence_is_linear_in_innovations() -> None:
     """Changes that are as expected are no evidence, whatever the states; twice the innovation is twice the evidence."""
-    _, data = pushed(8, None, np.random.default_rng(0))
+    data = pushed(8, np.random.default_rng(0))
     belief = InnovationBelief(2, 16, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
     other = EvidenceBelief(2, 16, belief.inputs.scales, streams()).eval()
 
@@ -80,7 +78,7 @@ def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[V
     made, data = model
     belief = OnlineBelief(made.encoder, 2, 32, streams())
     belief.fit(made, data, 400, streams())
-    _, fresh = pushed(400, None, np.random.default_rng(1))
+    fresh = pushed(400, np.random.default_rng(1))
     with torch.no_grad():
         memory = made.encoder(fresh)
         final = made.encoder.posterior(memory[:, :, -1])[0]
@@ -97,13 +95,13 @@ def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[V
 
 def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of steps that took place, more of the first ones."""
-    _, data = pushed(70, None, np.random.default_rng(0))
+    data = pushed(70, np.random.default_rng(0))
     data.mask[:, ::2, 10:] = 0
     made = VariationalModel("innovations", 2, 8, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
     number, step = torch.arange(70.0)[None, :, None].expand(-1, -1, STEPS), torch.arange(float(STEPS)).expand(1, 70, -1)
     data = Batch(torch.stack([number, step], -1), data.action, data.next_obs, data.mask)
     monkeypatch.setattr(made.encoder, "forward", lambda batch: torch.cat([batch.obs, batch.obs[:, :, -1:]], 2))
-    monkeypatch.setattr(online, "final_belief", lambda *_: data.obs[:, :, 0].repeat(1, 1, 2))
+    monkeypatch.setattr(made, "belief", lambda memory: memory.repeat(1, 1, 2))
     memory, latent = online.memories(made, data, streams())
     assert memory.shape == (1, 70 * online.PER_TRIAL, 2)
     assert torch.equal(memory[..., 0], latent[..., 0])

@@ -352,7 +352,9 @@ class TestTraining:
                 with pytest.raises(envs.InputError, match=f"^{part} of {type(config).__name__} was "):
                     replace(config, **{part: b"x"})
         DeconfoundedConfig(model="gru", inference_batch=None, beta=0)
-        with pytest.raises(envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'innovations' or"):
+        with pytest.raises(
+            envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'innovations' or"
+        ):
             DeconfoundedConfig(model="tree")  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("drifts", [True, False])
