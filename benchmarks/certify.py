@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks.console import Parser, place
+from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
@@ -27,7 +27,7 @@ from deconfounded.experts import policy
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
 
-EPISODES, SEED = 5, 0
+EPISODES, SEED, TRIALS = 5, 0, 64
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
 MOST = 16  # levels of many latents, drawn from all combinations
@@ -128,7 +128,11 @@ def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
 
 
 def certify(
-    task: envs.Task, expert: Expert, trials: int = 64, grid: int = 21, done: Callable[[str], None] = lambda stage: None
+    task: envs.Task,
+    expert: Expert,
+    trials: int = TRIALS,
+    grid: int = 21,
+    done: Callable[[str], None] = lambda stage: None,
 ) -> dict[str, Any]:
     """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert.
 
@@ -252,13 +256,15 @@ def main() -> None:
     parser = Parser(__doc__, "--task", "--expert")
     folder = Path("results") / "certificates"
     parser.add_argument("--out", type=place, default=folder, help=f"output folder; default: {folder}")
+    about = f"of each policy: more where returns are noisy; default: {TRIALS}"
+    parser.add_argument("--trials", type=whole(2, 10_000), default=TRIALS, help=about)
     args = parser.parse_args()
     task = envs.get(args.task)
     envs.check_task(task)
     expert = policy.load(task, args.expert)
     check_folder(folder := args.out)
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
-    result = certify(task, expert, done=lambda stage: progress.update(1, f"({stage} done)"))
+    result = certify(task, expert, args.trials, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()
     write_json(folder / f"{task.name}.json", result)
     picture(result, folder / f"{task.name}.png")

@@ -1,4 +1,4 @@
-"""q_phi(theta_hat | tau): two beliefs behind one interface.
+"""q_phi(theta_hat | tau): the interface of a belief, and those whose memory is a sum over transitions.
 
 A belief keeps a memory of a history and reads a Gaussian over theta_hat from it (`posterior`). Memories come for all
 prefixes of a batch of trials at once (`forward`), or one transition at a time (`start`, `update`), alike.
@@ -6,15 +6,15 @@ prefixes of a batch of trials at once (`forward`), or one transition at a time (
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Batch, Draws
-from deconfounded.deconf.core.gru import GruScan
-from deconfounded.deconf.core.layers import Linear, Mlp
-from deconfounded.deconf.core.nets import Embedding, Inputs, Scales, Whitener, per_seed
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.nets import Inputs, Scales, Whitener, per_seed
 from deconfounded.deconf.equations import masked_mean
 
 MAX_PRODUCTS = 16  # of actions and changes, as inputs of the evidence network
@@ -24,7 +24,7 @@ class Belief(nn.Module, ABC):
     """q_phi(theta_hat | tau) and the prior p(theta_hat), a diagonal Gaussian: N(0, 1) until `set_prior`."""
 
     inputs: Inputs
-    read_width: int
+    online: ClassVar[bool] = False  # whether a second network gives the belief in the course of a trial: see online.py
     prior_mean: Tensor
     prior_std: Tensor
 
@@ -65,23 +65,15 @@ class Belief(nn.Module, ABC):
         return self.prior_mean.new_zeros(len(self.prior_mean))
 
     @abstractmethod
-    def read(self, memory: Tensor) -> Tensor:
-        """What networks read [..., read_width] of memories [..., M]."""
-
-    @abstractmethod
-    def empty(self, memory: Tensor) -> Tensor:
-        """Whether memories [..., M] hold no evidence, so that the belief is the prior, [..., 1]."""
-
-    @abstractmethod
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and std [..., D] of q_phi given memories [..., M]."""
 
-    def hindsight(self, batch: Batch) -> Tensor:
-        """Memories [S, K, M] from which the latents of whole trials [S, B, T] are inferred.
+    def hindsight(self, batch: Batch, memories: Tensor) -> Tensor:
+        """Memories [S, B, K, M] from which the latents of whole trials [S, B, T] are inferred.
 
-        K is B, a memory a trial, or B T, a memory a step where the latent may change within a trial.
+        K is 1, or T, a memory a step, where the latent may change within a trial. memories: those of `forward`.
         """
-        return self(batch)[:, :, -1]
+        return memories[:, :, -1:]
 
 
 class EvidenceBelief(Belief):
@@ -174,9 +166,11 @@ class EvidenceBelief(Belief):
         return torch.cat([evidence / n, evidence / n.sqrt(), n.log() - 2], -1)
 
     def read(self, memory: Tensor) -> Tensor:
+        """What networks read [..., read_width] of memories [..., M]."""
         return self._rescaled(memory, self.longest)
 
     def empty(self, memory: Tensor) -> Tensor:
+        """Whether memories [..., M] hold no evidence, so that the belief is the prior, [..., 1]."""
         return memory[..., self.features : self.features + 1] == 0
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -196,6 +190,8 @@ class InnovationBelief(EvidenceBelief):
     trials, so that their latents differ from those by which an agent acts.
     """
 
+    online = True
+
     def _evidence_network(self, width: int, inputs: int, draws: Draws) -> Mlp:
         return Mlp(inputs, width, width // 4 * self.inputs.signature.obs, draws)
 
@@ -204,7 +200,7 @@ class InnovationBelief(EvidenceBelief):
         return (gains * innovation[..., None, :]).sum(-1)
 
 
-class ForgettingBelief(EvidenceBelief):
+class ForgettingBelief(InnovationBelief):
     """A belief about a latent that may change at any step, or may not: sums that forget beside the one that does not.
 
     Besides the sum of all evidence it keeps sums in which a step counts KEPT^age, so that evidence of a former latent
@@ -225,14 +221,14 @@ class ForgettingBelief(EvidenceBelief):
         sums = [terms.cumsum(2), *(faded_sum(terms, kept) for kept in self.KEPT)]
         return F.pad(torch.cat(sums, -1), (0, 0, 1, 0))
 
-    def hindsight(self, batch: Batch) -> Tensor:
+    def hindsight(self, batch: Batch, memories: Tensor) -> Tensor:
         """Of each step, what is evidence of the latent at that step: before it and after it."""
         terms = self._terms(batch)
         sums = [terms.sum(2, keepdim=True).expand_as(terms)]
         for kept in self.KEPT:
             after = faded_sum(terms.flip(2), kept).flip(2)
             sums.append(after + kept * F.pad(faded_sum(terms, kept), (0, 0, 1, -1)))
-        return torch.cat(sums, -1).flatten(1, 2)
+        return torch.cat(sums, -1)
 
     def start(self, n: int) -> Tensor:
         return self.prior_mean.new_zeros(len(self.prior_mean), n, self.sums * (self.features + 1))
@@ -257,79 +253,3 @@ def faded_sum(x: Tensor, kept: float) -> Tensor:
         y = y + kept**window * F.pad(y, (0, 0, window, -window))
         window *= 2
     return y
-
-
-class GruMemory(nn.Module):
-    """A GRU (Cho et al., 2014) over embedded transitions (s, a, s'): the history encoder of appendix D.
-
-    Gates are initialised for time constants of 1 to 100 steps (Tallec and Ollivier, 2018). With torch's initialisation
-    a memory lasts two steps, and one seed of five of `dagger` never learns to infer theta.
-    """
-
-    def __init__(self, width: int, scales: Scales, draws: Draws) -> None:
-        super().__init__()
-        self.width, self.seeds = width, len(draws)
-        self.inputs = Embedding(width, scales, draws)
-        self.input, self.recurrent = Linear(3 * 32, 3 * width, draws), Linear(width, 3 * width, draws)
-        with torch.no_grad():
-            keep = slice(width, 2 * width)
-            self.input.bias[..., keep] = torch.log(1 + 98 * draws.uniform(1, width))
-            self.recurrent.bias[..., keep] = 0
-
-    def start(self, n: int) -> Tensor:
-        """The memory [S, N, W] of empty histories."""
-        return self.recurrent.weight.new_zeros(self.seeds, n, self.width)
-
-    def _embed(self, batch: Batch) -> Tensor:
-        before, after = self.inputs.obs(torch.stack([batch.obs, batch.next_obs], 1)).unbind(1)
-        return self.input(torch.cat([before, self.inputs.action(batch.action), after], -1))
-
-    def forward(self, batch: Batch, memory: Tensor) -> Tensor:
-        """Transitions [S, B, T, ...] after a memory [S, B, W] -> memories [S, B, T + 1, W]."""
-        return GruScan.apply(self._embed(batch), memory, self.recurrent.weight, self.recurrent.bias, batch.mask)
-
-    def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory [S, N, W] after one more transition; unchanged where its mask is 0."""
-        return self(step[:, :, None], memory)[:, :, -1]
-
-
-class GruBelief(Belief):
-    """The paper's belief: GruMemory, then linear to a mean and a softplus variance.
-
-    Its inputs are initialised to unit scale: He's initialisation for the observations' embedding, action embeddings of
-    about 1, and a tanh's gain for the GRU's input. Otherwise Eq. (6) stays for thousands of updates on the plateau
-    where the latent is ignored. (Not so for the memories of policies: with it, dagger is worse on `forked_path`.)
-    """
-
-    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
-        super().__init__(latent, draws)
-        self.memory = GruMemory(width, scales, draws)
-        self.inputs = self.memory.inputs
-        self.read_width = width
-        self.out = Linear(width, 2 * latent, draws)
-        with torch.no_grad():
-            for layer in self.inputs.embed_obs:
-                if isinstance(layer, Linear):
-                    layer.weight.mul_(6**0.5)
-                    layer.bias.zero_()
-            self.inputs.embed_action.weight.mul_(3)
-            self.memory.input.weight.mul_(3)
-
-    def forward(self, batch: Batch) -> Tensor:
-        return self.memory(batch, self.start(len(batch)))
-
-    def start(self, n: int) -> Tensor:
-        return self.memory.start(n)
-
-    def update(self, memory: Tensor, step: Batch) -> Tensor:
-        return self.memory.update(memory, step)
-
-    def read(self, memory: Tensor) -> Tensor:
-        return memory
-
-    def empty(self, memory: Tensor) -> Tensor:
-        return torch.zeros_like(memory[..., :1], dtype=torch.bool)
-
-    def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        mean, raw = self.out(memory).chunk(2, -1)
-        return mean, (F.softplus(raw) + 1e-6).sqrt()

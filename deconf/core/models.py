@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, GruBelief, InnovationBelief
+from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.gru import GruBelief
 from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
@@ -109,7 +110,7 @@ class VariationalModel(LatentModel):
         return self.encoder.update(memory, step)
 
     def final_memory(self, batch: Batch) -> Tensor:
-        return self.encoder.hindsight(batch)
+        return self.encoder.hindsight(batch, self.encoder(batch)).flatten(1, 2)
 
     def belief(self, memory: Tensor) -> Tensor:
         return torch.cat(self.encoder.posterior(memory), -1)

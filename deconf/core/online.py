@@ -5,10 +5,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.beliefs import Belief
+from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.layers import Mlp
-from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.models import LatentModel, VariationalModel
 from deconfounded.deconf.core.nets import gaussian_log_prob
 
 MEMORIES, PER_TRIAL = 32768, 64  # on which the network is trained, about; at most so many of a trial of exploration
@@ -25,13 +25,13 @@ class OnlineBelief(nn.Module):
     the std, and what is to be added to q_phi's mean: nothing, at first, and where a trial is nearly over.
     """
 
-    def __init__(self, encoder: Belief, latent: int, width: int, draws: Draws) -> None:
+    def __init__(self, encoder: EvidenceBelief, latent: int, width: int, draws: Draws) -> None:
         super().__init__()
         self.net = Mlp(encoder.read_width, width, 2 * latent, draws)
         for parameter in self.net[-1].parameters():
             nn.init.zeros_(parameter)
 
-    def forward(self, encoder: Belief, memory: Tensor) -> Tensor:
+    def forward(self, encoder: EvidenceBelief, memory: Tensor) -> Tensor:
         """Memories [S, ..., M] -> mean and std [S, ..., 2 D]; those of the prior where there is no evidence."""
         added, raw = self.net(encoder.read(memory)).chunk(2, -1)
         with torch.no_grad():
@@ -42,31 +42,62 @@ class OnlineBelief(nn.Module):
         std = torch.where(empty, prior_std, prior_std * (F.softplus(raw) + LEAST))
         return torch.cat([mean, std], -1)
 
-    def fit(self, model: VariationalModel, explored: Batch, updates: int, draws: Draws) -> None:
-        """Train on trials [S, B, T] of exploration."""
-        memory, theta_hat = memories(model, explored, draws)
-        _, prior_std = model.encoder.prior(theta_hat)
+    def fit(
+        self, model: LatentModel, explored: Batch, updates: int, draws: Draws, latents: Tensor | None = None
+    ) -> None:
+        """Train on trials [S, B, T] of exploration. latents [S, B, D]: theirs; None: those inferred on whole trials."""
+        encoder = reader(model)
+        memory, theta_hat = memories(model, explored, draws, latents)
+        _, prior_std = encoder.prior(theta_hat)
         optimizer = Adam([self], RATE, updates)
         for _ in range(updates):
             index = draws.integers(memory.shape[1], BATCH)
-            mean, std = self(model.encoder, take(memory, index)).chunk(2, -1)
+            mean, std = self(encoder, take(memory, index)).chunk(2, -1)
             log_prob = gaussian_log_prob(take(theta_hat, index) / prior_std, mean / prior_std, std / prior_std)
             optimizer.step(-log_prob.mean(-1))
 
 
-@torch.no_grad()
-def memories(model: VariationalModel, trials: Batch, draws: Draws, part: int = 64) -> tuple[Tensor, Tensor]:
-    """Memories [S, K, M] before random steps of trials [S, B, T], and the latents [S, K, D] that these trials give.
+def reader(model: LatentModel) -> EvidenceBelief:
+    """The encoder of a model, whose memory the second network reads."""
+    assert isinstance(model, VariationalModel)
+    assert isinstance(model.encoder, EvidenceBelief)
+    return model.encoder
 
-    Of each trial as many steps, at most PER_TRIAL, more of the first ones: the density of step t goes by 1 / sqrt(t).
+
+def online_belief(model: LatentModel, draws: Draws) -> OnlineBelief | None:
+    """The untrained second network of a model, if its belief has one."""
+    if not (isinstance(model, VariationalModel) and model.encoder.online):
+        return None
+    return OnlineBelief(reader(model), model.latent, model.width, draws)
+
+
+@torch.no_grad()
+def memories(
+    model: LatentModel, trials: Batch, draws: Draws, latents: Tensor | None = None, part: int = 64
+) -> tuple[Tensor, Tensor]:
+    """Memories [S, K, M] before random steps of trials [S, B, T], and the latents [S, K, D] of these steps.
+
+    Latents are those of the trials [S, B, D], as given or as inferred on the whole trial. Of each trial as many steps,
+    at most PER_TRIAL, more of the first ones: the density of step t goes by 1 / sqrt(t).
     """
-    steps = trials.mask.shape[2]
+    encoder = reader(model)
     each = max(1, min(PER_TRIAL, MEMORIES // len(trials)))
     step = (draws.uniform(len(trials), each).square() * trials.mask.sum(2, keepdim=True)).long()
-    read, inferred = [], []
+    read, theta_hat = [], []
     for i in torch.arange(len(trials), device=step.device).split(part):
-        memory = model.encoder(trials[:, i])
-        where = step[:, i] + (steps + 1) * torch.arange(len(i), device=step.device)[:, None]
-        read.append(take(memory.flatten(1, 2), where.flatten(1)))
-        inferred.append(model.mean(model.belief(memory[:, :, -1])))
-    return torch.cat(read, 1), torch.cat(inferred, 1).repeat_interleave(each, 1)
+        batch = trials[:, i]
+        memory = encoder(batch)
+        read.append(_chosen(memory, step[:, i]))
+        if latents is None:
+            final = encoder.hindsight(batch, memory)  # one a trial, or one a step
+            theta_hat.append(_chosen(model.mean(model.belief(final)), step[:, i]))
+        else:
+            theta_hat.append(_chosen(latents[:, i, None], step[:, i]))
+    return torch.cat(read, 1), torch.cat(theta_hat, 1)
+
+
+def _chosen(values: Tensor, step: Tensor) -> Tensor:
+    """Values [S, B, T, F] of steps [S, B, K], as [S, B K, F]; of a single value, T = 1, that one for all steps."""
+    _, trials, steps, _ = values.shape
+    trial = torch.arange(trials, device=step.device)[:, None]
+    return take(values.flatten(1, 2), (step.clamp(max=steps - 1) + steps * trial).flatten(1))

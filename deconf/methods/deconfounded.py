@@ -19,10 +19,10 @@ from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
 from deconfounded.deconf.core.deployment import Way, acted_on, deployments
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
-from deconfounded.deconf.core.models import LatentModel, VariationalModel, final_belief, new_model
+from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
-from deconfounded.deconf.core.online import OnlineBelief
+from deconfounded.deconf.core.online import OnlineBelief, online_belief, reader
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
@@ -65,41 +65,35 @@ class DeconfoundedConfig(Configuration):
 
 
 class DeconfoundedAgent(LearnedAgent):
-    """Algorithm 2, posterior sampling. way: how it takes theta_hat from its belief (`core/deployment.py`).
+    """Algorithm 2, posterior sampling.
 
-    `online`: its belief in the course of a trial; None: that is the model's own.
+    online: its belief in the course of a trial; None: that is the model's own. way: how it takes theta_hat from its
+    belief (`core/deployment.py`).
     """
 
-    def __init__(self, model: LatentModel, policy: ActionHead, way: Way = "step") -> None:
+    def __init__(
+        self, model: LatentModel, policy: ActionHead, online: OnlineBelief | None = None, way: Way = "step"
+    ) -> None:
         super().__init__(policy)
-        self.model, self.way = model, way
-        self.online: OnlineBelief | None = None
+        self.model, self.online, self.way = model, online, way
 
     @staticmethod
     def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         """An untrained agent. Raises InputError for an unknown kind of model."""
         model = new_model(kind, latent, width, scales, draws)
-        return DeconfoundedAgent(model, ActionHead(model.inputs.obs_width + latent, width, scales, draws))
-
-    def add_online(self, draws: Draws) -> None:
-        """Give it an untrained belief for the course of a trial."""
-        model = self.model
-        assert isinstance(model, VariationalModel)
-        self.online = OnlineBelief(model.encoder, model.latent, model.width, draws)
+        policy = ActionHead(model.inputs.obs_width + latent, width, scales, draws)
+        return DeconfoundedAgent(model, policy, online_belief(model, draws))
 
     @classmethod
     def blank(cls, shape: dict[str, Any], scales: Scales, draws: Draws) -> "DeconfoundedAgent":
         sizes = (shape["model"], shape["latent"], shape["width"])
         agent = cls.new(*sizes, scales, draws)
         agent.way = shape["way"]
-        if shape["online"]:
-            agent.add_online(draws)
         return agent
 
     def shape(self) -> dict[str, Any]:
         model = self.model
-        sizes = {"model": model.kind, "latent": model.latent, "width": model.width}
-        return sizes | {"online": self.online is not None, "way": self.way}
+        return {"model": model.kind, "latent": model.latent, "width": model.width, "way": self.way}
 
     def parts(self) -> dict[str, nn.Module]:
         own: dict[str, nn.Module] = {"model": self.model, "policy": self.policy}
@@ -118,8 +112,7 @@ class DeconfoundedAgent(LearnedAgent):
         """The belief [S, N, P] given the trial so far."""
         if self.online is None:
             return self.model.belief(self._memory)
-        assert isinstance(self.model, VariationalModel)
-        return self.online(self.model.encoder, self._memory)  # type: ignore[no-any-return]
+        return self.online(reader(self.model), self._memory)  # type: ignore[no-any-return]
 
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] for the next action."""
@@ -161,8 +154,7 @@ class Explorer(DeconfoundedAgent):
     """
 
     def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
-        super().__init__(agent.model, agent.policy)
-        self.online = agent.online
+        super().__init__(agent.model, agent.policy, agent.online)
         self.latents, self.random_share = latents, random_share
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
@@ -198,8 +190,6 @@ def train(
     draws = Draws(rngs, device)
     scales = Scales.of(signature, expert, explored)
     agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
-    if config.model == "innovations":
-        agent.add_online(draws)
     model, policy, online = agent.model, agent.policy, agent.online
     inference_batch = config.inference_batch
     if config.drifts:
@@ -241,7 +231,7 @@ def train(
         latents = model.sample(belief, draws)
         if config.fit_prior:
             model.set_prior(belief, draws)
-        if online is not None and isinstance(model, VariationalModel):
+        if online is not None:
             online.fit(model, explored, config.inference_updates, draws)
         for _ in range(config.imitation_updates):
             imitate(done, imitation)

@@ -22,7 +22,7 @@ BANDIT = replace(ON_BANDIT, model="forgetting")
 AMOUNTS = {"on_control": DeconfoundedConfig(model="forgetting"), "on_bandit": BANDIT, "paper": BANDIT}
 
 
-@uses(*USES, version=1, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)
+@uses(*USES, version=2, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the belief that forgets."""
     return deconfounded.fit(given)

@@ -3,7 +3,8 @@
 An offline encoder reads whole expert trials, actions included (in training, a random subset of their steps), and a
 decoder of two factors, dynamics and policy, explains both by one latent, Eq. (7). The encoder takes actions for
 evidence, but the dynamics do not: synthetic trials are rolled out in them under actions that are blind to the latent,
-and an online encoder is trained on these, Eq. (6). It is deployed as in Tier 2, by Algorithm 2.
+and an online encoder is trained on these, Eq. (6). Since their latents are known, the belief in the course of a trial
+is trained on the latents themselves. The agent is deployed as in Tier 2, by Algorithm 2.
 """
 
 from dataclasses import dataclass
@@ -18,12 +19,15 @@ from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
+from deconfounded.deconf.core.online import online_belief
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.experts.rollout import Trials
+
+LAST = 512  # least synthetic trials for the belief in the course of a trial
 
 
 @dataclass(frozen=True)
@@ -51,15 +55,22 @@ class OfflineConfig(Configuration):
 
 
 def explain(
-    data: Batch, signature: Signature, config: OfflineConfig, draws: Draws, monitor: Monitor, times: int = 1
+    data: Batch,
+    signature: Signature,
+    config: OfflineConfig,
+    draws: Draws,
+    monitor: Monitor,
+    times: int = 1,
+    kind: str = "evidence",
 ) -> tuple[VariationalModel, VariationalModel, ActionHead]:
     """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an untrained online model.
 
-    The two models share their dynamics. Batches are `times` as large.
+    The two models share their dynamics; kind: that of the online one. The offline one reads actions as evidence by
+    themselves. Batches are `times` as large.
     """
     scales = Scales.of(signature, data)
-    sizes = ("evidence", config.latent, config.width, scales, draws)
-    offline, online = VariationalModel(*sizes), VariationalModel(*sizes)
+    sizes = (config.latent, config.width, scales, draws)
+    offline, online = VariationalModel("evidence", *sizes), VariationalModel(kind, *sizes)
     online.dynamics = offline.dynamics
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, scales, draws)
     total = config.offline_updates + config.online_updates
@@ -89,63 +100,72 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     episodes = trials.mask.shape[1]
     trials, times = (split_episodes(trials), episodes) if config.drifts else (trials, 1)
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
-    offline, online, policy = explain(data, signature, config, draws, monitor, times)
+    offline, online, policy = explain(data, signature, config, draws, monitor, times, "innovations")
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
-    horizon = trials.mask.shape[2]
-    agent = DeconfoundedAgent(online, policy)
+    synthesis = Synthesis(online, policy, latents, data, starts, trials.mask.shape[2], config.random_share, draws)
+    agent = DeconfoundedAgent(online, policy, online_belief(online, draws))
     total = config.offline_updates + config.online_updates
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
         if update % config.refresh == 0:
-            synthetic = synthesise(online, policy, latents, data, starts, horizon, config, draws)
+            synthetic, _ = synthesis(config.synthetic)
         batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch * times, draws)
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
+    if agent.online is not None:
+        synthetic, drawn = synthesis(max(LAST, config.synthetic))
+        agent.online.fit(online, synthetic, config.online_updates, draws, drawn)
     if config.drifts:
         choose_kept(online, data[:, : 64 * episodes], episodes, draws)
     return agent
 
 
-@torch.no_grad()
-def synthesise(
-    model: VariationalModel,
-    policy: ActionHead,
-    latents: Tensor,
-    expert: Batch,
-    starts: Tensor,
-    horizon: int,
-    config: OfflineConfig,
-    draws: Draws,
-) -> Batch:
-    """Rollouts in the learned dynamics: each trial has a latent of [S, B, D], and each episode's actions another one.
+@dataclass(frozen=True)
+class Synthesis:
+    """Draws rollouts in the learned dynamics, whose actions are blind to the latent.
 
-    They are as long as the expert's trials, in episodes of at most `horizon` steps from starts [S, K, O]. An episode
-    ends where it leaves the range of the expert's observations: the dynamics were not trained there.
+    Each trial has a latent of [S, B, D], and each episode's actions have another one. They are as long as the expert's
+    trials, in episodes of at most `horizon` steps from starts [S, K, O]. An episode ends where it leaves the range of
+    the expert's observations: the dynamics were not trained there.
     """
-    n, (low, high) = config.synthetic, extent(expert.obs, expert.mask)
-    theta_hat = take(latents, draws.integers(latents.shape[1], n))
-    obs, action_latent = starts[:, :1], latents[:, :1]  # replaced in the first step
-    over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
-    steps: list[tuple[Tensor, Tensor, Tensor]] = []
-    for t in range(expert.mask.shape[2]):
-        over = over | (t % horizon == 0)
-        obs = torch.where(over, take(starts, draws.integers(starts.shape[1], n)), obs)
-        action_latent = torch.where(over, take(latents, draws.integers(latents.shape[1], n)), action_latent)
-        action = policy.sample(torch.cat([model.inputs.obs(obs), action_latent], -1), draws)
-        action = policy.signature.randomise(action, config.random_share, draws)
-        next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
-        steps.append((obs, action, next_obs))
-        obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
-    obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))
-    return Batch(obs, action, next_obs, torch.ones(len(draws), n, len(steps), device=draws.device))
+
+    model: VariationalModel
+    policy: ActionHead
+    latents: Tensor
+    expert: Batch
+    starts: Tensor
+    horizon: int
+    random_share: float
+    draws: Draws
+
+    @torch.no_grad()
+    def __call__(self, n: int) -> tuple[Batch, Tensor]:
+        """As many trials, and their latents [S, n, D]."""
+        model, policy, latents, starts, draws = self.model, self.policy, self.latents, self.starts, self.draws
+        low, high = extent(self.expert.obs, self.expert.mask)
+        theta_hat = take(latents, draws.integers(latents.shape[1], n))
+        obs, action_latent = starts[:, :1], latents[:, :1]  # replaced in the first step
+        over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
+        steps: list[tuple[Tensor, Tensor, Tensor]] = []
+        for t in range(self.expert.mask.shape[2]):
+            over = over | (t % self.horizon == 0)
+            obs = torch.where(over, take(starts, draws.integers(starts.shape[1], n)), obs)
+            action_latent = torch.where(over, take(latents, draws.integers(latents.shape[1], n)), action_latent)
+            action = policy.sample(torch.cat([model.inputs.obs(obs), action_latent], -1), draws)
+            action = policy.signature.randomise(action, self.random_share, draws)
+            next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
+            steps.append((obs, action, next_obs))
+            obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
+        obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))
+        return Batch(obs, action, next_obs, torch.ones(len(draws), n, len(steps), device=draws.device)), theta_hat
 
 
 @uses(
     "demonstrations",
-    version=3,
+    version=4,
     cost=7,
     on_control=OfflineConfig(),
     on_bandit=OfflineConfig(

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.sequence_bc import SMOKE, RecurrentAgent, RecurrentConfig, train_recurrent

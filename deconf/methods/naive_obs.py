@@ -6,8 +6,8 @@ where theta shows only there, as on the bandit, nothing is learned of it. All el
 
 from torch import Tensor
 
-from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.nets import per_seed
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
-from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, take
+from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales

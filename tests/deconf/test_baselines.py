@@ -18,8 +18,8 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import Provider, Vector, fit
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.beliefs import GruMemory
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.given import Environments

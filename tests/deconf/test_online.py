@@ -101,11 +101,17 @@ def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.Monkey
     number, step = torch.arange(70.0)[None, :, None].expand(-1, -1, STEPS), torch.arange(float(STEPS)).expand(1, 70, -1)
     data = Batch(torch.stack([number, step], -1), data.action, data.next_obs, data.mask)
     monkeypatch.setattr(made.encoder, "forward", lambda batch: torch.cat([batch.obs, batch.obs[:, :, -1:]], 2))
-    monkeypatch.setattr(made, "belief", lambda memory: memory.repeat(1, 1, 2))
+    monkeypatch.setattr(made, "belief", lambda memory: torch.cat([memory, memory], -1))
     memory, latent = online.memories(made, data, streams())
+    given, of_given = online.memories(made, data, streams(), 10 * number[..., :1].expand(-1, -1, 2))
+    assert torch.equal(given, memory)
+    assert torch.equal(of_given, 10 * latent[..., :1].expand(-1, -1, 2))
     assert memory.shape == (1, 70 * online.PER_TRIAL, 2)
     assert torch.equal(memory[..., 0], latent[..., 0])
     short, whole = (memory[0, memory[0, :, 0] % 2 == rest, 1] for rest in (0, 1))
     assert short.max() == 9
     assert whole.max() > 20
     assert abs((whole < STEPS / 4).float().mean() - 0.5) < 0.1
+    monkeypatch.setattr(made.encoder, "hindsight", lambda batch, memories: batch.obs)  # a latent for every step
+    memory, latent = online.memories(made, data, streams())
+    assert torch.equal(memory, latent)
