@@ -24,7 +24,7 @@ class Belief(nn.Module, ABC):
     """q_phi(theta_hat | tau) and the prior p(theta_hat), a diagonal Gaussian: N(0, 1) until `set_prior`."""
 
     inputs: Inputs
-    online: ClassVar[bool] = False  # whether a second network gives the belief in the course of a trial: see online.py
+    linear: ClassVar[bool] = False  # in innovations; if so, dynamics are linear in theta_hat, and online.py is used
     prior_mean: Tensor
     prior_std: Tensor
 
@@ -169,15 +169,11 @@ class EvidenceBelief(Belief):
         """What networks read [..., read_width] of memories [..., M]."""
         return self._rescaled(memory, self.longest)
 
-    def empty(self, memory: Tensor) -> Tensor:
-        """Whether memories [..., M] hold no evidence, so that the belief is the prior, [..., 1]."""
-        return memory[..., self.features : self.features + 1] == 0
-
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = self.out(self.read(memory)).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()
         prior_mean, prior_std = self.prior(mean)
-        empty = self.empty(memory)
+        empty = memory[..., self.features : self.features + 1] == 0
         return torch.where(empty, prior_mean, mean), torch.where(empty, prior_std, std)
 
 
@@ -190,7 +186,7 @@ class InnovationBelief(EvidenceBelief):
     trials, so that their latents differ from those by which an agent acts.
     """
 
-    online = True
+    linear = True
 
     def _evidence_network(self, width: int, inputs: int, draws: Draws) -> Mlp:
         return Mlp(inputs, width, width // 4 * self.inputs.signature.obs, draws)

@@ -15,7 +15,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.gru import GruBelief
-from deconfounded.deconf.core.nets import DynamicsHead, Inputs, Scales, per_seed, sample_index
+from deconfounded.deconf.core.nets import DynamicsHead, Inputs, LinearDynamicsHead, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
@@ -101,7 +101,8 @@ class VariationalModel(LatentModel):
         self.kind, self.latent, self.width = kind, latent, width
         self.encoder: Belief = BELIEFS[kind](latent, width, scales, draws)  # type: ignore[abstract]
         self.inputs = self.encoder.inputs
-        self.dynamics = DynamicsHead(latent, width, self.inputs, draws)
+        head = LinearDynamicsHead if self.encoder.linear else DynamicsHead
+        self.dynamics = head(latent, width, self.inputs, draws)
 
     def start(self, n: int) -> Tensor:
         return self.encoder.start(n)

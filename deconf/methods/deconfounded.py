@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
-from deconfounded.deconf.core.deployment import Way, acted_on, deployments
+from deconfounded.deconf.core.deployment import Latents, Way, acted_on, deployments
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
 from deconfounded.deconf.core.monitor import Monitor
@@ -108,15 +108,16 @@ class DeconfoundedAgent(LearnedAgent):
         self._latent: Tensor | None = None
         self._memory = self.model.forget(self._memory)
 
-    def belief(self) -> Tensor:
-        """The belief [S, N, P] given the trial so far."""
+    def belief(self) -> tuple[Latents[Tensor, Draws], Tensor]:
+        """What gives latents, and the belief [S, N, P] given the trial so far."""
         if self.online is None:
-            return self.model.belief(self._memory)
-        return self.online(reader(self.model), self._memory)  # type: ignore[no-any-return]
+            return self.model, self.model.belief(self._memory)
+        return self.online, self.online(reader(self.model), self._memory)
 
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] for the next action."""
-        self._latent = acted_on(self.model, self.way, self.belief(), self._draws, self._latent)
+        latents, belief = self.belief()
+        self._latent = acted_on(latents, self.way, belief, self._draws, self._latent)
         return self._latent
 
     def choose(self, obs: Tensor) -> Tensor:
@@ -142,7 +143,8 @@ class DeconfoundedAgent(LearnedAgent):
 
     @torch.no_grad()
     def features(self) -> NDArray[np.float32]:
-        mean = self.model.mean(self.belief())
+        latents, belief = self.belief()
+        mean = latents.mean(belief)
         return mean.flatten(0, 1).cpu().numpy()
 
 
@@ -297,7 +299,7 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 
 
 @uses(
-    *USES, version=4, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+    *USES, version=5, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from deconfounded.deconf.core import online
 from deconfounded.deconf.core.adam import Adam
@@ -65,32 +66,60 @@ def test_evidence_is_linear_in_innovations() -> None:
 
 def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch]) -> None:
     made, data = model
-    belief = OnlineBelief(made.encoder, 2, 16, streams())
+    belief = OnlineBelief(made.encoder, 16, streams())
     memory = made.encoder(data)
-    mean, std = belief(made.encoder, memory).chunk(2, -1)
-    torch.testing.assert_close(mean, made.encoder.posterior(memory)[0])
-    torch.testing.assert_close(mean[:, :, 0], made.encoder.prior_mean[:, None].expand_as(mean[:, :, 0]))
-    torch.testing.assert_close(std[:, :, 0], made.encoder.prior_std[:, None].expand_as(std[:, :, 0]))
+    torch.testing.assert_close(belief.mean(belief(made.encoder, memory)), made.encoder.posterior(memory)[0])
+
+
+def test_samples_are_of_the_density() -> None:
+    """Of latents that depend on each other: mean, covariance and entropy as of the Gaussian that is given."""
+    data = pushed(2, np.random.default_rng(0))
+    encoder = InnovationBelief(3, 16, Scales.of(Signature(1, 1, 0, False), data), streams())
+    belief = OnlineBelief(encoder, 16, streams())
+    belief.unit.copy_(torch.tensor([[1.0, 2.0, 0.5]]))
+    mean, std, lower = [0.3, -1.0, 2.0], [0.5, 0.1, 0.02], [-0.9, 2.0, -3.0]
+    given = torch.tensor([*mean, *std, *lower])[None, None].expand(1, 20_000, -1)
+    drawn = belief.sample(given, streams())[0].double()
+    triangle = torch.tensor([[1, 0, 0], [-0.9, 1, 0], [2, -3, 1]]).double().inverse()
+    factor = belief.unit[0, :, None].double() * triangle @ torch.diag(torch.tensor(std).double())
+    torch.testing.assert_close(drawn.mean(0), torch.tensor(mean).double(), atol=0.02, rtol=0)
+    torch.testing.assert_close(drawn.T.cov(), factor @ factor.T, atol=5e-3, rtol=0.05)
+    entropy = sum(0.5 * np.log(2 * np.pi * np.e) + np.log(x) for x in std)
+    assert abs(belief.log_prob(given, drawn[None].float()).mean().item() + entropy) < 0.03
 
 
 def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[VariationalModel, Batch]) -> None:
-    """On trials that it has not seen: squared errors are 1 to 2 of its variance, and hundreds of the model's own."""
+    """On trials that it has not seen: squared errors are 1 to 2 of its variance, and hundreds of the model's own.
+
+    The two dimensions of the latent depend on each other, since theta has one, and so do samples.
+    """
     made, data = model
-    belief = OnlineBelief(made.encoder, 2, 32, streams())
+    belief = OnlineBelief(made.encoder, 32, streams())
     belief.fit(made, data, 400, streams())
     fresh = pushed(400, np.random.default_rng(1))
     with torch.no_grad():
         memory = made.encoder(fresh)
         final = made.encoder.posterior(memory[:, :, -1])[0]
-        none = belief(made.encoder, memory[:, :, 0]).chunk(2, -1)[0]
-        torch.testing.assert_close(none, made.encoder.prior_mean[:, None].expand_as(none))
-        for t in (2, 6, 12):
-            mean, std = belief(made.encoder, memory[:, :, t]).chunk(2, -1)
+        for t in (0, 2, 6, 12):
+            given = belief(made.encoder, memory[:, :, t])
+            mean, drawn = belief.mean(given), belief.sample(given, streams())
             own_mean, own_std = made.encoder.posterior(memory[:, :, t])
-            apart, own_apart = (((x - final) / y).square().mean().item() for x, y in ((mean, std), (own_mean, own_std)))
-            assert 0.5 < apart < 4
-            assert own_apart > 50
-            assert (mean - final).square().mean() < 1.02 * (own_mean - final).square().mean()
+            own_apart = ((own_mean - final) / own_std).square().mean()
+            assert 0.5 < _squared_distance(belief, given, final) < 4
+            assert t == 0 or own_apart > 50
+            assert (mean - final).square().mean() < 1.05 * (own_mean - final).square().mean()
+            assert abs(_correlation(drawn) - _correlation(final)) < 0.1, "samples lie where latents lie"
+
+
+def _squared_distance(belief: OnlineBelief, given: Tensor, latent: Tensor) -> float:
+    """The mean squared distance of latents from beliefs, a dimension, in units of their variances."""
+    mean, std, lower = belief._split(given)
+    apart = (belief._triangle(lower) @ ((latent - mean) / belief.unit[:, None])[..., None])[..., 0]
+    return (apart / std).square().mean().item()
+
+
+def _correlation(latents: Tensor) -> float:
+    return float(np.corrcoef(latents[0].T.numpy())[0, 1])
 
 
 def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.MonkeyPatch) -> None:
