@@ -23,9 +23,9 @@ from deconfounded.benchmarks.output import scoring
 from deconfounded.benchmarks.output.aggregation import covered
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.equations import posterior_policy
 from deconfounded.deconf.exact import ExactAgent
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically, write_json

@@ -14,8 +14,9 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.dynamics import DynamicsHead, LinearDynamicsHead
 from deconfounded.deconf.core.gru import GruBelief
-from deconfounded.deconf.core.nets import DynamicsHead, Inputs, LinearDynamicsHead, Scales, per_seed, sample_index
+from deconfounded.deconf.core.nets import Inputs, Scales, per_seed, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 

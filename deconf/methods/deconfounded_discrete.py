@@ -3,10 +3,11 @@
 from dataclasses import replace
 
 from deconfounded.deconf.core.deployment import deployments
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
-from deconfounded.deconf.methods.deconfounded import SHARED, USES, DeconfoundedAgent, DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded import SHARED, USES, DeconfoundedConfig
 
 ON_CONTROL = DeconfoundedConfig(
     model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2

@@ -7,16 +7,11 @@ lies around it, before and after, and not given one latent a trial.
 
 from dataclasses import replace
 
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
-from deconfounded.deconf.methods.deconfounded import (
-    ON_BANDIT,
-    SHARED,
-    USES,
-    DeconfoundedAgent,
-    DeconfoundedConfig,
-)
+from deconfounded.deconf.methods.deconfounded import ON_BANDIT, SHARED, USES, DeconfoundedConfig
 
 BANDIT = replace(ON_BANDIT, model="forgetting")
 AMOUNTS = {"on_control": DeconfoundedConfig(model="forgetting"), "on_bandit": BANDIT, "paper": BANDIT}

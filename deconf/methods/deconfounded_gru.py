@@ -2,17 +2,11 @@
 
 from dataclasses import replace
 
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
-from deconfounded.deconf.methods.deconfounded import (
-    ON_BANDIT,
-    PAPER,
-    SHARED,
-    USES,
-    DeconfoundedAgent,
-    DeconfoundedConfig,
-)
+from deconfounded.deconf.methods.deconfounded import ON_BANDIT, PAPER, SHARED, USES, DeconfoundedConfig
 
 ON_CONTROL, BANDIT = DeconfoundedConfig(model="gru"), replace(ON_BANDIT, model="gru")
 

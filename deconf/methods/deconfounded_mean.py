@@ -15,6 +15,7 @@ from torch import Tensor
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scaler, Scales
@@ -22,7 +23,7 @@ from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent, Explore
+from deconfounded.deconf.methods.deconfounded import Explore
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 

@@ -16,6 +16,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -24,7 +25,6 @@ from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.experts.rollout import Trials
 
 LAST = 512  # least synthetic trials for the belief in the course of a trial

@@ -17,6 +17,7 @@ from deconfounded.deconf.core import models
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.deployment import deployments
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import DiscreteModel, LatentModel, VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.methods import (
@@ -34,7 +35,6 @@ from deconfounded.deconf.methods import (
     naive_transformer,
     palr,
 )
-from deconfounded.deconf.methods.deconfounded import DeconfoundedAgent
 from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy

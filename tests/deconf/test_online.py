@@ -1,4 +1,4 @@
-"""The belief in the course of a trial, and evidence that is linear in innovations, where the exact belief is known."""
+"""A belief linear in innovations, effects linear in the latent, and the belief in the course of a trial, on a ball."""
 
 import numpy as np
 import pytest
@@ -62,6 +62,24 @@ def test_evidence_is_linear_in_innovations() -> None:
         torch.testing.assert_close(evidence(belief, 2), 2 * evidence(belief, 1), rtol=1e-3, atol=1e-4)
         assert evidence(belief, 1).abs().max() > 0.1
         assert evidence(other, 0).abs().max() > 0.1, "that of EvidenceBelief is not"
+
+
+def test_effects_are_linear_in_the_latent(model: tuple[VariationalModel, Batch]) -> None:
+    """Means of next observations lie on the line between those of two latents, but not with EvidenceBelief."""
+    made, data = model
+    other = VariationalModel("evidence", 2, 32, made.inputs.scales, streams()).eval()
+
+    def apart(of: VariationalModel) -> tuple[float, float]:
+        """The largest distance from the line, and the largest effect."""
+        one, two = (torch.tensor(x).expand(*data.mask.shape, 2) for x in ([3.0, -2.0], [-1.0, 4.0]))
+        with torch.no_grad():
+            ends = [of.dynamics.mean(data.obs, data.action, x) for x in (one, two, 0.25 * one + 0.75 * two)]
+        return (ends[2] - 0.25 * ends[0] - 0.75 * ends[1]).abs().max().item(), (ends[0] - ends[1]).abs().max().item()
+
+    off, effect = apart(made)
+    assert effect > 0.3
+    assert off < 1e-4
+    assert apart(other)[0] > 0.01
 
 
 def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch]) -> None:
