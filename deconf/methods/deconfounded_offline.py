@@ -71,7 +71,7 @@ def explain(
     scales = Scales.of(signature, data)
     sizes = (config.latent, config.width, scales, draws)
     offline, online = VariationalModel("evidence", *sizes), VariationalModel(kind, *sizes)
-    online.dynamics = offline.dynamics
+    offline.dynamics = online.dynamics = (online if online.encoder.linear else offline).dynamics
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, scales, draws)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
