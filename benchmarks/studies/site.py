@@ -154,7 +154,7 @@ def dead_links(folder: Path) -> list[str]:
     """Of all pages in a folder, the links to a file or an anchor that it does not hold: `page: link`."""
     from lxml.etree import HTMLParser, parse
 
-    links, anchors = {}, {}
+    folder, links, anchors = folder.resolve(), {}, {}
     for file in map(str, sorted(folder.rglob("*.html"))):
         page = parse(file, HTMLParser(encoding="utf-8"))
         links[file], anchors[file] = page.xpath("//@href | //@src"), set(page.xpath("//@id"))
@@ -165,12 +165,11 @@ def dead_links(folder: Path) -> list[str]:
             if scheme or host:  # elsewhere, or the data itself
                 continue
             target = os.path.normpath(os.path.join(os.path.dirname(file), unquote(path))) if path else file
-            known = anchors.get(target)
             scripted = "/interactive/" in target and "/_modules/" not in file  # its script makes anchors
-            if known is None:
-                missing = not os.path.isfile(target)
+            if target in anchors:
+                missing = bool(anchor) and unquote(anchor) not in anchors[target] and not scripted
             else:
-                missing = bool(anchor) and unquote(anchor) not in known and not scripted
+                missing = not os.path.isfile(target)
             if missing:
                 dead.append(f"{os.path.relpath(file, folder)}: {link}")
     return dead

@@ -74,11 +74,16 @@ class OnlineBelief(nn.Module):
         drawn = torch.linalg.solve_triangular(self._triangle(lower), noise, upper=False, unitriangular=True)
         return mean + per_seed(self.unit, mean) * drawn[..., 0]
 
+    def uncorrelated(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
+        """(1 + A) (theta_hat - mean) [S, ..., D], in units of the prior's stds: independent, with stds s."""
+        mean, _, lower = self._split(belief)
+        apart = ((theta_hat - mean) / per_seed(self.unit, mean))[..., None]
+        return (self._triangle(lower) @ apart)[..., 0]
+
     def log_prob(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
         """The log density [S, ...] of theta_hat [S, ..., D], in units of the prior's stds."""
-        mean, std, lower = self._split(belief)
-        apart = ((theta_hat - mean) / per_seed(self.unit, mean))[..., None]
-        return gaussian_log_prob(torch.zeros_like(std), (self._triangle(lower) @ apart)[..., 0], std)
+        _, std, _ = self._split(belief)
+        return gaussian_log_prob(torch.zeros_like(std), self.uncorrelated(belief, theta_hat), std)
 
     def fit(
         self, model: LatentModel, explored: Batch, updates: int, draws: Draws, latents: Tensor | None = None

@@ -20,7 +20,7 @@ from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel, final_belief
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
-from deconfounded.deconf.core.online import online_belief
+from deconfounded.deconf.core.online import OnlineBelief, reader
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
@@ -105,7 +105,8 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     online.encoder.set_prior(latents)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
     synthesis = Synthesis(online, policy, latents, data, starts, trials.mask.shape[2], config.random_share, draws)
-    agent = DeconfoundedAgent(online, policy, online_belief(online, draws))
+    in_course = OnlineBelief(reader(online), config.width, draws)
+    agent = DeconfoundedAgent(online, policy, in_course)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
     for update in range(config.online_updates):
@@ -115,9 +116,8 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
         warm = ramp(update, config.warm_up * config.online_updates)
         inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
         monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
-    if agent.online is not None:
-        synthetic, drawn = synthesis(max(LAST, config.synthetic))
-        agent.online.fit(online, synthetic, config.online_updates, draws, drawn)
+    synthetic, drawn = synthesis(max(LAST, config.synthetic))
+    in_course.fit(online, synthetic, config.online_updates, draws, drawn)
     if config.drifts:
         choose_kept(online, data[:, : 64 * episodes], episodes, draws)
     return agent
