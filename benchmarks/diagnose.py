@@ -19,8 +19,8 @@ from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.envs.support.files import write_json
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.diagnosis.judgement import Diagnosis
     from deconfounded.deconf.diagnosis.measures import Amounts, Findings
+    from deconfounded.deconf.diagnosis.verdict import Diagnosis
 
 
 @dataclass(frozen=True)

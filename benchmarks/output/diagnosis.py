@@ -7,8 +7,8 @@ from typing import Any
 
 from deconfounded.benchmarks.output.pictures import colour, encoded, panels
 from deconfounded.benchmarks.output.templates import template
-from deconfounded.deconf.diagnosis.judgement import Diagnosis, Figure
 from deconfounded.deconf.diagnosis.thresholds import GOOD, NEGLIGIBLE, STAKES
+from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure
 from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts.datasets.units import Units
 
@@ -25,7 +25,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "verdict": diagnosis.verdict,
         "tier": diagnosis.tier,
         "headline": diagnosis.headline,
-        **{key: getattr(diagnosis, key) for key in ("found", "cost", "sure", "wrong", "agreeing", "dissenting")},
+        **{key: getattr(diagnosis, key) for key in ("finding", "cost", "sure", "wrong", "agreeing", "dissenting")},
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
         "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
@@ -36,7 +36,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     write_atomically(folder / "index.html", page + "\n")
     how = f"\n\n{code}" if code else ""
     plain = {
-        "Found": diagnosis.found,
+        "Finding": diagnosis.finding,
         "Cost of cloning": diagnosis.cost,
         "How sure": f"{diagnosis.sure} {diagnosis.wrong}".strip(),
         "Next": f"{diagnosis.next.advice}{how}",

@@ -24,7 +24,7 @@ from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
 if TYPE_CHECKING:
-    from deconfounded.deconf.diagnosis.judgement import Diagnosis
+    from deconfounded.deconf.diagnosis.verdict import Diagnosis
 
 CASES: dict[str, str | None] = {
     **dict.fromkeys(envs.SUITE),

@@ -1,5 +1,7 @@
 """Deviation of trajectories from a reference set, by a few features of each episode, relative to chance."""
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -40,25 +42,46 @@ def max_ratio(deviations: Tensor, chance: Tensor) -> float:
     return float(deviations.max() / chance.max().clamp(min=1))
 
 
-def excess_score(excess: Tensor, wrong: Tensor) -> float:
-    """A score of deviations beyond chance [F, O]: 1 for none, 0 for those under a wrong latent; by least squares.
+def paired_score(paths: Tensor, wrong: Tensor, right: Tensor, repeats: Sequence[Tensor]) -> float:
+    """The score of trajectories [N, T, O]: 1 if they are those under the right latents, 0 if those under wrong ones.
 
-    Chance has to be estimated for each separately: noise of a common estimate would correlate the two.
+    Squared deviations of the means over segments are compared, each trajectory's from the one under the right latent
+    that starts as it does, by least squares: where the wrong latent's deviation is large counts most. The unit is what
+    a coordinate deviates by chance, over the whole episode: in units of a segment, a small deviation at the start,
+    where chance has had no time to add up, would count as much as a large one at the end. repeats: three more draws
+    under the right latents. Chance is subtracted, by a repeat of its own on either side: noise of a common estimate
+    would correlate the two.
     """
-    weight = wrong.clamp(min=0)
-    share = (weight * excess).sum() / weight.square().sum().clamp(min=1e-6)
+    of_right = _means(right)
+    errors, mistakes, *by_chance = (_means(x) - of_right for x in (paths, wrong, *repeats))
+    usual = torch.cat(by_chance).abs().flatten(0, 1).median(0).values
+    unit = torch.maximum(1.48 * usual, _least(of_right.flatten(0, 1)))
+    clip = (CLIP * (mistakes / unit).square().median(0).values).clamp(min=CLIP)  # as far as wrong latents usually lead
+    error, mistake, _, first, second = (
+        torch.minimum((x / unit).square(), clip).mean(0) for x in (errors, mistakes, *by_chance)
+    )
+    weight = (mistake - first).clamp(min=0)
+    share = (weight * (error - second)).sum() / weight.square().sum().clamp(min=1e-6)
     return float(1 - share.clamp(0, 1))
 
 
 def _ratio(reference: Tensor, deviations: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
     """The ratio of mean squares of two deviations [N, F, O], in units of the usual one, or of 1% of the range."""
-    least = (0.01 * (reference.amax(0) - reference.amin(0))).clamp(min=1e-6)
-    unit = torch.maximum(1.48 * usual.abs().median(0).values, least)
+    unit = torch.maximum(1.48 * usual.abs().median(0).values, _least(reference))
     numerator, denominator = ((x / unit).square().clamp(max=CLIP).mean(0) for x in (deviations, by_chance))
     return numerator / denominator.clamp(min=0.5)
 
 
+def _least(values: Tensor) -> Tensor:
+    """The least unit of values [N, ...]: 1% of their range."""
+    return (0.01 * (values.amax(0) - values.amin(0))).clamp(min=1e-6)
+
+
 def _features(paths: Tensor) -> Tensor:
     """[N, T, O] -> [N, F, O]."""
-    segments = paths.tensor_split(min(SEGMENTS, paths.shape[1]), 1)
-    return torch.stack([part.mean(1) for part in (*segments, paths, paths.square())], 1)
+    return torch.cat([_means(paths), paths.mean(1, keepdim=True), paths.square().mean(1, keepdim=True)], 1)
+
+
+def _means(paths: Tensor) -> Tensor:
+    """Means over segments: [N, T, O] -> [N, segments, O]."""
+    return torch.stack([part.mean(1) for part in paths.tensor_split(min(SEGMENTS, paths.shape[1]), 1)], 1)

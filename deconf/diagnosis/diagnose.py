@@ -10,13 +10,14 @@ import numpy as np
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.diagnosis import fits
 from deconfounded.deconf.diagnosis.held_out import Report
-from deconfounded.deconf.diagnosis.judgement import Diagnosis, judge
+from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import in_range
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
+from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 8  # raised when figures or verdicts of the same trials change
+VERSION = 9  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
 """The verdict on figures of several splits of the trials, with its reasons."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,8 +11,6 @@ from deconfounded.deconf.diagnosis.advice import (
     EXPLORE,
     EXPLORE_FIRST,
     EXPLORE_MORE,
-    HEADLINES,
-    IF_WRONG,
     MORE_TRIALS,
     PASSING,
     QUERY,
@@ -36,89 +33,8 @@ from deconfounded.deconf.diagnosis.thresholds import (
     TRAIT_STAKES,
     UNUSED,
 )
+from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure
 from deconfounded.envs.support.errors import InputError
-
-
-class Figure(NamedTuple):
-    """The mean over refits, and their range."""
-
-    value: float
-    low: float
-    high: float
-
-    @staticmethod
-    def of(refits: Sequence[float]) -> "Figure":
-        """The figure of the refits' values."""
-        return Figure(sum(refits) / len(refits), min(refits), max(refits))
-
-    def __format__(self, spec: str) -> str:
-        """With `%`, in percent."""
-        if spec == "%":
-            return f"{self.value:.0%} ({self.low:.0%} to {self.high:.0%})"
-        return str(self)
-
-    def __str__(self) -> str:
-        value, low, high = (f"{x:,.0f}" if abs(x) >= 100 else f"{x:.2g}" for x in self)
-        return f"{value} ({low} to {high})"
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.
-
-    found, cost, sure, wrong: plain sentences on what was found, what it costs, how sure that is, and what a wrong
-    verdict would look like. `reasons` have the figures. Figures are those of Findings, and three more. `gap`: the
-    predicted loss by naive cloning, in scores by paired deviation; `gap_by_actions`: by Eq. (1); `ratio`: the evidence
-    of actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone;
-    dissenting: what the others say, each verdict once.
-    """
-
-    verdict: Verdict
-    figures: dict[str, Figure]
-    reasons: tuple[str, ...]
-    tier: int | None
-    next: Next
-    found: str = ""
-    agreeing: int = 0
-    refits: int = 0
-    dissenting: tuple[str, ...] = ()
-
-    @property
-    def headline(self) -> str:
-        """A title."""
-        return HEADLINES[self.verdict]
-
-    @property
-    def cost(self) -> str:
-        """What cloning would cost."""
-        if self.verdict == "cannot tell" or self.tier == 3:
-            return "Not known from these data."
-        if self.verdict != "confounded":
-            return "Next to nothing, as far as the learned model of your system shows."
-        naive, latent = (self.figures[key] for key in ("naive", "latent"))
-        lost, rest = (Figure(1 - x.value, 1 - x.high, 1 - x.low) for x in (naive, latent))
-        return (
-            f"In the learned model of your system, a clone with a memory leaves the expert's course by {lost:%} of"
-            " what an expert would that acts on a wrong value of what is hidden. A policy that infers it from what the"
-            f" world does leaves it by {rest:%}: that is possible in the model, and no promise for a trained agent."
-        )
-
-    @property
-    def sure(self) -> str:
-        """How sure the verdict is."""
-        dissent = f" (the others: {', '.join(self.dissenting)})" if self.dissenting else ""
-        text = f"{self.agreeing} of {self.refits} random splits of your trials say the same if judged alone{dissent}."
-        if self.verdict == "cannot tell":
-            return text
-        if self.agreeing < self.refits:
-            return f"Not very: {text} More trials make it surer."
-        return f"Fairly: {text} They share most of their data and the same kind of model, so that this is no proof."
-
-    @property
-    def wrong(self) -> str:
-        """What a wrong verdict would look like; empty if there is none."""
-        text = IF_WRONG.get((self.verdict, self.tier))
-        return f"If this is wrong, {text}" if text else ""
 
 
 def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
@@ -130,7 +46,7 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
     alone = [(split.verdict, split.tier) for split in (_judge([refit], explored) for refit in refits)]
     if 2 * alone.count((diagnosis.verdict, diagnosis.tier)) < len(refits) and diagnosis.verdict != "cannot tell":
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
-        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, found=reason, next=MORE_TRIALS)
+        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, finding=reason, next=MORE_TRIALS)
     dissent = [verdict for verdict in alone if verdict != (diagnosis.verdict, diagnosis.tier)]
     verdicts = dict.fromkeys(f"{name}{f', Tier {tier}' * (name == 'confounded')}" for name, tier in dissent)
     return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(verdicts))
@@ -165,16 +81,18 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         f"A memory improves the prediction of the expert's action by {memory} nats a step over the present observation."
     ]
 
-    def conclude(verdict: Verdict, tier: int | None, found: str, advice: Next) -> Diagnosis:
-        return Diagnosis(verdict, figures, tuple(reasons), tier, advice, found)
+    def conclude(verdict: Verdict, tier: int | None, finding: str, advice: Next) -> Diagnosis:
+        return Diagnosis(verdict, figures, tuple(reasons), tier, advice, finding)
 
-    def more_exploration(found: str) -> Diagnosis:
+    def more_exploration(finding: str) -> Diagnosis:
         had = "" if explored is None else f" You have {explored} trials of it."
-        return conclude("cannot tell", None, found + had, EXPLORE_MORE)
+        return conclude("cannot tell", None, finding + had, EXPLORE_MORE)
 
     if memory.low < -MISFIT:
-        found = "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
-        return conclude("cannot tell", None, found, MORE_TRIALS)
+        finding = (
+            "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
+        )
+        return conclude("cannot tell", None, finding, MORE_TRIALS)
     least = (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
     unused = in_exploration is not None and not alike and figures["latent_gain"].low > least
     if memory.low <= NEGLIGIBLE and not unused:
@@ -185,29 +103,29 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
             reasons.append(_rollouts(figures))
             loses = at_stake and max(gap.low, by_actions.low) > SMALL_GAP and model.value < MAX_MODEL_DEVIATION
             if loses and figures["latent_gain"].low > 0:
-                found = (
+                finding = (
                     "Your system differs from trial to trial, and the expert seems to act on it: the clone with a"
                     " memory found nothing of that in the logs, and would lose by it."
                 )
-                return conclude("cannot tell", None, found, MORE_TRIALS)
-            found = (
+                return conclude("cannot tell", None, finding, MORE_TRIALS)
+            finding = (
                 "Your system differs from trial to trial, but past actions tell a clone nothing of the expert's next"
                 " one that the present observation does not."
             )
-            return conclude("not confounded", 1, found, CLONE)
-        found = (
+            return conclude("not confounded", 1, finding, CLONE)
+        finding = (
             "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. Under these"
             " conditions a clone misses nothing; about others the trials say nothing."
         )
-        return conclude("cannot tell", None, found, VARY_LATENT)
+        return conclude("cannot tell", None, finding, VARY_LATENT)
     reasons.append(_rollouts(figures))
     if in_exploration is None:
-        found = (
+        finding = (
             "Past actions tell a clone more of the expert's next one than the present observation. Whether the world"
             " would tell it too cannot be seen in expert trials alone: they hold nearly one action for each"
             " observation, so that effects of the action and of what is hidden cannot be separated."
         )
-        return conclude("cannot tell", None, found, EXPLORE_FIRST)
+        return conclude("cannot tell", None, finding, EXPLORE_FIRST)
     in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(_evidence(figures))
     if alike:
@@ -224,11 +142,11 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")
     if harmless and gain.low > 0:
-        found = (
+        finding = (
             "Something is hidden that the expert acts on, but where trials go hardly depends on it: acting on another"
             " value of it would change next to nothing."
         )
-        return conclude("not confounded", 1, found, CLONE)
+        return conclude("not confounded", 1, finding, CLONE)
     if (harmless and gain.high < NEGLIGIBLE) or (min(naive.low, latent.low) > NO_LOSS and not unused):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
     if not at_stake:
@@ -239,22 +157,22 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if gain.high <= 0:
         return more_exploration("What the world tells does not yet explain any of the expert's actions.")
     if naive.low > GOOD and max(gap.high, by_actions.high) < SMALL_GAP:
-        found = "Something is hidden, and the clone with a memory infers it by itself."
-        return conclude("not confounded", 1, found, CLONE)
+        finding = "Something is hidden, and the clone with a memory infers it by itself."
+        return conclude("not confounded", 1, finding, CLONE)
     if unused:
-        found = (
+        finding = (
             "The world tells more of the expert's actions than the clone's memory makes use of: it did not learn what"
             " it could."
         )
-        return conclude("cannot tell", None, found, MORE_TRIALS)
+        return conclude("cannot tell", None, finding, MORE_TRIALS)
     if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
-        found = "Something is hidden; whether a clone loses by it is not clear."
-        return conclude("cannot tell", None, found, MORE_TRIALS)
-    found = (
+        finding = "Something is hidden; whether a clone loses by it is not clear."
+        return conclude("cannot tell", None, finding, MORE_TRIALS)
+    finding = (
         "The expert acts on something that your columns do not show. A clone with a memory takes its own past actions"
         " for evidence of it, though it chose them itself; what the world does would tell."
     )
-    return conclude("confounded", 2, found, EXPLORE)
+    return conclude("confounded", 2, finding, EXPLORE)
 
 
 def _goal_or_habit(
@@ -267,20 +185,20 @@ def _goal_or_habit(
     if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
     if max(figures["trait_stakes"].high, figures["paired_trait_stakes"].high) < TRAIT_STAKES:
-        found = (
+        finding = (
             "Experts act in ways of their own, which last for a trial, but where trials go hardly depends on them, and"
             " the world tells nothing of them: habits, rather than anything hidden in your system."
         )
-        return conclude("nothing at stake", 1, found, CLONE_HABITS)
+        return conclude("nothing at stake", 1, finding, CLONE_HABITS)
     if gain.low < max(NEGLIGIBLE, TRAIT_SHARE * memory.high) or figures["paired_trait_stakes"].low < TRAIT_STAKES:
-        found = "Whether experts differ by goals that only they see, or by habits, is not clear."
-        return conclude("cannot tell", None, found, MORE_TRIALS)
-    found = (
+        finding = "Whether experts differ by goals that only they see, or by habits, is not clear."
+        return conclude("cannot tell", None, finding, MORE_TRIALS)
+    finding = (
         "The expert goes elsewhere in different trials, by something that only it sees, and the world tells nothing of"
         " it, with or without exploration. If where it goes is a matter of taste, nothing is lost: any clone's way is"
         " right. Otherwise only the expert, or a sensor, can tell."
     )
-    return conclude("confounded", 3, found, QUERY)
+    return conclude("confounded", 3, finding, QUERY)
 
 
 def _rollouts(figures: dict[str, Figure]) -> str:

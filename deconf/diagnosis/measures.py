@@ -21,7 +21,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis import fits, latent, trait
-from deconfounded.deconf.diagnosis.deviation import deviation, excess_score, max_ratio, paired_deviation, trajectories
+from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
 from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report
 from deconfounded.deconf.diagnosis.latent import Explanation, typical
 from deconfounded.deconf.diagnosis.learned_env import (
@@ -227,14 +227,11 @@ def _rollouts(
     rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, *[right] * 3]]
     least, most, *errors = (error for error, _ in rollouts[:4])
     judged = (float(1 - (error - least) / (most - least).clamp(min=0.05)) for error in errors)
-    home, away, cloned, inferred, repeat, *repeats = (path[0] for _, path in rollouts)
-    paired = [paired_deviation(path, home, repeat) for path in (away, cloned, inferred, *repeats)]
-    mistake, *others, chance, second_chance = paired  # of two repeats, so that their errors are independent
-    stakes, paired_stakes = stakes_of([away, home, repeat, repeats[0]])
-    scores = (excess_score(deviations - second_chance, mistake - chance) for deviations in others)
+    home, away, *imitated, repeat, second, third = (path[0] for _, path in rollouts)
+    stakes, paired_stakes = stakes_of([away, home, repeat, second])
+    naive, inferring = (paired_score(path, away, home, (repeat, second, third)) for path in imitated)
     shuffled = paths[torch.randperm(len(paths), generator=torch.Generator().manual_seed(0))]
     unlike = float(deviation(home, *shuffled.tensor_split(2)).mean())
-    naive, inferring = scores
     naive_by_actions, inferring_by_actions = judged
     return stakes, paired_stakes, unlike, naive, inferring, naive_by_actions, inferring_by_actions
 

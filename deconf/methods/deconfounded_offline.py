@@ -61,17 +61,16 @@ def explain(
     draws: Draws,
     monitor: Monitor,
     times: int = 1,
-    kind: str = "evidence",
 ) -> tuple[VariationalModel, VariationalModel, ActionHead]:
     """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an untrained online model.
 
-    The two models share their dynamics; kind: that of the online one. The offline one reads actions as evidence by
-    themselves. Batches are `times` as large.
+    The two models share their dynamics. The offline one reads actions as evidence by themselves. Batches are `times` as
+    large.
     """
     scales = Scales.of(signature, data)
     sizes = (config.latent, config.width, scales, draws)
-    offline, online = VariationalModel("evidence", *sizes), VariationalModel(kind, *sizes)
-    offline.dynamics = online.dynamics = (online if online.encoder.linear else offline).dynamics
+    offline, online = VariationalModel("evidence", *sizes), VariationalModel("innovations", *sizes)
+    offline.dynamics = online.dynamics
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, scales, draws)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
@@ -100,7 +99,7 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     episodes = trials.mask.shape[1]
     trials, times = (split_episodes(trials), episodes) if config.drifts else (trials, 1)
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
-    offline, online, policy = explain(data, signature, config, draws, monitor, times, "innovations")
+    offline, online, policy = explain(data, signature, config, draws, monitor, times)
     latents = offline.sample(final_belief(offline, data), draws)
     online.encoder.set_prior(latents)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from deconfounded.deconf.core.data import Batch, Draws
-from deconfounded.deconf.diagnosis.deviation import deviation, excess_score, max_ratio, paired_deviation, trajectories
+from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
 from deconfounded.deconf.diagnosis.measures import draw_distant
 from deconfounded.experts.rollout import Trials
 
@@ -40,21 +40,42 @@ def test_pairs() -> None:
     assert float(paired_deviation(repeat, reference, repeat).max()) == pytest.approx(1)
 
 
-def test_score() -> None:
-    """Under the wrong latent two of three features deviate, the first three times as much: it weighs nine times."""
-    wrong = torch.tensor([3.0, 1.0, -1.0])
-    for excess, score in (([0, 0, 9], 1), ([3, 1, 0], 0), ([1.5, 0.5, 0], 0.5), ([3, 0, 0], 0.1), ([0, 1, 0], 0.9)):
-        assert excess_score(torch.tensor(excess), wrong) == pytest.approx(score)
-    assert excess_score(torch.tensor([9.0, 9.0, 0.0]), wrong) == 0
-    assert excess_score(torch.tensor([-0.5, -0.5, 0.0]), wrong) == 1
+def goals(n: int) -> torch.Tensor:
+    """Trajectories [n, 24, 1] to goals from -10 to 10."""
+    return torch.linspace(-10, 10, n)[:, None, None] * torch.linspace(0, 1, 24)[:, None]
+
+
+def noise(n: int, seed: int) -> torch.Tensor:
+    return torch.tensor(np.random.default_rng(seed).normal(size=(n, 24, 1)), dtype=torch.float32)
+
+
+@pytest.mark.parametrize(("share", "score"), [(0, 1), (0.5, 0.75), (0.7, 0.51), (1, 0), (2, 0)])
+def test_score(share: float, score: float) -> None:
+    """By squared deviation, to .03: a trajectory half of the way to where a wrong latent leads scores 3 / 4."""
+    right, *repeats = (goals(400) + 0.1 * noise(400, seed) for seed in range(4))
+    paths, wrong = (goals(400) + part * 3 + 0.1 * noise(400, seed) for seed, part in ((4, share), (5, 1)))
+    assert paired_score(paths, wrong, right, repeats) == pytest.approx(score, abs=0.03)
+
+
+def test_a_single_trajectory_does_not_decide() -> None:
+    right, *repeats = (goals(400) + 0.1 * noise(400, seed) for seed in range(4))
+    wrong, paths = goals(400) + 3, goals(400)
+    paths[0] += 1000
+    assert paired_score(paths, wrong, right, repeats) > 0.97
+
+
+def test_a_deviation_at_the_start_counts_no_more_than_later() -> None:
+    """Though chance is smaller there: half of the wrong latent's, in one of six segments, is a loss of some 1 / 24."""
+    right, *repeats = (goals(400) + 0.4 * walks(400, seed)[..., :1] for seed in range(4))
+    paths, wrong = (goals(400) + 0.4 * walks(400, seed)[..., :1] for seed in (4, 5))
+    paths[:, :4] += 1.5
+    assert paired_score(paths, wrong + 3, right, repeats) > 0.9
 
 
 def test_chance_scores_one() -> None:
     """Deviation by chance scores 1, though the wrong latent's is hardly larger: to .1, of 400 trajectories."""
-    reference, repeat, first, second, paths, wrong = (walks(400, seed) for seed in range(6))
-    excess = paired_deviation(paths, reference, repeat) - paired_deviation(first, reference, repeat)
-    mistake = paired_deviation(1.1 * wrong, reference, repeat) - paired_deviation(second, reference, repeat)
-    assert excess_score(excess, mistake) > 0.9
+    right, *repeats, paths, wrong = (walks(400, seed) for seed in range(6))
+    assert paired_score(paths, 1.1 * wrong, right, repeats) > 0.9
 
 
 def test_distant_latents() -> None:

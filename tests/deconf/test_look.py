@@ -17,6 +17,7 @@ from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
 from deconfounded.deconf.diagnosis import diagnose, judgement
 from deconfounded.deconf.diagnosis.look import Remark, look
+from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
@@ -280,7 +281,7 @@ def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(naive_rnn, "RecurrentConfig", lambda: RecurrentConfig(updates=1, batch=2))
     few = OfflineConfig(offline_updates=1, online_updates=0, offline_batch=2)
     monkeypatch.setattr(deconfounded_offline, "OfflineConfig", lambda: few)
-    code = _code(judgement.Diagnosis("cannot tell", {}, (), None, advice), about)
+    code = _code(Diagnosis("cannot tell", {}, (), None, advice), about)
     if advice is advices.QUERY:
         assert WRITTEN["query"] in code
         with pytest.raises(NotImplementedError, match="ask the expert"):

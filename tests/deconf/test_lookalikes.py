@@ -9,8 +9,8 @@ import torch
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.core.nets import LabelScaler, Scaler
 from deconfounded.deconf.diagnosis import fits, judgement, latent, measures
-from deconfounded.deconf.diagnosis.judgement import Diagnosis
 from deconfounded.deconf.diagnosis.measures import Amounts
+from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
@@ -92,7 +92,7 @@ def test_nothing_at_stake(kind: str) -> None:
 def test_nothing_hidden() -> None:
     diagnosis = diagnosed("idle")
     assert diagnosis.verdict == "cannot tell"
-    assert "differs from trial to trial" not in diagnosis.found
+    assert "differs from trial to trial" not in diagnosis.finding
 
 
 @pytest.mark.slow
@@ -104,7 +104,7 @@ def test_tier_3_for_a_goal_that_the_world_does_not_tell() -> None:
 def test_too_little_exploration_is_no_tier_3() -> None:
     diagnosis = diagnosed("wind", explored=24)
     assert diagnosis.tier != 3
-    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.found
+    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.finding
 
 
 def tank(heat: float, lasting: float = 0.0, rough: float = 0.0) -> Trials:

@@ -65,9 +65,14 @@ _TIERS = {
     **dict.fromkeys(("mujoco:ArmTrembles", "mujoco:PushedPole", "motor:MotorIntegral"), 1),
     **dict.fromkeys(("lane:LaneHabits", "lane:LaneLate", "reactor:ReactorTwice", "motor:MotorCalm"), 1),
 }
-_LEARNED_FROM = ("reactor:ReactorHeat",)  # a wrong verdict, by which the diagnosis was changed
+_LEARNED_FROM = ("reactor:ReactorHeat", "motor:MotorCalm")  # wrong verdicts, by which the diagnosis was changed
+_ADDED = {  # in their place
+    **dict.fromkeys(("mujoco:PushedDouble", "lane:LaneBias"), 2),
+    **dict.fromkeys(("classic:PendulumCalm", "classic:PoleLength"), 1),
+}
 CASES = tuple(
-    Case(reference, tier, i % 2 == 1 and reference not in _LEARNED_FROM)
-    for i, (reference, tier) in enumerate(_TIERS.items())
+    Case(reference, tier, reference in _ADDED or (i % 2 == 1 and reference not in _LEARNED_FROM))
+    for i, (reference, tier) in enumerate((_TIERS | _ADDED).items())
 )
-"""Every other one is unseen, but for those that were learned from. The order was fixed before any was diagnosed."""
+"""Every other one is unseen, but for those that were learned from; and so are those that were added in their place. The
+order was fixed, and the truth of each measured, before any was diagnosed."""

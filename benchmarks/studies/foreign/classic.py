@@ -15,9 +15,9 @@ WIND, GUST, DT = 3.5, 0.15, 0.05  # rad/s^2; rad/s a step; s
 class Windy(gymnasium.Wrapper):
     """A steady angular acceleration of a pendulum, and a gust on its speed after each step."""
 
-    def __init__(self, env: gymnasium.Env, wind: float) -> None:
+    def __init__(self, env: gymnasium.Env, wind: float, gust: float) -> None:
         super().__init__(env)
-        self.wind = wind
+        self.wind, self.gust = wind, gust
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         return self.env.reset(seed=seed, options={"x_init": 0.2, "y_init": 0.2})
@@ -25,7 +25,7 @@ class Windy(gymnasium.Wrapper):
     def step(self, action: Array) -> Step:
         obs, *rest = self.env.step(action)
         state = self.get_wrapper_attr("state")
-        state[1] += DT * self.wind + GUST * self.np_random.standard_normal()
+        state[1] += DT * self.wind + self.gust * self.np_random.standard_normal()
         obs[2] = state[1]
         return obs, *rest
 
@@ -33,18 +33,24 @@ class Windy(gymnasium.Wrapper):
 class PendulumWind(World):
     """Pendulum-v1, held upright in a hidden steady wind: confounded, and Tier 2 suffices."""
 
-    noise = 0.05
+    noise, gust = 0.05, GUST
     evidence = [2]
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("Pendulum-v1", max_episode_steps=self.steps, disable_env_checker=True)
-        return Windy(env, float(theta[0]))
+        return Windy(env, float(theta[0]), self.gust)
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return rng.uniform(-WIND, WIND, 1)
 
     def expert(self, obs: Array, theta: Array) -> Array:
         return -(8 * np.arctan2(obs[1], obs[0]) + 3 * obs[2] + theta / 3)
+
+
+class PendulumCalm(PendulumWind):
+    """The same wind without gusts: one transition reveals it."""
+
+    gust = 0.0
 
 
 class Turned(gymnasium.Wrapper):
@@ -87,6 +93,28 @@ class GustyCart(ReversedCart):
 
     noise, gust = 0.02, 0.4
     evidence = [1, 3]
+
+
+class PoleLength(World):
+    """CartPole-v1 whose pole is of a hidden length: the expert pushes harder for a long one, to little effect."""
+
+    noise = 0.1  # share of the expert's actions that are random
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("CartPole-v1", max_episode_steps=self.steps, disable_env_checker=True)
+        cart: Any = env.unwrapped
+        cart.length = float(theta[0])
+        cart.polemass_length = cart.masspole * cart.length
+        return env
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(0.3, 0.9, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return np.asarray(int(obs @ (0.3, 0.6, 12.0, 5.0 * theta[0]) > 0))
+
+    def controller(self, theta: Array, rng: np.random.Generator) -> Controller:
+        return lambda obs: np.asarray(rng.integers(2)) if rng.random() < self.noise else self.expert(obs, theta)
 
 
 class MountainPower(World):

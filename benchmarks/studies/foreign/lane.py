@@ -12,6 +12,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import Trials
 
 WIND, GUST, DT = 12.0, 1.2, 0.1  # m/s^2 to the side; m/s to the side a step; s
+BIAS, SWAY = 0.25, 1.5  # of the steering's range; rad/s of yaw a step
 DRIFT, SPEED, STEERING = 0.195, 8.3, np.pi / 3  # s, sideways speed by wind; m/s; rad an action of 1
 
 
@@ -66,6 +67,37 @@ class LaneWind(World):
         """Heads into the wind, and slowly back to the middle."""
         heading = -DRIFT * theta / SPEED - 0.03 * obs[0]
         return (heading - obs[1]) / STEERING
+
+
+class Bent(SideWind):
+    """A steering that is off by so much of its range, and gusts on the yaw rate after each step."""
+
+    def __init__(self, env: gymnasium.Env, bias: float, gust: float) -> None:
+        super().__init__(env, 0.0, 0.0)
+        self.bias, self.sway = bias, gust
+
+    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        _, reward, terminated, truncated, info = super().step(np.clip(action + self.bias, -1, 1))
+        vehicle = self.env.unwrapped.vehicle  # type: ignore[attr-defined]
+        vehicle.yaw_rate += self.sway * self.np_random.standard_normal()
+        return self._observed(), reward, terminated, truncated, info
+
+
+class LaneBias(LaneWind):
+    """theta: how far the steering is off [1], of its range: confounded, and Tier 2 suffices."""
+
+    gust = SWAY
+    evidence = [2, 3]
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("lane-keeping-v0", disable_env_checker=True)
+        return Bent(env.unwrapped, float(theta[0]), self.gust)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(-BIAS, BIAS, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return super().expert(obs, np.zeros(1)) - theta
 
 
 class LaneHabits(LaneWind):

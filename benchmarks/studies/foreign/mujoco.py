@@ -1,4 +1,4 @@
-"""Gymnasium's MuJoCo: an arm without loads, whose target is hidden or whose expert trembles, and a pushed pole."""
+"""Gymnasium's MuJoCo: an arm without loads, whose target is hidden or whose expert trembles, and pushed poles."""
 
 from typing import Any, SupportsFloat
 
@@ -11,6 +11,7 @@ from deconfounded.benchmarks.studies.foreign.world import Controller, World
 from deconfounded.envs.streams import Array
 
 RADIUS, PUSH, GUST = 0.18, 20.0, 0.15  # m; N; m/s and rad/s a step
+SHOVE, SWAY = 200.0, 0.06  # of the double pendulum: N; m/s and rad/s a step
 
 
 class ArmTrembles(Arm):
@@ -77,7 +78,7 @@ class PushedPole(World):
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=self.steps, disable_env_checker=True)
-        return Pushed(env, float(theta[0]))
+        return Pushed(env, float(theta[0]), GUST)
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return rng.uniform(-PUSH, PUSH, 1)
@@ -86,17 +87,51 @@ class PushedPole(World):
         return np.array([obs @ (0.5, 8.0, 0.8, 1.6)]) - theta / 100  # a motor of gear 100
 
 
-class Pushed(gymnasium.Wrapper):
-    """A constant force on a cart, and gusts on its speed and the pole's after each step."""
+class PushedDouble(World):
+    """InvertedDoublePendulum-v5 whose cart is pushed by a hidden force, at which it is fed forward: Tier 2 suffices.
 
-    def __init__(self, env: gymnasium.Env, force: float) -> None:
+    Observed is all but the force of constraints. The feedback is a linear-quadratic regulator's.
+    """
+
+    noise = 0.005
+    evidence = [5, 6, 7]
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("InvertedDoublePendulum-v5", max_episode_steps=self.steps, disable_env_checker=True)
+        return Pushed(Seen(env), float(theta[0]), SWAY)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(-SHOVE, SHOVE, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        angles = np.arctan2(obs[1:3], obs[3:5])
+        state = np.concatenate([obs[:1], angles, obs[5:]])
+        return -np.array([state @ (0.21, 1.82, 5.59, 0.31, 0.9, 0.82)]) - theta / 500  # a motor of gear 500
+
+
+class Seen(gymnasium.ObservationWrapper):
+    """The first eight coordinates."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
-        self.force = force
+        self.observation_space = spaces.Box(-np.inf, np.inf, (8,), np.float64)
+
+    def observation(self, observation: Array) -> Array:
+        return observation[:8]
+
+
+class Pushed(gymnasium.Wrapper):
+    """A constant force on a cart, and gusts on the speeds of all joints, the last columns, after each step."""
+
+    def __init__(self, env: gymnasium.Env, force: float, gust: float) -> None:
+        super().__init__(env)
+        self.force, self.gust = force, gust
 
     def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        data, gust = self.get_wrapper_attr("data"), GUST * self.np_random.standard_normal(2)
+        data = self.get_wrapper_attr("data")
+        gust = self.gust * self.np_random.standard_normal(len(data.qvel))
         data.qfrc_applied[0] = self.force
         obs, *rest = self.env.step(action)
         data.qvel += gust
-        obs[2:] += gust
+        obs[-len(gust) :] += gust
         return obs, *rest
