@@ -11,7 +11,7 @@ from deconfounded.benchmarks.studies.foreign.world import Controller, World
 from deconfounded.envs.streams import Array
 
 RADIUS, PUSH, GUST = 0.18, 20.0, 0.15  # m; N; m/s and rad/s a step
-SHOVE, SWAY = 200.0, 0.06  # of the double pendulum: N; m/s and rad/s a step
+SHOVE, SWAY = 250.0, 0.1  # of the double pendulum: N; m/s and rad/s a step
 
 
 class ArmTrembles(Arm):
