@@ -56,9 +56,8 @@ def paired_score(paths: Tensor, wrong: Tensor, right: Tensor, repeats: Sequence[
     errors, mistakes, *by_chance = (_means(x) - of_right for x in (paths, wrong, *repeats))
     usual = torch.cat(by_chance).abs().flatten(0, 1).median(0).values
     unit = torch.maximum(1.48 * usual, _least(of_right.flatten(0, 1)))
-    clip = (CLIP * (mistakes / unit).square().median(0).values).clamp(min=CLIP)  # as far as wrong latents usually lead
     error, mistake, _, first, second = (
-        torch.minimum((x / unit).square(), clip).mean(0) for x in (errors, mistakes, *by_chance)
+        (x / unit).square().clamp(max=CLIP).mean(0) for x in (errors, mistakes, *by_chance)
     )
     weight = (mistake - first).clamp(min=0)
     share = (weight * (error - second)).sum() / weight.square().sum().clamp(min=1e-6)

@@ -48,7 +48,7 @@ class PendulumWind(World):
 
 
 class PendulumCalm(PendulumWind):
-    """The same wind without gusts: one transition reveals it."""
+    """The same wind without gusts: one transition reveals it, but a naive clone does not make use of it."""
 
     gust = 0.0
 

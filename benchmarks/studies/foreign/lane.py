@@ -84,7 +84,7 @@ class Bent(SideWind):
 
 
 class LaneBias(LaneWind):
-    """theta: how far the steering is off [1], of its range: confounded, and Tier 2 suffices."""
+    """theta: how far the steering is off [1], of its range, which a naive clone infers by itself, in spite of gusts."""
 
     gust = SWAY
     evidence = [2, 3]
