@@ -25,7 +25,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
         "verdict": diagnosis.verdict,
         "tier": diagnosis.tier,
         "headline": diagnosis.headline,
-        **{key: getattr(diagnosis, key) for key in ("finding", "cost", "sure", "wrong", "agreeing", "dissenting")},
+        **{key: getattr(diagnosis, key) for key in ("conclusion", "cost", "sure", "wrong", "agreeing", "dissenting")},
         "reasons": list(diagnosis.reasons),
         "next": {"advice": diagnosis.next.advice, "code": code},
         "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
@@ -36,7 +36,7 @@ def write(diagnosis: Diagnosis, about: dict[str, Any], folder: Path) -> str:
     write_atomically(folder / "index.html", page + "\n")
     how = f"\n\n{code}" if code else ""
     plain = {
-        "Finding": diagnosis.finding,
+        "Conclusion": diagnosis.conclusion,
         "Cost of cloning": diagnosis.cost,
         "How sure": f"{diagnosis.sure} {diagnosis.wrong}".strip(),
         "Next": f"{diagnosis.next.advice}{how}",

@@ -1,7 +1,5 @@
 """Deviation of trajectories from a reference set, by a few features of each episode, relative to chance."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -9,6 +7,7 @@ from deconfounded.deconf.core.data import Batch
 
 SEGMENTS = 6  # of an episode
 CLIP = 9.0  # of squared deviations, in squares of the unit
+MEANS, SQUARES = slice(-1), slice(-1, None)  # of features
 
 
 def trajectories(episodes: Batch) -> Tensor:
@@ -42,26 +41,31 @@ def max_ratio(deviations: Tensor, chance: Tensor) -> float:
     return float(deviations.max() / chance.max().clamp(min=1))
 
 
-def paired_score(paths: Tensor, wrong: Tensor, right: Tensor, repeats: Sequence[Tensor]) -> float:
-    """The score of trajectories [N, T, O]: 1 if they are those under the right latents, 0 if those under wrong ones.
+def paired_score(paths: Tensor, wrong: Tensor, right: Tensor, repeats: tuple[Tensor, Tensor]) -> float:
+    """The score of trajectories: 1 if they deviate from those under right latents by chance, 0 if as those under wrong.
 
-    Squared deviations of the means over segments are compared, each trajectory's from the one under the right latent
-    that starts as it does, by least squares: where the wrong latent's deviation is large counts most. The unit is what
-    a coordinate deviates by chance, over the whole episode: in units of a segment, a small deviation at the start,
-    where chance has had no time to add up, would count as much as a large one at the end. repeats: three more draws
-    under the right latents. Chance is subtracted, by a repeat of its own on either side: noise of a common estimate
-    would correlate the two.
+    All are [N, T, O], and the i-th of each have latent and start in common; repeats are two more draws under the right
+    latents. A deviation is the mean over trajectories of the squared differences of a feature, less that by chance, of
+    one repeat for the wrong latents and of the other for the trajectories, so that their errors are independent. The
+    score is 1 - c, where c times the deviations under wrong latents fits those of the trajectories by least squares.
+
+    The unit, in which squares are clipped at 9, is what chance does to a coordinate, in any segment of the episode. In
+    a unit for each segment, a small deviation at the start, where chance has had no time to add up, would count as much
+    as a large one later.
     """
-    of_right = _means(right)
-    errors, mistakes, *by_chance = (_means(x) - of_right for x in (paths, wrong, *repeats))
-    usual = torch.cat(by_chance).abs().flatten(0, 1).median(0).values
-    unit = torch.maximum(1.48 * usual, _least(of_right.flatten(0, 1)))
-    error, mistake, _, first, second = (
-        (x / unit).square().clamp(max=CLIP).mean(0) for x in (errors, mistakes, *by_chance)
-    )
-    weight = (mistake - first).clamp(min=0)
-    share = (weight * (error - second)).sum() / weight.square().sum().clamp(min=1e-6)
+    features = _features(right)
+    off, away, *by_chance = (_features(x) - features for x in (paths, wrong, *repeats))
+    unit = torch.cat([_pooled_unit(features[:, part], torch.cat(by_chance)[:, part]) for part in (MEANS, SQUARES)])
+    deviation, mistake, chance, second = ((x / unit).square().clamp(max=CLIP).mean(0) for x in (off, away, *by_chance))
+    weight = (mistake - chance).clamp(min=0)
+    share = (weight * (deviation - second)).sum() / weight.square().sum().clamp(min=1e-6)
     return float(1 - share.clamp(0, 1))
+
+
+def _pooled_unit(features: Tensor, by_chance: Tensor) -> Tensor:
+    """The usual size of differences [M, F, O] by chance, or 1% of the range of features [N, F, O]: [F, O], same F."""
+    usual = 1.48 * by_chance.abs().flatten(0, 1).median(0).values
+    return torch.maximum(usual, _least(features.flatten(0, 1))).expand(features.shape[1], -1)
 
 
 def _ratio(reference: Tensor, deviations: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
@@ -77,10 +81,6 @@ def _least(values: Tensor) -> Tensor:
 
 
 def _features(paths: Tensor) -> Tensor:
-    """[N, T, O] -> [N, F, O]."""
-    return torch.cat([_means(paths), paths.mean(1, keepdim=True), paths.square().mean(1, keepdim=True)], 1)
-
-
-def _means(paths: Tensor) -> Tensor:
-    """Means over segments: [N, T, O] -> [N, segments, O]."""
-    return torch.stack([part.mean(1) for part in paths.tensor_split(min(SEGMENTS, paths.shape[1]), 1)], 1)
+    """[N, T, O] -> [N, F, O]: MEANS, over segments and over all of the episode, and SQUARES, the mean square."""
+    segments = paths.tensor_split(min(SEGMENTS, paths.shape[1]), 1)
+    return torch.stack([part.mean(1) for part in (*segments, paths, paths.square())], 1)

@@ -46,7 +46,7 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
     alone = [(split.verdict, split.tier) for split in (_judge([refit], explored) for refit in refits)]
     if 2 * alone.count((diagnosis.verdict, diagnosis.tier)) < len(refits) and diagnosis.verdict != "cannot tell":
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
-        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, finding=reason, next=MORE_TRIALS)
+        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
     dissent = [verdict for verdict in alone if verdict != (diagnosis.verdict, diagnosis.tier)]
     verdicts = dict.fromkeys(f"{name}{f', Tier {tier}' * (name == 'confounded')}" for name, tier in dissent)
     return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(verdicts))
@@ -81,18 +81,18 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         f"A memory improves the prediction of the expert's action by {memory} nats a step over the present observation."
     ]
 
-    def conclude(verdict: Verdict, tier: int | None, finding: str, advice: Next) -> Diagnosis:
-        return Diagnosis(verdict, figures, tuple(reasons), tier, advice, finding)
+    def conclude(verdict: Verdict, tier: int | None, conclusion: str, advice: Next) -> Diagnosis:
+        return Diagnosis(verdict, figures, tuple(reasons), tier, advice, conclusion)
 
-    def more_exploration(finding: str) -> Diagnosis:
+    def more_exploration(conclusion: str) -> Diagnosis:
         had = "" if explored is None else f" You have {explored} trials of it."
-        return conclude("cannot tell", None, finding + had, EXPLORE_MORE)
+        return conclude("cannot tell", None, conclusion + had, EXPLORE_MORE)
 
     if memory.low < -MISFIT:
-        finding = (
+        conclusion = (
             "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
         )
-        return conclude("cannot tell", None, finding, MORE_TRIALS)
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     least = (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
     unused = in_exploration is not None and not alike and figures["latent_gain"].low > least
     if memory.low <= NEGLIGIBLE and not unused:
@@ -103,29 +103,29 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
             reasons.append(_rollouts(figures))
             loses = at_stake and max(gap.low, by_actions.low) > SMALL_GAP and model.value < MAX_MODEL_DEVIATION
             if loses and figures["latent_gain"].low > 0:
-                finding = (
+                conclusion = (
                     "Your system differs from trial to trial, and the expert seems to act on it: the clone with a"
                     " memory found nothing of that in the logs, and would lose by it."
                 )
-                return conclude("cannot tell", None, finding, MORE_TRIALS)
-            finding = (
+                return conclude("cannot tell", None, conclusion, MORE_TRIALS)
+            conclusion = (
                 "Your system differs from trial to trial, but past actions tell a clone nothing of the expert's next"
                 " one that the present observation does not."
             )
-            return conclude("not confounded", 1, finding, CLONE)
-        finding = (
+            return conclude("not confounded", 1, conclusion, CLONE)
+        conclusion = (
             "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. Under these"
             " conditions a clone misses nothing; about others the trials say nothing."
         )
-        return conclude("cannot tell", None, finding, VARY_LATENT)
+        return conclude("cannot tell", None, conclusion, VARY_LATENT)
     reasons.append(_rollouts(figures))
     if in_exploration is None:
-        finding = (
+        conclusion = (
             "Past actions tell a clone more of the expert's next one than the present observation. Whether the world"
             " would tell it too cannot be seen in expert trials alone: they hold nearly one action for each"
             " observation, so that effects of the action and of what is hidden cannot be separated."
         )
-        return conclude("cannot tell", None, finding, EXPLORE_FIRST)
+        return conclude("cannot tell", None, conclusion, EXPLORE_FIRST)
     in_trials, gain = figures["expert_evidence"], figures["latent_gain"]
     reasons.append(_evidence(figures))
     if alike:
@@ -142,11 +142,11 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")
     if harmless and gain.low > 0:
-        finding = (
+        conclusion = (
             "Something is hidden that the expert acts on, but where trials go hardly depends on it: acting on another"
             " value of it would change next to nothing."
         )
-        return conclude("not confounded", 1, finding, CLONE)
+        return conclude("not confounded", 1, conclusion, CLONE)
     if (harmless and gain.high < NEGLIGIBLE) or (min(naive.low, latent.low) > NO_LOSS and not unused):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
     if not at_stake:
@@ -157,22 +157,22 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
     if gain.high <= 0:
         return more_exploration("What the world tells does not yet explain any of the expert's actions.")
     if naive.low > GOOD and max(gap.high, by_actions.high) < SMALL_GAP:
-        finding = "Something is hidden, and the clone with a memory infers it by itself."
-        return conclude("not confounded", 1, finding, CLONE)
+        conclusion = "Something is hidden, and the clone with a memory infers it by itself."
+        return conclude("not confounded", 1, conclusion, CLONE)
     if unused:
-        finding = (
+        conclusion = (
             "The world tells more of the expert's actions than the clone's memory makes use of: it did not learn what"
             " it could."
         )
-        return conclude("cannot tell", None, finding, MORE_TRIALS)
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
-        finding = "Something is hidden; whether a clone loses by it is not clear."
-        return conclude("cannot tell", None, finding, MORE_TRIALS)
-    finding = (
+        conclusion = "Something is hidden; whether a clone loses by it is not clear."
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
+    conclusion = (
         "The expert acts on something that your columns do not show. A clone with a memory takes its own past actions"
         " for evidence of it, though it chose them itself; what the world does would tell."
     )
-    return conclude("confounded", 2, finding, EXPLORE)
+    return conclude("confounded", 2, conclusion, EXPLORE)
 
 
 def _goal_or_habit(
@@ -185,20 +185,20 @@ def _goal_or_habit(
     if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
     if max(figures["trait_stakes"].high, figures["paired_trait_stakes"].high) < TRAIT_STAKES:
-        finding = (
+        conclusion = (
             "Experts act in ways of their own, which last for a trial, but where trials go hardly depends on them, and"
             " the world tells nothing of them: habits, rather than anything hidden in your system."
         )
-        return conclude("nothing at stake", 1, finding, CLONE_HABITS)
+        return conclude("nothing at stake", 1, conclusion, CLONE_HABITS)
     if gain.low < max(NEGLIGIBLE, TRAIT_SHARE * memory.high) or figures["paired_trait_stakes"].low < TRAIT_STAKES:
-        finding = "Whether experts differ by goals that only they see, or by habits, is not clear."
-        return conclude("cannot tell", None, finding, MORE_TRIALS)
-    finding = (
+        conclusion = "Whether experts differ by goals that only they see, or by habits, is not clear."
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
+    conclusion = (
         "The expert goes elsewhere in different trials, by something that only it sees, and the world tells nothing of"
         " it, with or without exploration. If where it goes is a matter of taste, nothing is lost: any clone's way is"
         " right. Otherwise only the expert, or a sensor, can tell."
     )
-    return conclude("confounded", 3, finding, QUERY)
+    return conclude("confounded", 3, conclusion, QUERY)
 
 
 def _rollouts(figures: dict[str, Figure]) -> str:

@@ -128,7 +128,7 @@ def _train_dynamics(
     The beginning of a trial and the steps after it, as in deployment, are no such halves: a latent of single episodes
     then encodes the time in the episode, and rollouts that start with it are of no use.
     """
-    model = VariationalModel("innovations", config.latent, config.width, scales, draws)
+    model = VariationalModel(config.model, config.latent, config.width, scales, draws)
     optimizer = Adam([model], config.inference_rate, config.inference_updates)
     for update in range(config.inference_updates):
         batch = explored.draw_trials(config.inference_batch, draws)

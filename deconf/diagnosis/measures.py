@@ -87,11 +87,11 @@ class Findings(NamedTuple):
     or of an episode, do beyond a fit of all trials; 0 if that is chance, None if they are too few to know
     (`fits.own_dynamics`).
 
-    The others are of the last episode of rollouts in the learned dynamics, and deviations are over chance, which is 1.
+    The others are of the last episode of rollouts in the learned dynamics; deviations are relative to chance, 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
     under right latents, in the feature where it is largest. paired_stakes: the same, paired by latent and start.
     model_deviation: mean deviation of trajectories under right latents from the data's. naive, latent: scores of the
-    naive clone and of posterior sampling, from 0 for a wrong latent to 1 for the right one, by paired deviation;
+    naive clone and of posterior sampling, from 0 for a wrong latent to 1 for the right one (`deviation.paired_score`);
     naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
     are None, and the latent explains actions too, Eq. (7).
 
@@ -224,12 +224,12 @@ def _rollouts(
     wrong = LatentPolicy(model, policy, take(candidates, draw_distant(candidates, index, draws)))
     imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(model, policy, candidates)]
     env = learned_env(right)
-    rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, *[right] * 3]]
+    rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, right, right]]
     least, most, *errors = (error for error, _ in rollouts[:4])
     judged = (float(1 - (error - least) / (most - least).clamp(min=0.05)) for error in errors)
-    home, away, *imitated, repeat, second, third = (path[0] for _, path in rollouts)
+    home, away, *imitated, repeat, second = (path[0] for _, path in rollouts)
     stakes, paired_stakes = stakes_of([away, home, repeat, second])
-    naive, inferring = (paired_score(path, away, home, (repeat, second, third)) for path in imitated)
+    naive, inferring = (paired_score(path, away, home, (repeat, second)) for path in imitated)
     shuffled = paths[torch.randperm(len(paths), generator=torch.Generator().manual_seed(0))]
     unlike = float(deviation(home, *shuffled.tensor_split(2)).mean())
     naive_by_actions, inferring_by_actions = judged

@@ -34,11 +34,11 @@ class Figure(NamedTuple):
 class Diagnosis:
     """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.
 
-    finding, cost, sure, wrong: plain sentences on what the data show, what it costs, how sure that is, and what a wrong
-    verdict would look like. `reasons` have the figures. Figures are those of Findings, and three more. `gap`: the
-    predicted loss by naive cloning, in scores by paired deviation; `gap_by_actions`: by Eq. (1); `ratio`: the evidence
-    of actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone;
-    dissenting: what the others say, each verdict once.
+    conclusion, cost, sure, wrong: plain sentences on what the data show, what it costs, how sure that is, and what a
+    wrong verdict would look like. `reasons` have the figures. Figures are those of Findings, and three more. `gap`: the
+    predicted loss by naive cloning, in scores by trajectories; `gap_by_actions`: by Eq. (1); `ratio`: the evidence of
+    actions over that of dynamics, in expert trials. agreeing: refits that say the same if judged alone; dissenting:
+    what the others say, each verdict once.
     """
 
     verdict: Verdict
@@ -46,7 +46,7 @@ class Diagnosis:
     reasons: tuple[str, ...]
     tier: int | None
     next: Next
-    finding: str = ""
+    conclusion: str = ""
     agreeing: int = 0
     refits: int = 0
     dissenting: tuple[str, ...] = ()

@@ -64,8 +64,7 @@ def explain(
 ) -> tuple[VariationalModel, VariationalModel, ActionHead]:
     """Eq. (7): an offline model and a policy that explain expert trials by one latent, and an untrained online model.
 
-    The two models share their dynamics. The offline one reads actions as evidence by themselves. Batches are `times` as
-    large.
+    The two models share their dynamics. The offline one takes actions, too, for evidence. Batches are `times` as large.
     """
     scales = Scales.of(signature, data)
     sizes = (config.latent, config.width, scales, draws)

@@ -95,10 +95,10 @@ def two() -> Iterator[Any]:
         for key, value in quiet.items():
             patch.setenv(key, value)
         head = {"num_cpus": 1, "include_dashboard": False}
-        # Without hooks at exit: from 3.13 on a fork drops these, and with them Ray's client, which crashes the fork.
+        # No hooks at exit: a forked process drops its hooks (Python 3.13), and dropping Ray's crashes it.
         made = Cluster(initialize_head=True, head_node_args=head, shutdown_at_exit=False)
-        made.second = made.add_node(num_cpus=1)
         try:
+            made.second = made.add_node(num_cpus=1)
             yield made
         finally:
             ray.shutdown()

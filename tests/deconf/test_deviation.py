@@ -40,48 +40,58 @@ def test_pairs() -> None:
     assert float(paired_deviation(repeat, reference, repeat).max()) == pytest.approx(1)
 
 
-def goals(n: int) -> torch.Tensor:
-    """Trajectories [n, 24, 1] to goals from -10 to 10."""
-    return torch.linspace(-10, 10, n)[:, None, None] * torch.linspace(0, 1, 24)[:, None]
+def lines(n: int, seed: int) -> torch.Tensor:
+    """Trajectories [n, 24, 2] at rest in noise of .5; the second coordinate is noise alone, a thousand times as large.
+
+    Of two, the difference in a feature has a std of .5 / sqrt(4) sqrt(2) = .35, or by the mean of an episode .14.
+    """
+    noise = np.random.default_rng(seed).normal(size=(n, 24, 2)) * (0.5, 500)
+    return torch.tensor(noise, dtype=torch.float32)
 
 
-def noise(n: int, seed: int) -> torch.Tensor:
-    return torch.tensor(np.random.default_rng(seed).normal(size=(n, 24, 1)), dtype=torch.float32)
+FIRST = torch.tensor([1.0, 0.0])  # the coordinate in which trajectories deviate
 
 
 @pytest.mark.parametrize(("share", "score"), [(0, 1), (0.5, 0.75), (0.7, 0.51), (1, 0), (2, 0)])
 def test_score(share: float, score: float) -> None:
     """By squared deviation, to .05: a trajectory half of the way to where a wrong latent leads scores 3 / 4."""
-    right, *repeats = (goals(800) + 0.1 * noise(800, seed) for seed in range(4))
-    paths, wrong = (goals(800) + part * 0.1 + 0.1 * noise(800, seed) for seed, part in ((4, share), (5, 1)))
-    assert paired_score(paths, wrong, right, repeats) == pytest.approx(score, abs=0.05)
+    right, *repeats, paths, wrong = (lines(2000, seed) for seed in range(5))
+    assert paired_score(paths + share * 0.5 * FIRST, wrong + 0.5 * FIRST, right, tuple(repeats)) == pytest.approx(
+        score, abs=0.05
+    )
 
 
 def test_far_off_is_far_off() -> None:
     """What is further off than chance usually leads counts in full, however far wrong latents lead."""
-    right, *repeats = (goals(400) + 0.1 * noise(400, seed) for seed in range(4))
-    assert paired_score(goals(400) + 1, goals(400) + 3, right, repeats) < 0.05
+    right, *repeats, paths, wrong = (lines(400, seed) for seed in range(5))
+    assert paired_score(paths + 10 * FIRST, wrong + 30 * FIRST, right, tuple(repeats)) < 0.05
 
 
 def test_a_single_trajectory_does_not_decide() -> None:
-    right, *repeats = (goals(400) + 0.1 * noise(400, seed) for seed in range(4))
-    wrong, paths = goals(400) + 3, goals(400)
+    right, *repeats, paths, wrong = (lines(400, seed) for seed in range(5))
     paths[0] += 1000
-    assert paired_score(paths, wrong, right, repeats) > 0.97
+    assert paired_score(paths, wrong + 3 * FIRST, right, tuple(repeats)) > 0.97
+
+
+def test_a_swing_about_the_right_course_deviates() -> None:
+    """Its means are right, and its square is not."""
+    right, *repeats, paths, wrong = (lines(400, seed) for seed in range(5))
+    swing = 3 * FIRST * torch.tensor([-1.0, 1.0]).repeat(12)[:, None]
+    assert paired_score(paths + swing, wrong + swing, right, tuple(repeats)) < 0.1
 
 
 def test_a_deviation_at_the_start_counts_no_more_than_later() -> None:
     """Though chance is smaller there: half of the wrong latent's, in one of six segments, is a loss of some 1 / 24."""
-    right, *repeats = (goals(400) + 0.4 * walks(400, seed)[..., :1] for seed in range(4))
-    paths, wrong = (goals(400) + 0.4 * walks(400, seed)[..., :1] for seed in (4, 5))
+    right, *repeats, paths, wrong = (0.4 * walks(400, seed)[..., :1] for seed in range(5))
     paths[:, :4] += 1.5
-    assert paired_score(paths, wrong + 3, right, repeats) > 0.9
+    assert paired_score(paths, wrong + 3, right, tuple(repeats)) > 0.9
 
 
 def test_chance_scores_one() -> None:
-    """Deviation by chance scores 1, though the wrong latent's is hardly larger: to .1, of 400 trajectories."""
-    right, *repeats, paths, wrong = (walks(400, seed) for seed in range(6))
-    assert paired_score(paths, 1.1 * wrong, right, repeats) > 0.9
+    """Deviation by chance scores 1 if the wrong latent's is clearly larger: to .1, in each of ten draws."""
+    for draw in range(10):
+        right, *repeats, paths, wrong = (walks(400, 5 * draw + i) for i in range(5))
+        assert paired_score(paths, 2 * wrong, right, tuple(repeats)) > 0.9
 
 
 def test_distant_latents() -> None:

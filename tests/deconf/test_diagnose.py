@@ -231,7 +231,7 @@ class TestJudge:
         few = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(latent_gain=2.0)])
         assert (few.verdict, few.tier, few.agreeing, few.next) == ("cannot tell", None, 2, advice.MORE_TRIALS)
         assert few.dissenting == ("confounded, Tier 2",)
-        assert "lead to different verdicts" in few.finding
+        assert "lead to different verdicts" in few.conclusion
 
     def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
@@ -301,7 +301,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert set(written["figures"]) >= {*Findings._fields[:-3], "gap", "gap_by_actions", "ratio"} - {"dynamics_differ"}
     page = (tmp_path / "out" / "index.html").read_text()
     unfolded, _, folded = html.unescape(page).partition("<details>")
-    for key in ("headline", "finding", "cost", "sure", "wrong"):
+    for key in ("headline", "conclusion", "cost", "sure", "wrong"):
         assert written[key] in unfolded
     assert not re.search(r"nats|Tier|Eq\.", unfolded.partition("A look at the data")[0].partition("What to do")[0])
     assert written["reasons"][0] in folded

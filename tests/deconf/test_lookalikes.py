@@ -95,7 +95,7 @@ def test_nothing_at_stake(kind: str) -> None:
 def test_nothing_hidden() -> None:
     diagnosis = diagnosed("idle")
     assert diagnosis.verdict == "cannot tell"
-    assert "differs from trial to trial" not in diagnosis.finding
+    assert "differs from trial to trial" not in diagnosis.conclusion
 
 
 @pytest.mark.slow
@@ -107,7 +107,7 @@ def test_tier_3_for_a_goal_that_the_world_does_not_tell() -> None:
 def test_too_little_exploration_is_no_tier_3() -> None:
     diagnosis = diagnosed("wind", explored=24)
     assert diagnosis.tier != 3
-    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.finding
+    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.conclusion
 
 
 def tank(heat: float, lasting: float = 0.0, rough: float = 0.0) -> Trials:

@@ -1,4 +1,4 @@
-"""Gymnasium's classic control: a pendulum in the wind, carts whose motor may be reversed, a car, and an acrobot."""
+"""Gymnasium's classic control: a pendulum in the wind, carts with a hidden motor or pole, a car, and an acrobot."""
 
 from typing import Any, SupportsFloat
 
@@ -88,17 +88,8 @@ class ReversedCart(World):
         return lambda obs: np.asarray(rng.integers(2)) if rng.random() < self.noise else self.expert(obs, theta)
 
 
-class GustyCart(ReversedCart):
-    """The same in gusts, which hide for a while which way it turns: confounded, and Tier 2 suffices."""
-
-    noise, gust = 0.02, 0.4
-    evidence = [1, 3]
-
-
-class PoleLength(World):
-    """CartPole-v1 whose pole is of a hidden length: the expert pushes harder for a long one, to little effect."""
-
-    noise = 0.1  # share of the expert's actions that are random
+class PoleLength(ReversedCart):
+    """theta: half the length [1] of CartPole-v1's pole in m. The expert weighs the pole's speed by it, to no effect."""
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("CartPole-v1", max_episode_steps=self.steps, disable_env_checker=True)
@@ -113,8 +104,12 @@ class PoleLength(World):
     def expert(self, obs: Array, theta: Array) -> Array:
         return np.asarray(int(obs @ (0.3, 0.6, 12.0, 5.0 * theta[0]) > 0))
 
-    def controller(self, theta: Array, rng: np.random.Generator) -> Controller:
-        return lambda obs: np.asarray(rng.integers(2)) if rng.random() < self.noise else self.expert(obs, theta)
+
+class GustyCart(ReversedCart):
+    """The same in gusts, which hide for a while which way it turns: confounded, and Tier 2 suffices."""
+
+    noise, gust = 0.02, 0.4
+    evidence = [1, 3]
 
 
 class MountainPower(World):

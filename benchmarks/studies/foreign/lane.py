@@ -1,4 +1,4 @@
-"""highway-env's lane-keeping, with a dynamic bicycle model: a side wind, drivers' habits, and late logs."""
+"""highway-env's lane-keeping, by a dynamic bicycle model: a side wind, a bent steering, habits, and late logs."""
 
 from typing import Any, SupportsFloat
 
@@ -12,7 +12,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.experts.rollout import Trials
 
 WIND, GUST, DT = 12.0, 1.2, 0.1  # m/s^2 to the side; m/s to the side a step; s
-BIAS, SWAY = 0.25, 1.5  # of the steering's range; rad/s of yaw a step
+BIAS, SWAY = 0.25, 1.5  # added to the action, of which 1 is full lock; rad/s of yaw a step
 DRIFT, SPEED, STEERING = 0.195, 8.3, np.pi / 3  # s, sideways speed by wind; m/s; rad an action of 1
 
 
@@ -70,11 +70,11 @@ class LaneWind(World):
 
 
 class Bent(SideWind):
-    """A steering that is off by so much of its range, and gusts on the yaw rate after each step."""
+    """A steering with a bias that is added to each action, and gusts on the yaw rate after each step."""
 
-    def __init__(self, env: gymnasium.Env, bias: float, gust: float) -> None:
+    def __init__(self, env: gymnasium.Env, bias: float, sway: float) -> None:
         super().__init__(env, 0.0, 0.0)
-        self.bias, self.sway = bias, gust
+        self.bias, self.sway = bias, sway
 
     def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         _, reward, terminated, truncated, info = super().step(np.clip(action + self.bias, -1, 1))
@@ -84,7 +84,7 @@ class Bent(SideWind):
 
 
 class LaneBias(LaneWind):
-    """theta: how far the steering is off [1], of its range, which a naive clone infers by itself, in spite of gusts."""
+    """theta: the steering's bias [1]. A naive clone infers it by itself, in spite of the gusts."""
 
     gust = SWAY
     evidence = [2, 3]

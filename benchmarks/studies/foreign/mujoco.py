@@ -88,9 +88,9 @@ class PushedPole(World):
 
 
 class PushedDouble(World):
-    """InvertedDoublePendulum-v5 whose cart is pushed by a hidden force, at which it is fed forward: Tier 2 suffices.
+    """theta: a force [1] on the cart of InvertedDoublePendulum-v5, in N: confounded, and Tier 2 suffices.
 
-    Observed is all but the force of constraints. The feedback is a linear-quadratic regulator's.
+    The expert feeds it forward, and a linear-quadratic regulator's feedback.
     """
 
     noise = 0.005
@@ -110,7 +110,7 @@ class PushedDouble(World):
 
 
 class Seen(gymnasium.ObservationWrapper):
-    """The first eight coordinates."""
+    """Observes all columns but the last, the force of constraints."""
 
     def __init__(self, env: gymnasium.Env) -> None:
         super().__init__(env)
