@@ -38,18 +38,19 @@ from deconfounded.envs.support.errors import InputError
 
 
 def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
-    """The verdict, and why. It cannot tell where less than half of the refits would give that verdict alone.
+    """The verdict, and why. It cannot tell where less than half of the refits, judged alone, lead to the same tier.
 
-    explored: trials of exploration. Raises InputError if a figure is not finite.
+    That is, both "not confounded" and "nothing at stake" say that a clone loses nothing. explored: trials of
+    exploration. Raises InputError if a figure is not finite.
     """
     diagnosis = _judge(refits, explored)
-    alone = [(split.verdict, split.tier) for split in (_judge([refit], explored) for refit in refits)]
-    if 2 * alone.count((diagnosis.verdict, diagnosis.tier)) < len(refits) and diagnosis.verdict != "cannot tell":
+    alone = [_judge([refit], explored) for refit in refits]
+    if diagnosis.tier is not None and 2 * sum(split.tier == diagnosis.tier for split in alone) < len(refits):
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
-    dissent = [verdict for verdict in alone if verdict != (diagnosis.verdict, diagnosis.tier)]
-    verdicts = dict.fromkeys(f"{name}{f', Tier {tier}' * (name == 'confounded')}" for name, tier in dissent)
-    return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(verdicts))
+    dissent = [split for split in alone if split.tier != diagnosis.tier]
+    others = dict.fromkeys(split.verdict + f", Tier {split.tier}" * (split.tier in (2, 3)) for split in dissent)
+    return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(others))
 
 
 def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:

@@ -10,9 +10,12 @@ from deconfounded.experts.rollout import RandomAgent
 
 OURS = [case for case in CASES if case.reference.split(":")[0] in ("arm", "classic", "mujoco")]
 NAMES = [case.name for case in OURS]
-HARMLESS = (
-    "classic_reversedcart classic_mountainpower classic_polelength mujoco_pushedpole".split()
-)  # though dynamics depend on theta
+HARMLESS = [
+    "classic_reversedcart",
+    "classic_mountainpower",
+    "classic_polelength",
+    "mujoco_pushedpole",
+]  # though dynamics depend on theta
 
 
 def test_halves_are_alike() -> None:

@@ -233,6 +233,13 @@ class TestJudge:
         assert few.dissenting == ("confounded, Tier 2",)
         assert "lead to different verdicts" in few.conclusion
 
+    def test_harmless_verdicts_agree(self) -> None:
+        """That nothing is at stake, and that a clone infers what is hidden by itself: either way it loses nothing."""
+        at_rest, infers = (CLEAR._replace(naive=x, naive_by_actions=x, latent=x) for x in (1.0, 0.9))
+        assert [judge([split]).verdict for split in (at_rest, infers)] == ["nothing at stake", "not confounded"]
+        both = judge([at_rest, at_rest, infers])
+        assert (both.verdict, both.tier, both.agreeing, both.dissenting) == ("not confounded", 1, 3, ())
+
     def test_nan(self) -> None:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
             judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
