@@ -63,21 +63,21 @@ def paired_score(paths: Tensor, wrong: Tensor, right: Tensor, repeats: tuple[Ten
 
 
 def _pooled_unit(features: Tensor, by_chance: Tensor) -> Tensor:
-    """The usual size of differences [M, F, O] by chance, or 1% of the range of features [N, F, O]: [F, O], same F."""
-    usual = 1.48 * by_chance.abs().flatten(0, 1).median(0).values
-    return torch.maximum(usual, _least(features.flatten(0, 1))).expand(features.shape[1], -1)
+    """The unit of differences by chance [M, F, O], of all features [N, F, O] together: [F, O], the same for each."""
+    return _unit(features.flatten(0, 1), by_chance.flatten(0, 1)).expand(features.shape[1], -1)
 
 
 def _ratio(reference: Tensor, deviations: Tensor, by_chance: Tensor, usual: Tensor) -> Tensor:
     """The ratio of mean squares of two deviations [N, F, O], in units of the usual one, or of 1% of the range."""
-    unit = torch.maximum(1.48 * usual.abs().median(0).values, _least(reference))
+    unit = _unit(reference, usual)
     numerator, denominator = ((x / unit).square().clamp(max=CLIP).mean(0) for x in (deviations, by_chance))
     return numerator / denominator.clamp(min=0.5)
 
 
-def _least(values: Tensor) -> Tensor:
-    """The least unit of values [N, ...]: 1% of their range."""
-    return (0.01 * (values.amax(0) - values.amin(0))).clamp(min=1e-6)
+def _unit(values: Tensor, usual: Tensor) -> Tensor:
+    """The scaled median of usual deviations [M, ...], or 1% of the range of values [N, ...] if that is more."""
+    least = (0.01 * (values.amax(0) - values.amin(0))).clamp(min=1e-6)
+    return torch.maximum(1.48 * usual.abs().median(0).values, least)
 
 
 def _features(paths: Tensor) -> Tensor:

@@ -49,8 +49,8 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
     dissent = [split for split in alone if split.tier != diagnosis.tier]
-    others = dict.fromkeys(split.verdict + f", Tier {split.tier}" * (split.tier in (2, 3)) for split in dissent)
-    return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(others))
+    dissenting = dict.fromkeys(s.verdict + f", Tier {s.tier}" * (s.verdict == "confounded") for s in dissent)
+    return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(dissenting))
 
 
 def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
