@@ -59,6 +59,12 @@ def mark_numbers(app, tree, page):
             cell["classes"].append("number")
 
 
+def collapse_contents(app, page, template, context, tree):
+    """The navigation shows a page's own branch and the top of all others; whole trees were a third of the build."""
+    whole = context["toctree"]
+    context["toctree"] = lambda **options: whole(**options | {"collapse": True})
+
+
 def short_arrays(app, what, name, obj, options, signature, returns):
     """`ndarray[floating]`, not what numpy.typing makes of it."""
     long = r"ndarray\[tuple\[[^\]]*\.\.\.\], [~.\w]*dtype\[[~.]*(?:\w+\.)*(\w+)(?:\[[^\]]*\])?\]\]"
@@ -79,5 +85,6 @@ def mathml(block):
 def setup(app):
     app.add_html_math_renderer("mathml", (mathml(False), None), (mathml(True), None))
     app.connect("doctree-resolved", mark_numbers)
+    app.connect("html-page-context", collapse_contents, priority=400)  # before furo's, of 500
     app.connect("autodoc-process-signature", short_arrays)
     app.connect("autodoc-process-docstring", as_rst)
