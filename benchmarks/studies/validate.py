@@ -42,7 +42,7 @@ LEARNED = ("naive_rnn", "deconfounded")
 KEPT = "diagnose/validation"
 FIGURES = (  # of the table
     *("memory_gain", "latent_gain", "exploration_evidence", "expert_evidence", "ratio"),
-    *("dynamics_differ", "stakes", "paired_stakes", "model_deviation"),
+    *("dynamics_differ", "stakes", "paired_stakes", "model_deviation", "model_length"),
 )
 
 

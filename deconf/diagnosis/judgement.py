@@ -23,6 +23,7 @@ from deconfounded.deconf.diagnosis.thresholds import (
     DIFFERS,
     GOOD,
     MAX_MODEL_DEVIATION,
+    MIN_MODEL_LENGTH,
     MISFIT,
     NEGLIGIBLE,
     NO_EVIDENCE,
@@ -142,6 +143,12 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         )
     if in_trials.low <= NO_EVIDENCE:
         return more_exploration("Whether what the world does in expert trials tells what is hidden is not clear.")
+    length = figures["model_length"]
+    if length.value < MIN_MODEL_LENGTH and (naive.low > GOOD or not at_stake):
+        return more_exploration(
+            "In the learned model of your system episodes of the expert itself, given the right latent, are only"
+            f" {length} times as long as in your trials, so that what a clone would lose does not show there."
+        )
     if harmless and gain.low > 0:
         conclusion = (
             "Something is hidden that the expert acts on, but where trials go hardly depends on it: acting on another"

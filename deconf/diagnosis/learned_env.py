@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -110,6 +110,15 @@ def valid_range(expert: Batch) -> tuple[Tensor, Tensor]:
     return low - margin, high + margin
 
 
+class Rollout(NamedTuple):
+    """The last episode of an actor's trials: the mean error of its actions [S], observations after each step
+    [S, N, T, O], and the number of steps [S, N]."""
+
+    error: Tensor
+    paths: Tensor
+    length: Tensor
+
+
 class LearnedEnv:
     """Learned dynamics under the latents [S, N, D] of a reference policy, which also measures errors of actions.
 
@@ -154,8 +163,8 @@ class LearnedEnv:
         return ((action - point).abs().sum(-1) / self.scale).clamp(max=1)
 
     @torch.no_grad()
-    def rollout(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> tuple[Tensor, Tensor]:
-        """The mean action error [S] and the observations [S, N, T, O] of an actor's last episode.
+    def rollout(self, actor: Actor, rngs: Sequence[np.random.Generator]) -> Rollout:
+        """The last episode of an actor's trials.
 
         After an episode leaves the valid range, its errors count as 1. From there on, or after its termination, its
         observations stay as they are.
@@ -166,11 +175,13 @@ class LearnedEnv:
         actor.begin(n, rngs)
         for obs in self.starts:
             alive, left = torch.ones(seeds, n), torch.zeros(seeds, n)
-            total, count, path = torch.zeros(seeds, n), torch.zeros(seeds, n), list[Tensor]()
+            total, count, length = (torch.zeros(seeds, n) for _ in range(3))
+            path = list[Tensor]()
             for _ in range(self.horizon):
                 action = actor.choose(obs)
                 total += alive * self._action_error(obs, action) + left
                 count += alive + left
+                length += alive
                 next_obs = self.reference.next_obs(obs, action, draws)
                 actor.remember(Batch(obs, action, next_obs, alive))  # before clamping, as log_next models it
                 obs = torch.where(alive[..., None] > 0, next_obs.clamp(*self.observed), obs)
@@ -180,4 +191,4 @@ class LearnedEnv:
                 if self.termination is not None:
                     alive = alive * (self.termination.logit(obs) <= 0)
                 path.append(obs)
-        return (total / count).mean(1), torch.stack(path, 2)
+        return Rollout((total / count).mean(1), torch.stack(path, 2), length)

@@ -90,10 +90,11 @@ class Findings(NamedTuple):
     The others are of the last episode of rollouts in the learned dynamics; deviations are relative to chance, 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
     under right latents, in the feature where it is largest. paired_stakes: the same, paired by latent and start.
-    model_deviation: mean deviation of trajectories under right latents from the data's. naive, latent: scores of the
-    naive clone and of posterior sampling, from 0 for a wrong latent to 1 for the right one (`deviation.paired_score`);
-    naive_by_actions, latent_by_actions: by errors of actions, Eq. (1). Without exploration, latent_gain and evidence
-    are None, and the latent explains actions too, Eq. (7).
+    model_deviation: mean deviation of trajectories under right latents from the data's. model_length: mean length of
+    their episodes, over that of the data's. naive, latent: scores of the naive clone and of posterior sampling, from 0
+    for a wrong latent to 1 for the right one (`deviation.paired_score`); naive_by_actions, latent_by_actions: by errors
+    of actions, Eq. (1). Without exploration, latent_gain and evidence are None, and the latent explains actions too,
+    Eq. (7).
 
     Only where a memory gains and dynamics do not differ, others are not None: trait_gain, the gain by a trait of the
     trial that is inferred from the actions of its other half (`trait.py`), and its stakes.
@@ -108,6 +109,7 @@ class Findings(NamedTuple):
     stakes: float
     paired_stakes: float
     model_deviation: float
+    model_length: float
     naive: float
     latent: float
     naive_by_actions: float
@@ -147,7 +149,7 @@ def measure(
         def learned_env(reference: LatentPolicy) -> LearnedEnv:
             return LearnedEnv(reference, episodes, batches, per_trial, horizon, ends)
 
-        rollouts = _rollouts(explanation, learned_env, recurrent, trajectories(episodes), amounts, rngs)
+        rollouts = _rollouts(explanation, learned_env, recurrent, episodes, amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
     findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
@@ -194,7 +196,7 @@ def _trait_stakes(
         for i in (index, draw_distant(candidates, index, draws))
     )
     env = learned_env(right)
-    return stakes_of([env.rollout(actor, rngs)[1][0] for actor in (wrong, right, right, right)])
+    return stakes_of([env.rollout(actor, rngs).paths[0] for actor in (wrong, right, right, right)])
 
 
 def stakes_of(paths: list[Tensor]) -> tuple[float, float]:
@@ -212,11 +214,11 @@ def _rollouts(
     explanation: Explanation,
     learned_env: Callable[[LatentPolicy], LearnedEnv],
     recurrent: LearnedAgent,
-    paths: Tensor,
+    episodes: Batch,
     amounts: Amounts,
     rngs: list[np.random.Generator],
-) -> tuple[float, float, float, float, float, float, float]:
-    """Figures of rollouts: `stakes` and those after it in Findings. paths: trajectories of the data [N, T, O]."""
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Figures of rollouts: `stakes` and those after it in Findings. episodes: the data's [1, N, T]."""
     draws, model, policy = Draws(rngs, "cpu"), explanation.model, explanation.policy
     candidates = take(explanation.latents, draws.integers(explanation.latents.shape[1], amounts.candidates))
     index = draws.integers(amounts.candidates, amounts.rollouts)
@@ -225,15 +227,17 @@ def _rollouts(
     imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(model, policy, candidates)]
     env = learned_env(right)
     rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, right, right]]
-    least, most, *errors = (error for error, _ in rollouts[:4])
+    least, most, *errors = (rollout.error for rollout in rollouts[:4])
     judged = (float(1 - (error - least) / (most - least).clamp(min=0.05)) for error in errors)
-    home, away, *imitated, repeat, second = (path[0] for _, path in rollouts)
+    home, away, *imitated, repeat, second = (rollout.paths[0] for rollout in rollouts)
     stakes, paired_stakes = stakes_of([away, home, repeat, second])
     naive, inferring = (paired_score(path, away, home, (repeat, second)) for path in imitated)
+    paths = trajectories(episodes)
     shuffled = paths[torch.randperm(len(paths), generator=torch.Generator().manual_seed(0))]
     unlike = float(deviation(home, *shuffled.tensor_split(2)).mean())
+    length = float(rollouts[0].length.mean() / episodes.mask.sum(-1).mean())
     naive_by_actions, inferring_by_actions = judged
-    return stakes, paired_stakes, unlike, naive, inferring, naive_by_actions, inferring_by_actions
+    return stakes, paired_stakes, unlike, length, naive, inferring, naive_by_actions, inferring_by_actions
 
 
 def draw_distant(latents: Tensor, index: Tensor, draws: Draws) -> Tensor:

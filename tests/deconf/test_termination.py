@@ -101,8 +101,9 @@ def test_rollouts_end(limit: float, observed: float, steps: int, last: float, er
     make: Any = LearnedEnv
     expert = trial(*range(6))
     env = make(walker, expert, [expert, trial(-1, observed)], 1, 20, model)
-    action_error, path = env.rollout(walker, [np.random.default_rng(0)])
+    action_error, path, length = env.rollout(walker, [np.random.default_rng(0)])
     assert walker.steps == steps
     assert walker.farthest >= min(last + 1, 6)  # the actor's evidence is not clamped
     assert action_error.item() == pytest.approx(error)
+    assert length.tolist() == [[steps] * 3]
     assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]
