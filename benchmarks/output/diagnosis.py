@@ -141,7 +141,7 @@ def _findings(figure: dict[str, Figure]) -> list[tuple[str, str, str]]:
             f"In the learned dynamics, trajectories of an expert policy given a wrong latent deviate {stakes} times as"
             f" much as by chance from those given right latents, and {paired} times as much when paired by latent and"
             f" start; below {STAKES} that may be chance. Trajectories in the learned dynamics deviate from the data's"
-            f" {figure['model_deviation']} times as much as by chance, and episodes are {figure['model_length']} times as"
+            f" {figure['model_deviation']} times as much as by chance, and last {figure['model_length']} times as"
             " long.",
             _bars(deviations, "deviation under a wrong latent, times chance", STAKES),
         )

@@ -5,6 +5,7 @@ DIFFERS = 0.03  # nats a step of evidence, in exploration too, from which on dyn
 UNUSED = 0.25  # share by which a latent from the dynamics may explain more than a memory, which could know as much
 MISFIT = 0.2  # nats a step by which a memory may make a clone worse
 GOOD, SMALL_GAP, NO_LOSS = 0.8, 0.15, 0.97  # scores
+SMALL_COST = 0.25  # a loss that the headline calls small, since it is as large as what splits differ by
 STAKES = 1.5  # times chance
 TRAIT_STAKES, TRAIT_SHARE = 3.0, 0.1  # times chance; of a memory's gain, for a goal that the dynamics do not tell
 MIN_MODEL_LENGTH = (

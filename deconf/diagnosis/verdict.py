@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deconfounded.deconf.diagnosis.advice import HEADLINES, IF_WRONG, Next, Verdict
+from deconfounded.deconf.diagnosis.thresholds import SMALL_COST
 
 
 class Figure(NamedTuple):
@@ -54,7 +55,8 @@ class Diagnosis:
     @property
     def headline(self) -> str:
         """A title."""
-        return HEADLINES[self.verdict]
+        mild = self.tier == 2 and 1 - self.figures["naive"].value < SMALL_COST
+        return HEADLINES[self.verdict] + ", at a small cost" * mild
 
     @property
     def cost(self) -> str:
@@ -69,6 +71,7 @@ class Diagnosis:
             f"In the learned model of your system, a clone with a memory leaves the expert's course by {lost:%} of"
             " what an expert would that acts on a wrong value of what is hidden. A policy that infers it from what the"
             f" world does leaves it by {rest:%}: that is possible in the model, and no promise for a trained agent."
+            " Where the reward hardly depends on the course, less is lost: logs do not hold the reward."
         )
 
     @property

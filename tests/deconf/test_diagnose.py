@@ -248,6 +248,11 @@ class TestJudge:
         with pytest.raises(InputError, match="learning failed: model_deviation is"):
             judge([CLEAR, CLEAR._replace(model_deviation=float("nan"))])
 
+    @pytest.mark.parametrize(("naive", "headline"), [(0.2, "Confounded"), (0.77, "Confounded, at a small cost")])
+    def test_headline(self, naive: float, headline: str) -> None:
+        """It says so if little is lost."""
+        assert judge([CLEAR._replace(naive=naive, latent=1.0)]).headline == headline
+
     def test_figures(self) -> None:
         """The mean over refits, the least, and the most of them."""
         figures = judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5, expert_evidence=0.5)]).figures

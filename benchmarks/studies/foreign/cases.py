@@ -65,13 +65,15 @@ _TIERS = {
     **dict.fromkeys(("mujoco:ArmTrembles", "mujoco:PushedPole", "motor:MotorIntegral"), 1),
     **dict.fromkeys(("lane:LaneHabits", "lane:LaneLate", "reactor:ReactorTwice", "motor:MotorCalm"), 1),
 }
-_LEARNED_FROM = ("reactor:ReactorHeat", "motor:MotorCalm")  # wrong verdicts, by which the diagnosis was changed
+# wrong verdicts, by which the diagnosis was changed, or was tried to be:
+_LEARNED_FROM = ("reactor:ReactorHeat", "motor:MotorCalm", "mujoco:PushedDouble", "lane:LaneBias")
 _ADDED = {  # in their place
     **dict.fromkeys(("mujoco:PushedDouble", "classic:PendulumCalm"), 2),
     **dict.fromkeys(("lane:LaneBias", "classic:PoleLength"), 1),
+    **dict.fromkeys(("mujoco:SlopingRail", "reactor:ReactorCalm"), 2),
 }
 CASES = tuple(
-    Case(reference, tier, reference in _ADDED or (i % 2 == 1 and reference not in _LEARNED_FROM))
+    Case(reference, tier, reference not in _LEARNED_FROM and (reference in _ADDED or i % 2 == 1))
     for i, (reference, tier) in enumerate((_TIERS | _ADDED).items())
 )
 """Every other one is unseen, but for those that were learned from; so are all that were added.

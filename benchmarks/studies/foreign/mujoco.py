@@ -12,6 +12,8 @@ from deconfounded.envs.streams import Array
 
 RADIUS, PUSH, GUST = 0.18, 20.0, 0.15  # m; N; m/s and rad/s a step
 SHOVE, SWAY = 250.0, 0.1  # of the double pendulum: N; m/s and rad/s a step
+SLOPE, SLIP, WEIGHT = 0.15, 0.05, 1.52  # rad; m/s and rad/s a step; of cart and pole, in actions
+FEEDBACK = (0.5, 8.0, 0.8, 1.6)  # of cart and pole, their speeds
 
 
 class ArmTrembles(Arm):
@@ -84,7 +86,40 @@ class PushedPole(World):
         return rng.uniform(-PUSH, PUSH, 1)
 
     def expert(self, obs: Array, theta: Array) -> Array:
-        return np.array([obs @ (0.5, 8.0, 0.8, 1.6)]) - theta / 100  # a motor of gear 100
+        return np.array([obs @ FEEDBACK]) - theta / 100  # a motor of gear 100
+
+
+class Leaning(gymnasium.Wrapper):
+    """A rail that slopes, and gusts on the speeds of all joints, the last columns, after each step."""
+
+    def __init__(self, env: gymnasium.Env, slope: float, gust: float) -> None:
+        super().__init__(env)
+        self.gust = gust
+        model = env.unwrapped.model  # type: ignore[attr-defined]
+        model.opt.gravity[:] = 9.81 * np.sin(slope), 0.0, -9.81 * np.cos(slope)
+
+    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        obs, *rest = self.env.step(action)
+        gust = self.gust * self.np_random.standard_normal(2)
+        self.get_wrapper_attr("data").qvel[:] += gust
+        return obs + np.concatenate([np.zeros(2), gust]), *rest
+
+
+class SlopingRail(World):
+    """theta: the slope [1] of InvertedPendulum-v5's rail in rad, for which the expert leans the pole."""
+
+    noise = 0.02
+    evidence = [2, 3]
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=self.steps, disable_env_checker=True)
+        return Leaning(env, float(theta[0]), SLIP)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(-SLOPE, SLOPE, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return np.array([obs @ FEEDBACK]) + FEEDBACK[1] * theta - WEIGHT * np.sin(theta)
 
 
 class PushedDouble(World):

@@ -46,8 +46,8 @@ class Reactor(gymnasium.Env):
     observation_space = spaces.Box(-np.inf, np.inf, (4,), np.float64)
     action_space = spaces.Box(LEAST, 0.0, (1,), np.float64)
 
-    def __init__(self, heat: float, target: float) -> None:
-        self.target, self.simulator = target, simulator()
+    def __init__(self, heat: float, target: float, gusts: tuple[float, ...] = GUSTS) -> None:
+        self.target, self.gusts, self.simulator = target, gusts, simulator()
         parameters = self.simulator.get_p_template()
         parameters["heat"] = heat
         self.simulator.set_p_fun(lambda time: parameters)
@@ -61,7 +61,7 @@ class Reactor(gymnasium.Env):
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         self.simulator.x0 = self.state
         then = self.simulator.make_step(np.asarray(action, float).reshape(1, 1))[:, 0]
-        self.state = then + self.np_random.normal(0, GUSTS)
+        self.state = then + self.np_random.normal(0, self.gusts)
         return self.state, -abs(self.state[2] - self.target) / 10, False, False, {}
 
 
@@ -79,6 +79,13 @@ class ReactorHeat(World):
 
     def expert(self, obs: Array, theta: Array) -> Array:
         return FORWARD - theta + 100.0 * (TARGET - obs[2:3])
+
+
+class ReactorCalm(ReactorHeat):
+    """The same without gusts: one transition reveals the heat."""
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        return Reactor(float(theta[0]), TARGET, (0.0,) * 4)
 
 
 class ReactorOrder(ReactorHeat):
