@@ -98,7 +98,8 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
                 failed[task.name] = error
                 print(f"{task.name} failed: {error}")
                 continue
-            print(run_report.write(task, about, finished, folders[task.name]))
+            text = run_report.write(task, about, finished, folders[task.name])
+            print(text.rpartition(" -> ")[0] if args.debug else text)  # which keeps no report
     if failed:
         name, reason = next(iter(failed.items()))
         raise envs.InputError(f"{len(failed)} of {len(tasks)} tasks failed; {name}: {reason}")

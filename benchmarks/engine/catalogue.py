@@ -88,7 +88,8 @@ def check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None
     """Raises InputError for a name that is not among those allowed."""
     for name in names:
         if name not in allowed:
-            raise envs.closest(kind, name, list(allowed))
+            own = f"; one of your own is {name}:FUNCTION" if name.endswith(".py") else ""
+            raise envs.closest(kind, name, list(allowed), own)
 
 
 def check(name: str, methods: Sequence[str], seeds: int | None, allowed: Sequence[str]) -> None:

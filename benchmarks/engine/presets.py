@@ -61,6 +61,8 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
     for change in changes:
         key, _, value = change.partition("=")
         method, _, name = key.rpartition(".")
+        if method in METHODS and method not in settings.configs:
+            raise envs.InputError(f"--set had {key}, and method {method!r} has no config; it sets fields of one")
         if method not in ("", *settings.configs):
             raise envs.closest("--set method", method, list(settings.configs))
         values = settings.configs[method] if method else asdict(replace(settings, configs={}))

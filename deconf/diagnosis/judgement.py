@@ -87,7 +87,7 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
         return Diagnosis(verdict, figures, tuple(reasons), tier, advice, conclusion)
 
     def more_exploration(conclusion: str) -> Diagnosis:
-        had = "" if explored is None else f" You have {explored} trials of it."
+        had = "" if explored is None else f" You have {explored} trials of exploration."
         return conclude("cannot tell", None, conclusion + had, EXPLORE_MORE)
 
     if memory.low < -MISFIT:

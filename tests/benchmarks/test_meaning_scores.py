@@ -167,6 +167,17 @@ def test_a_number_in_readme_is_its_method_s() -> None:
             assert float(cell.split()[0]) == pytest.approx(right, abs=0.0051), name
 
 
+def test_the_demo_in_readme_is_of_the_present_version() -> None:
+    """Its rows of deconfounded are what the record of the first seed scores."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    shown = re.findall(r"^(deconfounded\w*) +2 +[\d.]+ +((?:[\d.]+ ){4}[\d.]+)", text, re.M)
+    first = [r for r in records.of_task(ROOT / "docs" / "records", "curling") if r["seed"] == 0]
+    methods = aggregation.gather(first)["methods"]
+    assert {name for name, _ in shown} >= {"deconfounded", "deconfounded_mode"}
+    for name, scores in shown:
+        assert np.array(scores.split(), float) == pytest.approx(methods[name]["score"], abs=0.0051)
+
+
 @pytest.mark.slow
 def test_a_number_in_the_table_of_tasks_is_its_method_s(some: Found) -> None:
     """Each cell is the mean score of the task in its row, of the method over its column: on the page, and made anew."""

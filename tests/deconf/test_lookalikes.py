@@ -107,7 +107,7 @@ def test_tier_3_for_a_goal_that_the_world_does_not_tell() -> None:
 def test_too_little_exploration_is_no_tier_3() -> None:
     diagnosis = diagnosed("wind", explored=24)
     assert diagnosis.tier != 3
-    assert diagnosis.verdict == "confounded" or "You have 24 trials of it" in diagnosis.conclusion
+    assert diagnosis.verdict == "confounded" or "You have 24 trials of exploration" in diagnosis.conclusion
 
 
 def tank(heat: float, lasting: float = 0.0, rough: float = 0.0) -> Trials:
