@@ -66,6 +66,8 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
     (("run", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
     (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
+    (("run", "--task", "bandit", "--set", "random.updates=5"), "method 'random' has no config"),
+    (("run", "--task", "bandit", "--methods", "my.py"), "one of your own is my.py:FUNCTION"),
     (("run", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
     (("certify", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),
     (("performance", "sped"), "did you mean 'speed'?"),
