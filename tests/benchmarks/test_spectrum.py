@@ -127,6 +127,6 @@ def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> 
     assert validate.summary([*seen, *other]).endswith(f" Of cases added later, 3 of 3 {ranked} -1.00.")
     table = validate.table([*seen, *other]).splitlines()
     assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
-    assert table[-1].endswith("| 16.00 |  |  | 8.00 | -8.00 |")
+    assert table[-1].endswith("| 16.00 |  |  |  | 8.00 | -8.00 |")
     validate.picture([*seen, *other], tmp_path / "validation.png")
     assert (tmp_path / "validation.png").read_bytes().startswith(PNG)
