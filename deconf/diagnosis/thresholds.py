@@ -8,7 +8,5 @@ GOOD, SMALL_GAP, NO_LOSS = 0.8, 0.15, 0.97  # scores
 SMALL_COST = 0.25  # a loss that the headline calls small, since it is as large as what splits differ by
 STAKES = 1.5  # times chance
 TRAIT_STAKES, TRAIT_SHARE = 3.0, 0.1  # times chance; of a memory's gain, for a goal that the dynamics do not tell
-MIN_MODEL_LENGTH = (
-    0.5  # of an episode under right latents, over the data's, from which on it is believed that nothing is lost
-)
+MIN_MODEL_LENGTH = 0.5  # of episodes in rollouts, over the data's, from which on it is believed that nothing is lost
 MAX_MODEL_DEVIATION = 4.0  # deviation of rollouts from the data, up to which the absence of stakes is believed

@@ -170,11 +170,11 @@ def test_a_number_in_readme_is_its_method_s() -> None:
 def test_the_demo_in_readme_is_of_the_present_version() -> None:
     """Its rows of deconfounded are what the record of the first seed scores."""
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^(deconfounded\w*) +2 +[\d.]+ +((?:[\d.]+ ){4}[\d.]+)", text, re.M)
+    rows = re.findall(r"^(deconfounded\w*) +2 +[\d.]+ +((?:[\d.]+ ){4}[\d.]+)", text, re.M)
     first = [r for r in records.of_task(ROOT / "docs" / "records", "curling") if r["seed"] == 0]
     methods = aggregation.gather(first)["methods"]
-    assert {name for name, _ in shown} >= {"deconfounded", "deconfounded_mode"}
-    for name, scores in shown:
+    assert {name for name, _ in rows} >= {"deconfounded", "deconfounded_mode"}
+    for name, scores in rows:
         assert np.array(scores.split(), float) == pytest.approx(methods[name]["score"], abs=0.0051)
 
 

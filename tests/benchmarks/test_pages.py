@@ -427,11 +427,11 @@ class TestInABrowser:
         assert [values[name] for name in seen.evaluate(CELLS.format(task))] == [values[name] for name in expected[::-1]]
         seen.evaluate("document.querySelector('#all button[data-key=cpu]').click()")
         cells = "[...document.querySelectorAll('#all tbody tr')].map(row => row.cells[17].textContent)"
-        shown = seen.evaluate(cells)
-        cpu = [float(text) for text in shown if text != "by GPU"]
+        texts = seen.evaluate(cells)
+        cpu = [float(text) for text in texts if text != "by GPU"]
         assert cpu == sorted(cpu, reverse=True)
-        assert "by GPU" not in shown[: len(cpu)]  # which have no CPU seconds, and come last
-        assert len(shown) == len(made["rows"])
+        assert "by GPU" not in texts[: len(cpu)]  # which have no CPU seconds, and come last
+        assert len(texts) == len(made["rows"])
 
     def test_other_figures(self, seen: "Page", made: dict[str, Any], errors: list[str]) -> None:
         """The matrix shows them, with the best first: of regret the least."""

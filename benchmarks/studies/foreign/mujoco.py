@@ -89,22 +89,6 @@ class PushedPole(World):
         return np.array([obs @ FEEDBACK]) - theta / 100  # a motor of gear 100
 
 
-class Leaning(gymnasium.Wrapper):
-    """A rail that slopes, and gusts on the speeds of all joints, the last columns, after each step."""
-
-    def __init__(self, env: gymnasium.Env, slope: float, gust: float) -> None:
-        super().__init__(env)
-        self.gust = gust
-        model = env.unwrapped.model  # type: ignore[attr-defined]
-        model.opt.gravity[:] = 9.81 * np.sin(slope), 0.0, -9.81 * np.cos(slope)
-
-    def step(self, action: Array) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        obs, *rest = self.env.step(action)
-        gust = self.gust * self.np_random.standard_normal(2)
-        self.get_wrapper_attr("data").qvel[:] += gust
-        return obs + np.concatenate([np.zeros(2), gust]), *rest
-
-
 class SlopingRail(World):
     """theta: the slope [1] of InvertedPendulum-v5's rail in rad, for which the expert leans the pole."""
 
@@ -113,7 +97,9 @@ class SlopingRail(World):
 
     def make(self, theta: Array) -> gymnasium.Env:
         env = gymnasium.make("InvertedPendulum-v5", max_episode_steps=self.steps, disable_env_checker=True)
-        return Leaning(env, float(theta[0]), SLIP)
+        model = env.unwrapped.model  # type: ignore[attr-defined]
+        model.opt.gravity[:] = 9.81 * np.sin(theta[0]), 0.0, -9.81 * np.cos(theta[0])
+        return Pushed(env, 0.0, SLIP)
 
     def sample_theta(self, rng: np.random.Generator) -> Array:
         return rng.uniform(-SLOPE, SLOPE, 1)
