@@ -8,7 +8,7 @@ share is chosen without theta, by how well the belief predicts the next observat
 import torch
 
 from deconfounded.deconf.core.data import Batch, Draws, trials_of
-from deconfounded.deconf.core.models import LatentModel
+from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.experts.rollout import Trials
 
 SHARES = 11  # 0, .1, ..., 1

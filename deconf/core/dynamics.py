@@ -64,8 +64,12 @@ class LinearDynamicsHead(DynamicsHead):
         super().__init__(0, width, inputs, draws)
         self.gains = Mlp(inputs.obs_width + inputs.action_width, width, self.signature.obs * latent, draws)
 
+    def parts(self, obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """f [S, ..., O] and g [S, ..., O, D]."""
+        inputs = torch.cat([self.inputs.obs(obs), self.inputs.action(action)], -1)
+        return self.net(inputs), self.gains(inputs).unflatten(-1, (self.signature.obs, -1))
+
     def forward(self, obs: Tensor, action: Tensor, theta_hat: Tensor | None = None) -> Tensor:
         assert theta_hat is not None
-        inputs = torch.cat([self.inputs.obs(obs), self.inputs.action(action)], -1)
-        gains = self.gains(inputs).unflatten(-1, (self.signature.obs, -1))
-        return (self.net(inputs) + (gains * theta_hat[..., None, :]).sum(-1))[..., None, :]
+        expected, gains = self.parts(obs, action)
+        return (expected + (gains * theta_hat[..., None, :]).sum(-1))[..., None, :]

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.deployment import Latents, Way, acted_on
-from deconfounded.deconf.core.models import LatentModel, final_belief, new_model
+from deconfounded.deconf.core.latent_model import LatentModel, final_belief
+from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.nets import ActionHead, Scales
-from deconfounded.deconf.core.online import OnlineBelief, online_belief, reader
+from deconfounded.deconf.core.online import OnlineBelief, online_belief
 from deconfounded.deconf.equations import imitation_loss
 
 
@@ -65,7 +66,7 @@ class DeconfoundedAgent(LearnedAgent):
         """What gives latents, and the belief [S, N, P] given the trial so far."""
         if self.online is None:
             return self.model, self.model.belief(self._memory)
-        return self.online, self.online(reader(self.model), self._memory)
+        return self.online, self.online(self.model, self._memory)
 
     def latent(self) -> Tensor:
         """The theta_hat [S, N, D] for the next action."""
@@ -80,11 +81,11 @@ class DeconfoundedAgent(LearnedAgent):
         self._memory = self.model.update(self._memory, step)
 
     def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
-        """The imitation loss [S] on steps of expert trials; theta_hat_H is drawn from `final_belief`."""
+        """The imitation loss [S] on steps of expert trials; theta_hat_H is that of `final_belief`, by `hindsight`."""
         index = batch.draw_steps(steps, draws)
         pairs = batch.steps(index)
         steps_each = batch.mask.shape[1:].numel() // belief.shape[1]  # of a belief: a trial's, or one
-        theta_hat = self.model.sample(take(belief, index // steps_each), draws)
+        theta_hat = self.model.hindsight(take(belief, index // steps_each), draws)
         with torch.no_grad():
             inputs = self.model.inputs.obs(pairs.obs)
         return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), pairs.action), pairs.mask)

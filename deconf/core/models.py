@@ -5,18 +5,19 @@ dynamics, and exact Bayesian inference over which one it is (footnote 4).
 """
 
 import math
-from abc import ABC, abstractmethod
+from dataclasses import replace
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import DynamicsHead, LinearDynamicsHead
 from deconfounded.deconf.core.gru import GruBelief
-from deconfounded.deconf.core.nets import Inputs, Scales, per_seed, sample_index
+from deconfounded.deconf.core.latent_model import LatentModel
+from deconfounded.deconf.core.linear_model import LinearModel
+from deconfounded.deconf.core.nets import Inputs, Scales, sample_index
 from deconfounded.deconf.equations import belief_update, gaussian_kl, inference_loss, marginal_loss, reparametrise
 from deconfounded.envs.support.errors import InputError
 
@@ -28,72 +29,6 @@ BELIEFS = {
 }
 
 
-class LatentModel(nn.Module, ABC):
-    """A model that infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
-
-    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts.
-    """
-
-    kind: str
-    latent: int
-    width: int
-    inputs: Inputs
-    kept: Tensor
-
-    def __init__(self, draws: Draws) -> None:
-        super().__init__()
-        self.register_buffer("kept", torch.ones(len(draws), device=draws.device))
-
-    def forget(self, memory: Tensor) -> Tensor:
-        """The memory [S, N, M] with which the next episode of a trial begins."""
-        return torch.lerp(self.start(memory.shape[1]), memory, per_seed(self.kept[:, None], memory))
-
-    @abstractmethod
-    def start(self, n: int) -> Tensor:
-        """The memory [S, N, M] of n histories without a transition, for each seed."""
-
-    @abstractmethod
-    def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory after one more transition (step: no time axis); unchanged where its mask is 0."""
-
-    @abstractmethod
-    def final_memory(self, batch: Batch) -> Tensor:
-        """The memory [S, B, M] after whole trials; [S, B T, M], one a step, if the latent may change within."""
-
-    @abstractmethod
-    def belief(self, memory: Tensor) -> Tensor:
-        """[..., M] -> [..., P]."""
-
-    @abstractmethod
-    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
-        """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
-
-    @abstractmethod
-    def mode(self, belief: Tensor) -> Tensor:
-        """The likeliest theta_hat [..., D]."""
-
-    @abstractmethod
-    def mean(self, belief: Tensor) -> Tensor:
-        """The mean [..., D] of theta_hat: of one-hot values their probabilities."""
-
-    @abstractmethod
-    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
-        """log p_psi(s' | s, a, theta_hat) [S, N] of a step (no time axis), under the belief of the memory [S, N, M]."""
-
-    @abstractmethod
-    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """The loss [S] on trials [S, B, T]. steps: how many of them are predicted; None: all."""
-
-    def set_prior(self, belief: Tensor, draws: Draws) -> None:
-        """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
-
-    def learn(self, optimizer: Adam, batch: Batch, steps: int | None, beta: float, draws: Draws) -> float:
-        """One update on `loss`; returns its mean over seeds."""
-        loss = self.loss(batch, steps, beta, draws)
-        optimizer.step(loss)
-        return loss.mean().item()
-
-
 class VariationalModel(LatentModel):
     """The paper's model: a belief is a Gaussian, and Eq. (6) trains q_phi and p_psi together."""
 
@@ -102,6 +37,7 @@ class VariationalModel(LatentModel):
         self.kind, self.latent, self.width = kind, latent, width
         self.encoder: Belief = BELIEFS[kind](latent, width, scales, draws)  # type: ignore[abstract]
         self.inputs = self.encoder.inputs
+        self.read_width = self.encoder.read_width if isinstance(self.encoder, InnovationBelief) else 0
         head = LinearDynamicsHead if self.encoder.linear else DynamicsHead
         self.dynamics = head(latent, width, self.inputs, draws)
 
@@ -111,8 +47,12 @@ class VariationalModel(LatentModel):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return self.encoder.update(memory, step)
 
+    def course(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        memories = self.encoder(batch)
+        return memories, self.encoder.hindsight(batch, memories)
+
     def final_memory(self, batch: Batch) -> Tensor:
-        return self.encoder.hindsight(batch, self.encoder(batch)).flatten(1, 2)
+        return self.course(batch)[1].flatten(1, 2)
 
     def belief(self, memory: Tensor) -> Tensor:
         return torch.cat(self.encoder.posterior(memory), -1)
@@ -121,15 +61,8 @@ class VariationalModel(LatentModel):
         mean, std = belief.chunk(2, -1)
         return reparametrise(mean, std, draws.normal(*mean.shape[1:]))
 
-    def mode(self, belief: Tensor) -> Tensor:
-        return self.mean(belief)
-
     def mean(self, belief: Tensor) -> Tensor:
         return belief.chunk(2, -1)[0]
-
-    def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
-        theta_hat = self.sample(self.belief(memory), draws)
-        return self.dynamics.log_prob(step.obs, step.action, step.next_obs, theta_hat)[..., 0]
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         index = batch.draw_steps(steps, draws)
@@ -139,6 +72,16 @@ class VariationalModel(LatentModel):
         theta_hat = reparametrise(mean, std, draws.normal(*mean.shape[1:]))
         bound = self.negative_elbo(transitions, mean, std, theta_hat, beta)
         return bound + self.innovation_loss(transitions, theta_hat)
+
+    def loss_on_sets(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        half = draws.uniform(*batch.mask.shape[1:]) < 0.5
+        context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
+        belief = self.belief(self.final_memory(context))
+        index = rest.draw_steps(steps, draws)
+        predicted, trial = rest.steps(index), index // batch.mask.shape[2]
+        theta_hat, mean, std = (take(x, trial) for x in (self.sample(belief, draws), *belief.chunk(2, -1)))
+        bound = self.negative_elbo(predicted, mean, std, theta_hat, beta)
+        return bound + self.innovation_loss(predicted, theta_hat)
 
     def innovation_loss(self, steps: Batch, theta_hat: Tensor) -> Tensor:
         """The belief's `innovation_loss` [S], of steps [S, K] under latents [S, K, D].
@@ -163,6 +106,13 @@ class VariationalModel(LatentModel):
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         self.encoder.set_prior(self.sample(belief, draws))
+
+    def read(self, memory: Tensor) -> Tensor:
+        assert isinstance(self.encoder, InnovationBelief)
+        return self.encoder.read(memory)
+
+    def spread(self) -> Tensor:
+        return self.encoder.prior_std
 
 
 class DiscreteModel(LatentModel):
@@ -230,19 +180,14 @@ class DiscreteModel(LatentModel):
 
 
 def new_model(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> LatentModel:
-    """An untrained model: of BELIEFS, or `discrete`. Raises InputError for another kind."""
+    """An untrained model: `linear`, of BELIEFS, or `discrete`. Raises InputError for another kind.
+
+    Of observations that are 0 or 1 `linear` is `evidence`: no change of such a number is normal.
+    """
     if kind == "discrete":
         return DiscreteModel(latent, width, scales, draws)
-    if kind not in BELIEFS:
-        raise InputError(f"model was {kind!r}; it must be one of {', '.join(BELIEFS)}, discrete")
-    return VariationalModel(kind, latent, width, scales, draws)
-
-
-@torch.no_grad()
-def final_belief(model: LatentModel, trials: Batch, part: int = 64) -> Tensor:
-    """Beliefs q_phi(theta_hat_H | tau) after whole trials, [S, B, P]; in parts of so many, to save memory.
-
-    [S, B T, P], one a step, if the latent may change within a trial.
-    """
-    indices = torch.arange(len(trials), device=trials.mask.device).split(part)
-    return torch.cat([model.belief(model.final_memory(trials[:, i])) for i in indices], 1)
+    if kind == "linear" and not scales.signature.binary:
+        return LinearModel(latent, width, scales, draws)
+    if kind not in ("linear", *BELIEFS):
+        raise InputError(f"model was {kind!r}; it must be one of linear, {', '.join(BELIEFS)}, discrete")
+    return VariationalModel("evidence" if kind == "linear" else kind, latent, width, scales, draws)

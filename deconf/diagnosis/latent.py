@@ -3,6 +3,7 @@
 Likelihoods are trimmed means over held-out trials, so that no single one, a fall say, decides.
 """
 
+import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,9 +14,11 @@ from torch import Tensor
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import ramp
-from deconfounded.deconf.core.data import Batch, Draws, Signature, take
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
-from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.latent_model import LatentModel, final_belief
+from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.diagnosis.learned_env import valid_range
@@ -35,7 +38,7 @@ LogProb = Callable[[Batch, Tensor], Tensor]
 
 
 class Explanation(NamedTuple):
-    """A model that infers latents, a policy given latents, and the latents [1, N, D] of the trials of training.
+    """Dynamics and a policy, both given latents, and the latents [1, N, D] of the trials of training.
 
     Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
@@ -43,7 +46,7 @@ class Explanation(NamedTuple):
     expert_evidence: as much of next observations, in exploration and in expert trials.
     """
 
-    model: VariationalModel
+    dynamics: DynamicsHead
     policy: ActionHead
     latents: Tensor
     latent_gain: float | None = None
@@ -56,7 +59,7 @@ def from_expert_trials(trials: Trials, config: OfflineConfig, draws: Draws, moni
     """Explain actions and dynamics of expert trials by one latent, Eq. (7)."""
     data = Batch.of(trials, 1)
     model, _, policy = deconfounded_offline.explain(data, Signature.of(trials), config, draws, monitor)
-    return Explanation(model, policy, model.sample(final_belief(model, data), draws))
+    return Explanation(model.dynamics, policy, model.sample(final_belief(model, data), draws))
 
 
 def from_dynamics(
@@ -79,22 +82,20 @@ def from_dynamics(
     explored, explored_held_out = (in_range(train, x) for x in (explored, explored_held_out))
     scales = Scales(Signature.of(expert[0]), explored, train.action, train.mask)
     model = _train_dynamics(explored, scales, exploring, draws, monitor)
-    _refit_noise(model, explored, draws)
 
-    def log_next(batch: Batch, latent: Tensor) -> Tensor:
-        return model.dynamics.log_prob(batch.obs, batch.action, batch.next_obs, latent)[..., 0]
+    def log_next(head: DynamicsHead) -> LogProb:
+        return lambda x, latent: head.log_prob(x.obs, x.action, x.next_obs, latent)[..., 0]
 
     def log_policy(of: ActionHead) -> LogProb:
         return lambda x, latent: of.log_prob(torch.cat([model.inputs.obs(x.obs), latent], -1), x.action)
 
-    evidence = _evidence(log_next, model, explored_held_out, per_theta, draws)
-    _refit_noise(model, train, draws)
-    belief = _belief(model, train)
+    evidence = _evidence(log_next(_refitted(model, explored, draws)), model, explored_held_out, per_theta, draws)
+    dynamics, belief = _refitted(model, train, draws), _belief(model, train)
     policy, other = (_train_policy(model, train, x, cloning, draws) for x in (belief, belief.roll(per_theta, 1)))
     gain = _gain(log_policy(policy), log_policy(other), model, held_out, draws)
     in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
-    in_trials = _evidence(log_next, model, held_out, per_theta, draws)
-    return Explanation(model, policy, model.sample(belief, draws), gain, in_actions, evidence, in_trials)
+    in_trials = _evidence(log_next(dynamics), model, held_out, per_theta, draws)
+    return Explanation(dynamics, policy, model.mean(belief), gain, in_actions, evidence, in_trials)
 
 
 def typical(x: Tensor, batch: Batch) -> float:
@@ -110,7 +111,7 @@ def odd_steps(batch: Batch) -> Batch:
     return replace(batch, mask=batch.mask * (torch.arange(batch.mask.shape[2]) % 2))
 
 
-def _belief(model: VariationalModel, batch: Batch) -> Tensor:
+def _belief(model: LatentModel, batch: Batch) -> Tensor:
     """Beliefs [1, B, P] about each trial from its even steps: half of them, as in training."""
     return final_belief(model, replace(batch, mask=batch.mask - odd_steps(batch).mask))
 
@@ -122,25 +123,19 @@ def _per_step(batch: Batch, latents: Tensor) -> Tensor:
 
 def _train_dynamics(
     explored: Batch, scales: Scales, config: DeconfoundedConfig, draws: Draws, monitor: Monitor
-) -> VariationalModel:
-    """Eq. (6) on sets: the latent inferred from a random half of a trial's steps predicts the other half.
+) -> LatentModel:
+    """A model trained on sets: the latent inferred from a random half of a trial's steps predicts the other half.
 
     The beginning of a trial and the steps after it, as in deployment, are no such halves: a latent of single episodes
     then encodes the time in the episode, and rollouts that start with it are of no use.
     """
-    model = VariationalModel(config.model, config.latent, config.width, scales, draws)
+    model = new_model(config.model, config.latent, config.width, scales, draws)
     optimizer = Adam([model], config.inference_rate, config.inference_updates)
     for update in range(config.inference_updates):
         batch = explored.draw_trials(config.inference_batch, draws)
         batch = batch[:, :, draws.uniform(batch.mask.shape[2])[0].argsort()].beginnings(update, config.shortest)
-        half = draws.uniform(*batch.mask.shape[1:]) < 0.5
-        context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
-        belief = model.belief(model.final_memory(context))
-        index = rest.draw_steps(config.inference_steps, draws)
-        steps, trial = rest.steps(index), index // batch.mask.shape[2]
-        theta_hat, mean, std = (take(x, trial) for x in (model.sample(belief, draws), *belief.chunk(2, -1)))
         beta = config.beta * ramp(update, config.warm_up * config.inference_updates)
-        loss = model.negative_elbo(steps, mean, std, theta_hat, beta) + model.innovation_loss(steps, theta_hat)
+        loss = model.loss_on_sets(batch, config.inference_steps, beta, draws)
         optimizer.step(loss)
         monitor.update(update + 1, config.inference_updates, {"inference": loss.mean().item()})
     return model
@@ -160,35 +155,36 @@ def in_range(expert: Batch, explored: Batch) -> Batch:
 
 
 @torch.no_grad()
-def _refit_noise(model: VariationalModel, data: Batch, draws: Draws) -> None:
-    """Set the noise to the residuals' size in these trials: falls and the like inflate what training estimates."""
-    head, latents = model.dynamics, _per_step(data, model.sample(_belief(model, data), draws))
+def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
+    """Its dynamics, with noise of the residuals' size in these trials: falls and the like inflate that of training."""
+    head, latents = copy.deepcopy(model.dynamics), _per_step(data, model.mean(_belief(model, data)))
     if not model.inputs.signature.binary:
         residual = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
         variance = masked_mean(residual.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
         head.log_std.copy_(0.5 * variance.clamp(min=1e-12).log())
+    return head
 
 
 @torch.no_grad()
-def _evidence(log_prob: LogProb, model: VariationalModel, data: Batch, per_theta: int, draws: Draws) -> float:
+def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int, draws: Draws) -> float:
     """Log-likelihood of odd steps given the latent of the even ones, less that given the latent of another trial.
 
     Nats a step. The other trial is `per_theta` before.
     """
-    odd, latents = odd_steps(data), model.sample(_belief(model, data), draws)
+    odd, latents = odd_steps(data), model.mean(_belief(model, data))
     own, other = (log_prob(odd, _per_step(odd, x)) for x in (latents, latents.roll(per_theta, 1)))
     return typical(own - other, odd)
 
 
 @torch.no_grad()
-def _gain(log_prob: LogProb, less: LogProb, model: VariationalModel, data: Batch, draws: Draws) -> float:
+def _gain(log_prob: LogProb, less: LogProb, model: LatentModel, data: Batch, draws: Draws) -> float:
     """Log-likelihood of odd steps given the latent of the even ones, less that by another policy; nats a step."""
-    odd, latents = odd_steps(data), _per_step(data, model.sample(_belief(model, data), draws))
+    odd, latents = odd_steps(data), _per_step(data, model.mean(_belief(model, data)))
     return typical(log_prob(odd, latents) - less(odd, latents), odd)
 
 
 def _train_policy(
-    model: VariationalModel, data: Batch, belief: Tensor, config: MemorylessConfig, draws: Draws
+    model: LatentModel, data: Batch, belief: Tensor, config: MemorylessConfig, draws: Draws
 ) -> ActionHead:
     """A policy, cloned given latents of beliefs [1, B, P] about the trials."""
     policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, extent, take
-from deconfounded.deconf.core.models import VariationalModel
+from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.nets import ActionHead, sample_index
 from deconfounded.deconf.core.termination import TerminationModel
 from deconfounded.deconf.equations import belief_update
@@ -27,8 +27,8 @@ class Actor(Protocol):
 class LatentPolicy:
     """The latent-conditional policy, an actor that is given the latents [S, N, D] of its trials, right or wrong."""
 
-    def __init__(self, model: VariationalModel, policy: ActionHead, theta_hat: Tensor) -> None:
-        self.model, self.policy, self.theta_hat = model, policy, theta_hat
+    def __init__(self, dynamics: DynamicsHead, policy: ActionHead, theta_hat: Tensor) -> None:
+        self.dynamics, self.policy, self.theta_hat = dynamics, policy, theta_hat
 
     def begin(self, n: int, rngs: Sequence[np.random.Generator]) -> None:
         """Start trials; there is no memory."""
@@ -36,7 +36,7 @@ class LatentPolicy:
 
     def features(self, obs: Tensor, latent: Tensor) -> Tensor:
         """Features for the policy."""
-        return torch.cat([self.model.inputs.obs(obs), latent], -1)
+        return torch.cat([self.dynamics.inputs.obs(obs), latent], -1)
 
     def choose(self, obs: Tensor) -> Tensor:
         return self.policy.sample(self.features(obs, self.theta_hat), self._draws)
@@ -46,7 +46,7 @@ class LatentPolicy:
 
     def next_obs(self, obs: Tensor, action: Tensor, draws: Draws) -> Tensor:
         """A draw of the next observations [S, N, O], under the latents of the trials."""
-        return self.model.dynamics.sample(obs, action, self.theta_hat, draws)
+        return self.dynamics.sample(obs, action, self.theta_hat, draws)
 
     def point(self, obs: Tensor, latent: Tensor) -> Tensor:
         """The mean action [..., A], or log-probabilities of discrete actions."""
@@ -69,7 +69,7 @@ class PosteriorSampler(LatentPolicy):
         shape = (*step.mask.shape, self.theta_hat.shape[1])
         latent = self.theta_hat.reshape(len(self.theta_hat), *[1] * (step.mask.dim() - 1), *self.theta_hat.shape[1:])
         obs, action, next_obs = (x[..., None, :].expand(*shape, -1) for x in step.tensors[:3])
-        return self.model.dynamics.log_prob(obs, action, next_obs, latent.expand(*shape, -1))[..., 0]
+        return self.dynamics.log_prob(obs, action, next_obs, latent.expand(*shape, -1))[..., 0]
 
     def choose(self, obs: Tensor) -> Tensor:
         latent = take(self.theta_hat, sample_index(self.log_belief.exp(), self._draws))

@@ -190,9 +190,9 @@ def _trait_stakes(
     draws, count = Draws(rngs, "cpu"), amounts.rollouts
     candidates = take(of_trial.traits, draws.integers(of_trial.traits.shape[1], amounts.candidates))
     index = draws.integers(amounts.candidates, count)
-    dynamics = take(explanation.latents, draws.integers(explanation.latents.shape[1], count))
+    latents = take(explanation.latents, draws.integers(explanation.latents.shape[1], count))
     right, wrong = (
-        TraitPolicy(explanation.model, of_trial.policy, dynamics, take(candidates, i))
+        TraitPolicy(explanation.dynamics, of_trial.policy, latents, take(candidates, i))
         for i in (index, draw_distant(candidates, index, draws))
     )
     env = learned_env(right)
@@ -219,12 +219,12 @@ def _rollouts(
     rngs: list[np.random.Generator],
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Figures of rollouts: `stakes` and those after it in Findings. episodes: the data's [1, N, T]."""
-    draws, model, policy = Draws(rngs, "cpu"), explanation.model, explanation.policy
+    draws, dynamics, policy = Draws(rngs, "cpu"), explanation.dynamics, explanation.policy
     candidates = take(explanation.latents, draws.integers(explanation.latents.shape[1], amounts.candidates))
     index = draws.integers(amounts.candidates, amounts.rollouts)
-    right = LatentPolicy(model, policy, take(candidates, index))
-    wrong = LatentPolicy(model, policy, take(candidates, draw_distant(candidates, index, draws)))
-    imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(model, policy, candidates)]
+    right = LatentPolicy(dynamics, policy, take(candidates, index))
+    wrong = LatentPolicy(dynamics, policy, take(candidates, draw_distant(candidates, index, draws)))
+    imitators: list[Actor] = [AgentActor(recurrent), PosteriorSampler(dynamics, policy, candidates)]
     env = learned_env(right)
     rollouts = [env.rollout(actor, rngs) for actor in [right, wrong, *imitators, right, right]]
     least, most, *errors = (rollout.error for rollout in rollouts[:4])

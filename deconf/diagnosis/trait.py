@@ -12,8 +12,8 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
+from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.layers import Mlp
-from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
 from deconfounded.deconf.diagnosis.latent import typical
 from deconfounded.deconf.diagnosis.learned_env import LatentPolicy
@@ -107,11 +107,11 @@ def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessC
 class TraitPolicy(LatentPolicy):
     """A policy given traits [S, N, TRAIT], in dynamics under latents [S, N, D]; theta_hat holds both."""
 
-    def __init__(self, model: VariationalModel, policy: ActionHead, latent: Tensor, trait: Tensor) -> None:
-        super().__init__(model, policy, torch.cat([latent, trait], -1))
+    def __init__(self, dynamics: DynamicsHead, policy: ActionHead, latent: Tensor, trait: Tensor) -> None:
+        super().__init__(dynamics, policy, torch.cat([latent, trait], -1))
 
     def features(self, obs: Tensor, latent: Tensor) -> Tensor:
-        return torch.cat([self.model.inputs.scales.obs(obs), latent[..., -TRAIT:]], -1)
+        return torch.cat([self.dynamics.inputs.scales.obs(obs), latent[..., -TRAIT:]], -1)
 
     def next_obs(self, obs: Tensor, action: Tensor, draws: Draws) -> Tensor:
-        return self.model.dynamics.sample(obs, action, self.theta_hat[..., :-TRAIT], draws)
+        return self.dynamics.sample(obs, action, self.theta_hat[..., :-TRAIT], draws)

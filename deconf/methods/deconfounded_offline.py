@@ -17,10 +17,11 @@ from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
-from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.latent_model import final_belief
+from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
-from deconfounded.deconf.core.online import OnlineBelief, reader
+from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
@@ -103,7 +104,7 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     online.encoder.set_prior(latents)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
     synthesis = Synthesis(online, policy, latents, data, starts, trials.mask.shape[2], config.random_share, draws)
-    in_course = OnlineBelief(reader(online), config.width, draws)
+    in_course = OnlineBelief(online, config.width, draws)
     agent = DeconfoundedAgent(online, policy, in_course)
     total = config.offline_updates + config.online_updates
     optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)

@@ -11,8 +11,9 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent, Explorer
+from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.layers import Linear
-from deconfounded.deconf.core.models import LatentModel, VariationalModel, new_model
+from deconfounded.deconf.core.models import VariationalModel, new_model
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
@@ -98,7 +99,7 @@ def losses(batch: Batch) -> dict[str, Loss]:
         "dagger": lambda given: dagger.loss(given, given.action, None, draws()),
         "rma": lambda given: student.loss(given, given.action, adapter.start(4))[0],
     }
-    for kind in ("innovations", "evidence", "gru", "discrete"):
+    for kind in ("linear", "innovations", "evidence", "gru", "discrete"):
         model = new_model(kind, 3, 16, scales, draws()).eval()
         agent = DeconfoundedAgent.new(kind, 3, 16, scales, draws())
         belief = agent.model.belief(agent.model.final_memory(batch)).detach()
@@ -223,7 +224,7 @@ def trained(data: Batch, latent: int, updates: int, rng: np.random.Generator, ki
     return model
 
 
-@pytest.mark.parametrize(("kind", "least"), [("evidence", 0.45), ("innovations", 0.6)])
+@pytest.mark.parametrize(("kind", "least"), [("evidence", 0.45), ("innovations", 0.6), ("linear", 0.6)])
 def test_a_small_effect_is_learned_beside_large_ones(kind: str, least: float) -> None:
     """Of two loads, small beside the noise, the belief knows most after 60 steps, on trials it has not seen.
 

@@ -9,7 +9,8 @@ from deconfounded.deconf.core import online
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
-from deconfounded.deconf.core.models import VariationalModel, final_belief
+from deconfounded.deconf.core.latent_model import final_belief
+from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
 
@@ -84,16 +85,16 @@ def test_effects_are_linear_in_the_latent(model: tuple[VariationalModel, Batch])
 
 def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch]) -> None:
     made, data = model
-    belief = OnlineBelief(made.encoder, 16, streams())
+    belief = OnlineBelief(made, 16, streams())
     memory = made.encoder(data)
-    torch.testing.assert_close(belief.mean(belief(made.encoder, memory)), made.encoder.posterior(memory)[0])
+    torch.testing.assert_close(belief.mean(belief(made, memory)), made.encoder.posterior(memory)[0])
 
 
 def test_samples_are_of_the_density() -> None:
     """Of latents that depend on each other: mean, covariance and entropy as of the Gaussian that is given."""
     data = pushed(2, np.random.default_rng(0))
-    encoder = InnovationBelief(3, 16, Scales.of(Signature(1, 1, 0, False), data), streams())
-    belief = OnlineBelief(encoder, 16, streams())
+    made = VariationalModel("innovations", 3, 16, Scales.of(Signature(1, 1, 0, False), data), streams())
+    belief = OnlineBelief(made, 16, streams())
     belief.unit.copy_(torch.tensor([[1.0, 2.0, 0.5]]))
     mean, std, lower = [0.3, -1.0, 2.0], [0.5, 0.1, 0.02], [-0.9, 2.0, -3.0]
     given = torch.tensor([*mean, *std, *lower])[None, None].expand(1, 20_000, -1)
@@ -112,14 +113,14 @@ def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[V
     The two dimensions of the latent depend on each other, since theta has one, and so do samples.
     """
     made, data = model
-    belief = OnlineBelief(made.encoder, 32, streams())
+    belief = OnlineBelief(made, 32, streams())
     belief.fit(made, data, 400, streams())
     fresh = pushed(400, np.random.default_rng(1))
     with torch.no_grad():
         memory = made.encoder(fresh)
         final = made.encoder.posterior(memory[:, :, -1])[0]
         for t in (0, 2, 6, 12):
-            given = belief(made.encoder, memory[:, :, t])
+            given = belief(made, memory[:, :, t])
             mean, drawn = belief.mean(given), belief.sample(given, streams())
             own_mean, own_std = made.encoder.posterior(memory[:, :, t])
             own_apart = ((own_mean - final) / own_std).square().mean()

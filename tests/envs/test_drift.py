@@ -9,7 +9,7 @@ from deconfounded import envs
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.drift import choose_kept
-from deconfounded.deconf.core.models import LatentModel
+from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.streams import Array

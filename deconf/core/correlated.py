@@ -1,0 +1,73 @@
+"""Gaussians over latents whose dimensions are correlated, as parameters that a network gives."""
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.data import Draws
+
+LEAST = 0.05  # least conditional std
+
+
+class Correlated:
+    """Gaussians over theta_hat [D], each by its parameters [P]: mean [D], stds s [D] and A [D (D - 1) / 2].
+
+    A is strictly lower triangular, and (1 + A) (theta_hat - mean) is normal with independent stds s: the modified
+    Cholesky decomposition (Pourahmadi, 1999). Latents of different thetas lie near a surface in the latent space, which
+    samples with independent dimensions would leave.
+    """
+
+    def __init__(self, latent: int) -> None:
+        self.latent, self.width = latent, 2 * latent + latent * (latent - 1) // 2
+
+    def about(self, mean: Tensor, raw: Tensor) -> Tensor:
+        """Parameters [..., P] by a network's output [..., P], zeros before training: what is added to the mean, stds
+        before a softplus, A."""
+        added, std, lower = self.split(raw)
+        return torch.cat([mean + added, F.softplus(std) + LEAST, lower], -1)
+
+    def split(self, belief: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, stds and A."""
+        d = self.latent
+        return belief[..., :d], belief[..., d : 2 * d], belief[..., 2 * d :]
+
+    def triangle(self, lower: Tensor) -> Tensor:
+        """1 + A [..., D, D]."""
+        d = self.latent
+        row, column = torch.tril_indices(d, d, -1, device=lower.device)
+        matrix = torch.eye(d, device=lower.device).expand(*lower.shape[:-1], d, d).clone()
+        matrix[..., row, column] = lower
+        return matrix
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
+        mean, std, lower = self.split(belief)
+        noise = (std * draws.normal(*mean.shape[1:]))[..., None]
+        drawn = torch.linalg.solve_triangular(self.triangle(lower), noise, upper=False, unitriangular=True)
+        return mean + drawn[..., 0]
+
+    def log_mean(self, belief: Tensor, precision: Tensor, weighted: Tensor) -> Tensor:
+        """log E exp(b theta_hat - theta_hat P theta_hat / 2) [...], in closed form, of P [..., D, D] and b [..., D].
+
+        That is what a belief makes of evidence that is quadratic in theta_hat; both in double precision.
+        """
+        mean, std, lower = self.split(belief)
+        root = torch.linalg.solve_triangular(  # theta_hat = mean + root e, e normal
+            self.triangle(lower).double(), torch.diag_embed(std.double()), upper=False, unitriangular=True
+        )
+        column = mean.double()[..., None]
+        slope = weighted[..., None] - precision @ column
+        at_mean = ((weighted[..., None] + slope) * column).sum((-1, -2)) / 2
+        return (at_mean + log_integral(root.mT @ precision @ root, root.mT @ slope)).float()
+
+
+def log_integral(precision: Tensor, weighted: Tensor) -> Tensor:
+    """log E exp(b e - e P e / 2) [...] of a standard normal e [D]: P [..., D, D], b [..., D, 1]."""
+    lower = posterior_root(precision)
+    half = torch.linalg.solve_triangular(lower, weighted, upper=False)
+    return half.square().sum((-1, -2)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+
+
+def posterior_root(precision: Tensor) -> Tensor:
+    """The Cholesky factor [..., D, D] of 1 + P: of the precision of a posterior whose prior is a standard normal."""
+    return torch.linalg.cholesky(precision + torch.eye(precision.shape[-1], dtype=precision.dtype).to(precision.device))

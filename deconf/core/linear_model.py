@@ -1,0 +1,137 @@
+"""A model whose dynamics are linear in theta_hat: evidence adds up, and likelihoods are exact (`LinearModel`)."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from deconfounded.deconf.core.correlated import Correlated, log_integral, posterior_root
+from deconfounded.deconf.core.data import Batch, Draws, take
+from deconfounded.deconf.core.dynamics import LinearDynamicsHead
+from deconfounded.deconf.core.latent_model import LatentModel
+from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.nets import Inputs, Scales, per_seed
+
+READ = 256  # memories an update, from each of which the evidence that follows is predicted
+HALVES = 8  # of a trial an update, from each of which the evidence of the other half is predicted
+ALIKE = 40  # steps in whose sum the error of f, alike in all of them, is as large as the noise
+
+
+class LinearModel(LatentModel):
+    """Bayesian linear regression on learned features (ALPaCA; Harrison, Sharma and Pavone, 2018), and a belief of it.
+
+    Dynamics are s' - s = f(s, a) + G(s, a) theta_hat + noise, and p(theta_hat) is a standard normal. What a trial tells
+    of theta_hat is then b theta_hat - theta_hat P theta_hat / 2, with sums over its steps, P of G' G and b of G' (s' -
+    s - f), in units of the noise: they are the memory. f, G and the noise maximise the likelihood of whole trials, in
+    which theta_hat is integrated out: Eq. (6) with the exact posterior in place of q_phi, so that the bound is tight,
+    and beta 1. With a drawn latent of a network in its place, whose error makes G too small, f learns theta's effect
+    wherever the state tells of theta, as it does if a controller that is wrong about theta drifts to one side.
+
+    The posterior of this regression is not the belief. f is never exact; its errors add up over a trial, depend on
+    where the behaviour goes, and the latents of an expert's trials are then not those of an agent's. And latents of
+    different thetas lie near a surface, not all over the prior. So the belief is a Gaussian with covariance that a
+    network makes of the posterior's mean and stds. It is trained to predict, in closed form, the evidence of the steps
+    that follow. In a sum of n steps an error of f that is alike in all of them has n / ALIKE of the noise's variance,
+    so that this evidence is tempered. Policies are cloned on the mean given whole trials: its uncertainty is of what f
+    does not explain, not of theta. What beginnings of a trial tell of that mean is for a second network (`online.py`).
+    """
+
+    kind = "linear"
+    stds: Tensor
+
+    def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
+        super().__init__(draws)
+        self.latent, self.width, self.inputs = latent, width, Inputs(scales)
+        self.dynamics: LinearDynamicsHead = LinearDynamicsHead(latent, width, self.inputs, draws)
+        self.gaussian, self.read_width = Correlated(latent), 2 * latent + 1
+        self.register_buffer("stds", torch.ones(len(draws), latent, device=draws.device))
+        self.reader = Mlp(self.read_width, width, self.gaussian.width, draws)
+        for parameter in self.reader[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def _terms(self, batch: Batch) -> Tensor:
+        """Increments of the memory [..., M], one a transition: products of (G, s' - s - f), and a count of 1."""
+        expected, gains = self.dynamics.parts(batch.obs, batch.action)
+        innovation = self.dynamics.change(batch.next_obs - batch.obs) - expected
+        weight = batch.mask[..., None] / per_seed(self.dynamics.log_std.exp(), expected)
+        both = torch.cat([gains, innovation[..., None]], -1) * weight[..., None]
+        return torch.cat([products(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
+
+    def _sums(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """P [..., D, D], b [..., D] and the squares of innovations [...], in double precision."""
+        sums = memory[..., :-1].double().unflatten(-1, (self.latent + 1, -1))
+        return sums[..., :-1, :-1], sums[..., :-1, -1], sums[..., -1, -1]
+
+    def start(self, n: int) -> Tensor:
+        return self.kept.new_zeros(len(self.kept), n, (self.latent + 1) ** 2 + 1)
+
+    def update(self, memory: Tensor, step: Batch) -> Tensor:
+        return memory + self._terms(step)
+
+    def course(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        memories = F.pad(self._terms(batch).cumsum(2), (0, 0, 1, 0))
+        return memories, memories[:, :, -1:]
+
+    def final_memory(self, batch: Batch) -> Tensor:
+        return self._terms(batch).sum(2)
+
+    @torch.no_grad()
+    def read(self, memory: Tensor) -> Tensor:
+        """Mean and logarithmic stds of the posterior, and the logarithm of the count."""
+        precision, weighted, _ = self._sums(memory)
+        lower = posterior_root(precision)
+        mean = torch.cholesky_solve(weighted[..., None], lower)[..., 0].float()
+        std = torch.cholesky_inverse(lower).diagonal(dim1=-2, dim2=-1).sqrt().float()
+        return torch.cat([mean, std.log(), (1 + memory[..., -1:]).log() - 2], -1)
+
+    def belief(self, memory: Tensor) -> Tensor:
+        read = self.read(memory)
+        return self.gaussian.about(read[..., : self.latent], self.reader(read))
+
+    def hindsight(self, belief: Tensor, draws: Draws) -> Tensor:
+        return self.mean(belief)
+
+    def set_prior(self, belief: Tensor, draws: Draws) -> None:
+        self.stds.copy_(self.mean(belief).std(1, correction=0).clamp(min=0.05))
+
+    def spread(self) -> Tensor:
+        return self.stds
+
+    def sample(self, belief: Tensor, draws: Draws) -> Tensor:
+        return self.gaussian.sample(belief, draws)
+
+    def mean(self, belief: Tensor) -> Tensor:
+        return self.gaussian.split(belief)[0]
+
+    def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        terms = self._terms(batch)
+        with torch.no_grad():
+            sums = terms.cumsum(2)
+            index = batch.draw_steps(READ, draws)
+            before = take((sums - terms).flatten(1, 2), index)
+            after = take(sums[:, :, -1], index // terms.shape[2]) - before
+        return self.surprise(terms.sum(2)) + self.prediction_loss(before, after)
+
+    def loss_on_sets(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        terms = self._terms(batch)
+        with torch.no_grad():
+            half = (draws.uniform(len(batch), HALVES, terms.shape[2]) < 0.5).float()
+            before, after = products(half, terms), products(1 - half, terms)
+        return self.surprise(terms.sum(2)) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
+
+    def surprise(self, memory: Tensor) -> Tensor:
+        """-log p [S] of trials with memories [S, B, M], theta_hat integrated out; a step, but for a constant."""
+        precision, weighted, squares = self._sums(memory)
+        total = squares / 2 - log_integral(precision, weighted[..., None])
+        return (total.sum(-1) / memory[..., -1].sum(-1).clamp(min=1)).float() + self.dynamics.log_std.sum(-1)
+
+    def prediction_loss(self, before: Tensor, after: Tensor) -> Tensor:
+        """-log p [S] of the evidence in memories `after` under the beliefs of `before`, both [S, N, M]; a step."""
+        after = after / (1 + after[..., -1:] / ALIKE)
+        precision, weighted, _ = self._sums(after)
+        log_likelihood = self.gaussian.log_mean(self.belief(before), precision, weighted)
+        return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M]: seed by seed, since a larger stack rounds otherwise."""
+    return torch.cat([*map(torch.matmul, a.split(1), b.split(1))])

@@ -1,0 +1,147 @@
+"""A model whose dynamics are linear in the latent: likelihoods in closed form, and what it learns of a ball."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.distributions import MultivariateNormal
+
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.correlated import Correlated
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.latent_model import final_belief
+from deconfounded.deconf.core.linear_model import LinearModel
+from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.online import OnlineBelief
+
+STEPS = 24
+
+
+def streams(seeds: int = 1) -> Draws:
+    return Draws([np.random.default_rng(i) for i in range(seeds)], "cpu")
+
+
+def pushed(n: int, rng: np.random.Generator) -> tuple[Batch, Tensor]:
+    """A hidden force theta ~ N(0, 1) on a ball, noise of std 1, and a weak controller that takes it for another's.
+
+    Where the ball is tells of theta: after some steps it lies at about twice theta less the force assumed.
+    """
+    theta, assumed, place = rng.normal(size=n), rng.normal(size=n), np.zeros(n)
+    seen, actions = [place], []
+    for _ in range(STEPS):
+        actions.append(-0.5 * place - assumed + 0.1 * rng.normal(size=n))
+        place = place + actions[-1] + theta + rng.normal(size=n)
+        seen.append(place)
+    obs, action = (torch.tensor(np.stack(x, 1)[..., None], dtype=torch.float32)[None] for x in (seen, actions))
+    batch = Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, STEPS))
+    return batch, torch.tensor(theta, dtype=torch.float32)
+
+
+def untrained(latent: int, data: Batch) -> LinearModel:
+    return LinearModel(latent, 32, Scales.of(Signature(1, 1, 0, False), data), streams())
+
+
+@pytest.fixture(scope="module")
+def trained() -> LinearModel:
+    data, _ = pushed(256, np.random.default_rng(0))
+    model, draws = untrained(2, data), streams()
+    optimizer = Adam([model], 1e-2, 600)
+    for update in range(600):
+        model.learn(optimizer, data.beginnings(update, 0.1).draw_trials(32, draws), None, 0.0, draws)
+    return model.eval()
+
+
+def test_likelihood_of_a_trial() -> None:
+    """Its changes are jointly normal, with covariance of noise and of G G': half of each trial's steps are missing."""
+    data, _ = pushed(3, np.random.default_rng(1))
+    data.mask[:, :, ::2] = 0
+    model = untrained(2, data)
+    with torch.no_grad():
+        model.dynamics.log_std.fill_(-0.3)
+        expected, gains = model.dynamics.parts(data.obs, data.action)
+        innovation = model.dynamics.change(data.next_obs - data.obs) - expected
+        covariance = gains[0, :, 1::2, 0] @ gains[0, :, 1::2, 0].mT + np.exp(-0.6) * torch.eye(STEPS // 2)
+        likelihood = MultivariateNormal(torch.zeros(STEPS // 2), covariance).log_prob(innovation[0, :, 1::2, 0])
+        constant = 0.5 * np.log(2 * np.pi)
+        surprise = model.surprise(model.final_memory(data))
+    assert surprise.item() == pytest.approx(-likelihood.sum().item() / (3 * STEPS / 2) - constant, rel=1e-4)
+
+
+def test_mean_of_evidence_under_a_belief() -> None:
+    """Against 400,000 samples, to five standard errors."""
+    gaussian, draws = Correlated(2), streams()
+    belief = torch.tensor([[0.3, -0.2, 0.5, 0.4, 0.7]])[None]
+    precision = torch.tensor([[2.0, 0.5], [0.5, 1.0]], dtype=torch.float64)
+    weighted = torch.tensor([0.8, -0.4], dtype=torch.float64)
+    drawn = gaussian.sample(belief.expand(1, 400_000, -1), draws)[0].double()
+    likelihood = (drawn @ weighted - ((drawn @ precision) * drawn).sum(-1) / 2).exp()
+    exact = gaussian.log_mean(belief, precision[None, None], weighted[None, None]).exp().item()
+    assert exact == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
+
+
+def test_memory_adds_up() -> None:
+    """Step by step it is that of the whole trial; steps that did not take place leave it as it is."""
+    data, _ = pushed(5, np.random.default_rng(1))
+    data.mask[:, 2:, STEPS // 2 :] = 0
+    model = untrained(3, data).eval()
+    memory = model.start(5)
+    for t in range(STEPS):
+        memory = model.update(memory, data[:, :, t])
+    torch.testing.assert_close(memory, model.final_memory(data), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(memory[:, 2:], model.final_memory(data[:, 2:, : STEPS // 2]), rtol=1e-4, atol=1e-4)
+
+
+def test_the_action_does_not_stand_in_for_theta(trained: LinearModel) -> None:
+    """Exploration pushes the ball against theta, so that a regression on place and action finds a quarter of a push.
+
+    f has the push that an action gives, 1, and G has theta's.
+    """
+    data, _ = pushed(4096, np.random.default_rng(2))
+    last = torch.cat([data.obs, data.action], -1)[0, :, -8:].flatten(0, 1)
+    change = (data.next_obs - data.obs)[0, :, -8:].flatten(0, 1)
+    assert torch.linalg.lstsq(last, change).solution[1].item() < 0.4
+    actions = torch.linspace(-2, 2, 5)[None, :, None]
+    with torch.no_grad():
+        expected, gains = trained.dynamics.parts(torch.zeros_like(actions), actions)
+    f = trained.dynamics.change.inverse(expected)[0, :, 0]
+    assert ((f[-1] - f[0]) / 4).item() == pytest.approx(1, abs=0.15)
+    size = (gains.square().sum(-1).sqrt() * trained.dynamics.change.std)[0, :, 0]
+    assert size.numpy() == pytest.approx(1, abs=0.3)
+
+
+def test_belief_is_the_posterior(trained: LinearModel) -> None:
+    """On fresh trials its mean is as near theta as that of the exact posterior, by a linear map of the latents.
+
+    After t steps that is t / (t + 1) times the mean innovation. The belief in the course of a trial is as far from the
+    latent of the whole as the posterior is, whose variance falls by 1 / (t + 1) - 1 / (STEPS + 1).
+    """
+    (data, _), (fresh, theta) = (pushed(n, np.random.default_rng(n)) for n in (256, 2048))
+    online = OnlineBelief(trained, 32, streams())
+    trained.set_prior(final_belief(trained, data), streams())
+    online.fit(trained, data, 300, streams())
+    innovation = (fresh.next_obs - fresh.obs - fresh.action)[0, ..., 0]
+    with torch.no_grad():
+        whole = trained.hindsight(final_belief(trained, fresh), streams())[0]
+        weights = torch.linalg.lstsq(whole, theta[:, None]).solution
+        assert ((whole @ weights)[:, 0] - theta).square().mean() < 1.5 / (STEPS + 1)
+        for t in (4, 12):
+            memory = trained.final_memory(fresh[:, :, :t])
+            exact = innovation[:, :t].sum(1) / (t + 1)
+            least = (exact - theta).square().mean()
+            own = (trained.mean(trained.belief(memory))[0] @ weights)[:, 0]
+            assert (own - theta).square().mean() < 1.25 * least + 0.01
+            belief = online(trained, memory)
+            drawn, mean = ((x[0] @ weights)[:, 0] for x in (online.sample(belief, streams()), online.mean(belief)))
+            assert (mean - theta).square().mean() < 1.25 * least + 0.01
+            learned = 1 / (t + 1) - 1 / (STEPS + 1)
+            assert (drawn - mean).square().mean().item() == pytest.approx(learned, rel=0.5)
+
+
+def test_sets_and_beginnings_have_the_same_likelihood() -> None:
+    """What a trial tells does not depend on the order of its steps; only the beliefs that are trained differ."""
+    data, _ = pushed(6, np.random.default_rng(4))
+    model = untrained(2, data)
+    with torch.no_grad():
+        model.prediction_loss = lambda before, after: torch.zeros(1)  # type: ignore[method-assign]
+        of_course, of_sets = (loss(data, None, 0.0, streams()) for loss in (model.loss, model.loss_on_sets))
+    torch.testing.assert_close(of_course, of_sets)
