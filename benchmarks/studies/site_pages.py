@@ -36,6 +36,7 @@ MODULES = {  # of the API reference
         *("deconfounded.deconf.method", "deconfounded.deconf.given", "deconfounded.deconf.equations"),
         *("deconfounded.deconf.exact", "deconfounded.deconf.learned_reference", "deconfounded.deconf.core.data"),
         *("deconfounded.deconf.core.agents", "deconfounded.deconf.core.beliefs", "deconfounded.deconf.core.models"),
+        *("deconfounded.deconf.core.latent_model", "deconfounded.deconf.core.linear_model"),
         *("deconfounded.deconf.core.nets", "deconfounded.deconf.core.monitor", "deconfounded.deconf.methods"),
     ),
     "Methods": tuple(
