@@ -7,6 +7,7 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.data import Draws
 
 LEAST = 0.05  # least conditional std
+ROUNDING = 1e-5  # of sums in single precision, relative to the largest
 
 
 class Correlated:
@@ -69,5 +70,13 @@ def log_integral(precision: Tensor, weighted: Tensor) -> Tensor:
 
 
 def posterior_root(precision: Tensor) -> Tensor:
-    """The Cholesky factor [..., D, D] of 1 + P: of the precision of a posterior whose prior is a standard normal."""
-    return torch.linalg.cholesky(precision + torch.eye(precision.shape[-1], dtype=precision.dtype).to(precision.device))
+    """The Cholesky factor [..., D, D] of 1 + P: of the precision of a posterior whose prior is a standard normal.
+
+    P is a sum in single precision; where evidence is so strong that its rounding exceeds the prior, that is added.
+    """
+    unit = torch.eye(precision.shape[-1], dtype=precision.dtype, device=precision.device)
+    lower, failed = torch.linalg.cholesky_ex(precision + unit)
+    if failed.any():
+        rounding = ROUNDING * precision.diagonal(dim1=-2, dim2=-1).sum(-1)
+        lower = torch.linalg.cholesky(precision + (1 + rounding[..., None, None]) * unit)
+    return lower  # type: ignore[no-any-return]

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.correlated import Correlated
+from deconfounded.deconf.core.correlated import Correlated, posterior_root
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.linear_model import LinearModel
@@ -145,3 +145,30 @@ def test_sets_and_beginnings_have_the_same_likelihood() -> None:
         model.prediction_loss = lambda before, after: torch.zeros(1)  # type: ignore[method-assign]
         of_course, of_sets = (loss(data, None, 0.0, streams()) for loss in (model.loss, model.loss_on_sets))
     torch.testing.assert_close(of_course, of_sets)
+
+
+def test_evidence_without_noise() -> None:
+    """Of a simulator without noise P grows until single precision cannot hold the prior beside it: beliefs stay finite."""
+    data, theta = pushed(64, np.random.default_rng(5))
+    data = Batch(data.obs, data.action, data.obs + data.action + theta[None, :, None, None], data.mask)
+    model, draws = untrained(2, data), streams()
+    with torch.no_grad():
+        model.dynamics.log_std.fill_(-12)
+    optimizer = Adam([model], 1e-2, 30)
+    for _ in range(30):
+        model.learn(optimizer, data, None, 0.0, draws)
+    with torch.no_grad():
+        precision = model._sums(model.final_memory(data))[0]
+        assert precision.max() > 1e8
+        belief = model.belief(model.final_memory(data))
+    assert torch.isfinite(belief).all()
+
+
+def test_a_posterior_of_rounded_sums() -> None:
+    """1 + P is not positive definite any more where P is rounded: its root is that of a matrix nearby."""
+    direction = torch.tensor([1.0, 0.7, -0.3])
+    precision = (1e9 * torch.outer(direction, direction)).double()
+    precision[0, 1] = precision[1, 0] = precision[0, 1] * (1 + 1e-7)
+    assert torch.linalg.cholesky_ex(precision + torch.eye(3)).info > 0
+    root = posterior_root(precision)
+    assert (root @ root.T - precision).abs().max() < 1e-4 * precision.max()
