@@ -148,7 +148,7 @@ def test_sets_and_beginnings_have_the_same_likelihood() -> None:
 
 
 def test_evidence_without_noise() -> None:
-    """Of a simulator without noise P grows until single precision cannot hold the prior beside it: beliefs stay finite."""
+    """Without noise P grows until single precision cannot hold the prior beside it; beliefs stay finite."""
     data, theta = pushed(64, np.random.default_rng(5))
     data = Batch(data.obs, data.action, data.obs + data.action + theta[None, :, None, None], data.mask)
     model, draws = untrained(2, data), streams()
