@@ -353,7 +353,7 @@ class TestTraining:
                     replace(config, **{part: b"x"})
         DeconfoundedConfig(model="gru", inference_batch=None, beta=0)
         with pytest.raises(
-            envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'innovations' or"
+            envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'linear' or"
         ):
             DeconfoundedConfig(model="tree")  # type: ignore[arg-type]
 
