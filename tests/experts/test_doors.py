@@ -352,9 +352,7 @@ class TestTraining:
                 with pytest.raises(envs.InputError, match=f"^{part} of {type(config).__name__} was "):
                     replace(config, **{part: b"x"})
         DeconfoundedConfig(model="gru", inference_batch=None, beta=0)
-        with pytest.raises(
-            envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'linear' or"
-        ):
+        with pytest.raises(envs.InputError, match="model of DeconfoundedConfig was 'tree'; it must be 'linear' or"):
             DeconfoundedConfig(model="tree")  # type: ignore[arg-type]
 
     @pytest.mark.parametrize("drifts", [True, False])
