@@ -1,7 +1,8 @@
 """Latent-variable models of the dynamics, which infer theta_hat from a history. They are trained on exploration.
 
-Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a, theta_hat), trained on Eq. (6). Discrete: K models of the
-dynamics, and exact Bayesian inference over which one it is (footnote 4).
+Linear, in linear_model.py: dynamics linear in theta_hat. Variational: q_phi(theta_hat | tau) and p_psi(s' | s, a,
+theta_hat), trained on Eq. (6). Discrete: K models of the dynamics, and exact Bayesian inference over which one it is
+(footnote 4).
 """
 
 import math
