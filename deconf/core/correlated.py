@@ -1,10 +1,11 @@
 """Gaussians over latents whose dimensions are correlated, as parameters that a network gives."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Draws
+from deconfounded.deconf.core.layers import Mlp
 
 LEAST = 0.05  # least conditional std
 ROUNDING = 1e-5  # of sums in single precision, relative to the largest
@@ -21,9 +22,15 @@ class Correlated:
     def __init__(self, latent: int) -> None:
         self.latent, self.width = latent, 2 * latent + latent * (latent - 1) // 2
 
+    def network(self, inputs: int, width: int, draws: Draws) -> Mlp:
+        """A network [..., I] -> [..., P] for `about`, whose output is 0 before training."""
+        net = Mlp(inputs, width, self.width, draws)
+        for parameter in net[-1].parameters():
+            nn.init.zeros_(parameter)
+        return net
+
     def about(self, mean: Tensor, raw: Tensor) -> Tensor:
-        """Parameters [..., P] by a network's output [..., P], zeros before training: what is added to the mean, stds
-        before a softplus, A."""
+        """Parameters [..., P] by a network's output [..., P]: what is added to the mean, stds before a softplus, A."""
         added, std, lower = self.split(raw)
         return torch.cat([mean + added, F.softplus(std) + LEAST, lower], -1)
 

@@ -69,8 +69,8 @@ class LatentModel(nn.Module, ABC):
         """Memories [S, B, T + 1, M] after 0, 1, ..., T transitions, and [S, B, 1 or T, M] of `final_memory`."""
         raise NotImplementedError
 
-    def read(self, memory: Tensor) -> Tensor:
-        """What a second network reads [..., read_width] of memories [..., M]: see `online.py`."""
+    def read(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """What a second network (`online.py`) reads [..., read_width] of memories [..., M], and the belief's mean."""
         raise NotImplementedError
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:

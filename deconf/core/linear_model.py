@@ -1,14 +1,14 @@
 """A model whose dynamics are linear in theta_hat: evidence adds up, and likelihoods are exact (`LinearModel`)."""
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.correlated import Correlated, log_integral, posterior_root
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_model import LatentModel
-from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.layers import by_seed
 from deconfounded.deconf.core.nets import Inputs, Scales, per_seed
 
 READ = 256  # memories an update, from each of which the evidence that follows is predicted
@@ -44,9 +44,7 @@ class LinearModel(LatentModel):
         self.dynamics: LinearDynamicsHead = LinearDynamicsHead(latent, width, self.inputs, draws)
         self.gaussian, self.read_width = Correlated(latent), 2 * latent + 1
         self.register_buffer("stds", torch.ones(len(draws), latent, device=draws.device))
-        self.reader = Mlp(self.read_width, width, self.gaussian.width, draws)
-        for parameter in self.reader[-1].parameters():
-            nn.init.zeros_(parameter)
+        self.reader = self.gaussian.network(self.read_width, width, draws)
 
     def _terms(self, batch: Batch) -> Tensor:
         """Increments of the memory [..., M], one a transition: products of (G, s' - s - f), and a count of 1."""
@@ -54,7 +52,7 @@ class LinearModel(LatentModel):
         innovation = self.dynamics.change(batch.next_obs - batch.obs) - expected
         weight = batch.mask[..., None] / per_seed(self.dynamics.log_std.exp(), expected)
         both = torch.cat([gains, innovation[..., None]], -1) * weight[..., None]
-        return torch.cat([products(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
+        return torch.cat([by_seed(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
 
     def _sums(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """P [..., D, D], b [..., D] and the squares of innovations [...], in double precision."""
@@ -75,7 +73,7 @@ class LinearModel(LatentModel):
         return self._terms(batch).sum(2)
 
     @torch.no_grad()
-    def read(self, memory: Tensor) -> Tensor:
+    def _posterior(self, memory: Tensor) -> Tensor:
         """Mean and logarithmic stds of the posterior, and the logarithm of the count."""
         precision, weighted, _ = self._sums(memory)
         lower = posterior_root(precision)
@@ -84,8 +82,14 @@ class LinearModel(LatentModel):
         return torch.cat([mean, std.log(), (1 + memory[..., -1:]).log() - 2], -1)
 
     def belief(self, memory: Tensor) -> Tensor:
-        read = self.read(memory)
-        return self.gaussian.about(read[..., : self.latent], self.reader(read))
+        return self._belief_of(self._posterior(memory))
+
+    def _belief_of(self, posterior: Tensor) -> Tensor:
+        return self.gaussian.about(posterior[..., : self.latent], self.reader(posterior))
+
+    def read(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        posterior = self._posterior(memory)
+        return posterior, self.mean(self._belief_of(posterior))
 
     def hindsight(self, belief: Tensor, draws: Draws) -> Tensor:
         return self.mean(belief)
@@ -115,7 +119,7 @@ class LinearModel(LatentModel):
         terms = self._terms(batch)
         with torch.no_grad():
             half = (draws.uniform(len(batch), HALVES, terms.shape[2]) < 0.5).float()
-            before, after = products(half, terms), products(1 - half, terms)
+            before, after = by_seed(half, terms), by_seed(1 - half, terms)
         return self.surprise(terms.sum(2)) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
 
     def surprise(self, memory: Tensor) -> Tensor:
@@ -130,8 +134,3 @@ class LinearModel(LatentModel):
         precision, weighted, _ = self._sums(after)
         log_likelihood = self.gaussian.log_mean(self.belief(before), precision, weighted)
         return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
-
-
-def products(a: Tensor, b: Tensor) -> Tensor:
-    """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M]: seed by seed, since a larger stack rounds otherwise."""
-    return torch.cat([*map(torch.matmul, a.split(1), b.split(1))])

@@ -108,9 +108,9 @@ class VariationalModel(LatentModel):
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         self.encoder.set_prior(self.sample(belief, draws))
 
-    def read(self, memory: Tensor) -> Tensor:
+    def read(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         assert isinstance(self.encoder, InnovationBelief)
-        return self.encoder.read(memory)
+        return self.encoder.read(memory), self.mean(self.belief(memory))
 
     def spread(self) -> Tensor:
         return self.encoder.prior_std

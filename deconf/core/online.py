@@ -7,7 +7,6 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.correlated import Correlated
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.latent_model import LatentModel
-from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.nets import gaussian_log_prob, per_seed
 
 MEMORIES, PER_TRIAL = 32768, 64  # on which the network is trained, about; at most so many of a trial of exploration
@@ -31,15 +30,13 @@ class OnlineBelief(nn.Module):
         super().__init__()
         self.gaussian = Correlated(model.latent)
         self.register_buffer("unit", torch.ones_like(model.spread()))
-        self.net = Mlp(model.read_width, width, self.gaussian.width, draws)
-        for parameter in self.net[-1].parameters():
-            nn.init.zeros_(parameter)
+        self.net = self.gaussian.network(model.read_width, width, draws)
 
     def forward(self, model: LatentModel, memory: Tensor) -> Tensor:
         """Memories [S, ..., M] -> beliefs [S, ..., P]."""
         with torch.no_grad():
-            mean = model.mean(model.belief(memory))
-        apart = self.gaussian.about(torch.zeros_like(mean), self.net(model.read(memory)))
+            read, mean = model.read(memory)
+        apart = self.gaussian.about(torch.zeros_like(mean), self.net(read))
         added, *rest = self.gaussian.split(apart)
         return torch.cat([mean + per_seed(self.unit, mean) * added, *rest], -1)
 

@@ -8,35 +8,18 @@ from torch import Tensor
 from deconfounded.deconf.core import online
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief, InnovationBelief
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
-
-STEPS = 24
-
-
-def streams(seeds: int = 1) -> Draws:
-    return Draws([np.random.default_rng(i) for i in range(seeds)], "cpu")
-
-
-def pushed(n: int, rng: np.random.Generator) -> Batch:
-    """A hidden force theta ~ N(0, 1) on a ball, and a controller that takes it for another's."""
-    theta, assumed, place = rng.normal(size=n), rng.normal(size=n), np.zeros(n)
-    seen, actions = [place], []
-    for _ in range(STEPS):
-        actions.append(-0.5 * place - assumed + 0.1 * rng.normal(size=n))
-        place = place + actions[-1] + theta + rng.normal(size=n)
-        seen.append(place)
-    obs, action = (torch.tensor(np.stack(x, 1)[..., None], dtype=torch.float32)[None] for x in (seen, actions))
-    return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, STEPS))
+from tests.deconf.ball import STEPS, pushed, streams
 
 
 @pytest.fixture(scope="module")
 def model() -> tuple[VariationalModel, Batch]:
     """A model with InnovationBelief, and the trials of a wrong controller on which it was trained."""
-    data = pushed(256, np.random.default_rng(0))
+    data, _ = pushed(256, np.random.default_rng(0))
     draws, signature = streams(), Signature(1, 1, 0, False)
     made = VariationalModel("innovations", 2, 32, Scales.of(signature, data), draws)
     optimizer = Adam([made], 5e-3, 400)
@@ -49,7 +32,7 @@ def model() -> tuple[VariationalModel, Batch]:
 
 def test_evidence_is_linear_in_innovations() -> None:
     """Changes that are as expected are no evidence, whatever the states; twice the innovation is twice the evidence."""
-    data = pushed(8, np.random.default_rng(0))
+    data, _ = pushed(8, np.random.default_rng(0))
     belief = InnovationBelief(2, 16, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
     other = EvidenceBelief(2, 16, belief.inputs.scales, streams()).eval()
 
@@ -92,7 +75,7 @@ def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch])
 
 def test_samples_are_of_the_density() -> None:
     """Of latents that depend on each other: mean, covariance and entropy as of the Gaussian that is given."""
-    data = pushed(2, np.random.default_rng(0))
+    data, _ = pushed(2, np.random.default_rng(0))
     made = VariationalModel("innovations", 3, 16, Scales.of(Signature(1, 1, 0, False), data), streams())
     belief = OnlineBelief(made, 16, streams())
     belief.unit.copy_(torch.tensor([[1.0, 2.0, 0.5]]))
@@ -115,7 +98,7 @@ def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[V
     made, data = model
     belief = OnlineBelief(made, 32, streams())
     belief.fit(made, data, 400, streams())
-    fresh = pushed(400, np.random.default_rng(1))
+    fresh, _ = pushed(400, np.random.default_rng(1))
     with torch.no_grad():
         memory = made.encoder(fresh)
         final = made.encoder.posterior(memory[:, :, -1])[0]
@@ -137,7 +120,7 @@ def _correlation(latents: Tensor) -> float:
 
 def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of steps that took place, more of the first ones."""
-    data = pushed(70, np.random.default_rng(0))
+    data, _ = pushed(70, np.random.default_rng(0))
     data.mask[:, ::2, 10:] = 0
     made = VariationalModel("innovations", 2, 8, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
     number, step = torch.arange(70.0)[None, :, None].expand(-1, -1, STEPS), torch.arange(float(STEPS)).expand(1, 70, -1)
