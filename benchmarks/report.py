@@ -28,4 +28,4 @@ def main() -> None:
         raise envs.InputError(f"{folder} holds no finished jobs of random and expert; give a folder of run.py")
     from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is refused at once
 
-    print(run_report.write(task, about, finished, folder))
+    print(f"{run_report.write(task, about, finished, folder)} -> {folder / 'report.html'}")

@@ -99,7 +99,7 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
                 print(f"{task.name} failed: {error}")
                 continue
             text = run_report.write(task, about, finished, folders[task.name])
-            print(text.rpartition(" -> ")[0] if args.debug else text)  # which keeps no report
+            print(text if args.debug else f"{text} -> {folders[task.name] / 'report.html'}")  # --debug keeps none
     if failed:
         name, reason = next(iter(failed.items()))
         raise envs.InputError(f"{len(failed)} of {len(tasks)} tasks failed; {name}: {reason}")

@@ -39,7 +39,7 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
     head = f"{task.name}{under}: 0 = random actions, 1 = the expert that sees theta"
     table = scoring.plain_table(scoring.COLUMNS, scoring.rows(results["methods"]), scoring.DROPPED)
     note = f"{scoring.INTERVALS}\n\n" if len(results["seeds"]) > 1 else ""
-    return f"\n{head}\n\n{table}\n\n{note}{results['wall_s']:.0f} s -> {folder / 'report.html'}"
+    return f"\n{head}\n\n{table}\n\n{note}{results['wall_s']:.0f} s"
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
