@@ -81,8 +81,8 @@ class Linear(nn.Module):
 
 
 def by_seed(a: Tensor, b: Tensor) -> Tensor:
-    """a [S, ..., N, K] b [S, ..., K, M], seed by seed: products of a stack have another order of sums than of one."""
-    return torch.matmul(a, b) if len(a) == 1 else torch.cat([*map(torch.matmul, a.split(1), b.split(1))])
+    """a [S, N, K] b [S, K, M], seed by seed: products of a stack have another order of sums than those of one seed."""
+    return torch.bmm(a, b) if len(a) == 1 else torch.cat([*map(torch.bmm, a.split(1), b.split(1))])
 
 
 def parameter_gradients(rows: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,6 @@ from deconfounded.deconf.core.correlated import Correlated, log_integral, poster
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_model import LatentModel
-from deconfounded.deconf.core.layers import by_seed
 from deconfounded.deconf.core.nets import Inputs, Scales, per_seed
 
 READ = 256  # memories an update, from each of which the evidence that follows is predicted
@@ -52,7 +51,7 @@ class LinearModel(LatentModel):
         innovation = self.dynamics.change(batch.next_obs - batch.obs) - expected
         weight = batch.mask[..., None] / per_seed(self.dynamics.log_std.exp(), expected)
         both = torch.cat([gains, innovation[..., None]], -1) * weight[..., None]
-        return torch.cat([by_seed(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
+        return torch.cat([products(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
 
     def _sums(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """P [..., D, D], b [..., D] and the squares of innovations [...], in double precision."""
@@ -119,7 +118,7 @@ class LinearModel(LatentModel):
         terms = self._terms(batch)
         with torch.no_grad():
             half = (draws.uniform(len(batch), HALVES, terms.shape[2]) < 0.5).float()
-            before, after = by_seed(half, terms), by_seed(1 - half, terms)
+            before, after = products(half, terms), products(1 - half, terms)
         return self.surprise(terms.sum(2)) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
 
     def surprise(self, memory: Tensor) -> Tensor:
@@ -134,3 +133,11 @@ class LinearModel(LatentModel):
         precision, weighted, _ = self._sums(after)
         log_likelihood = self.gaussian.log_mean(self.belief(before), precision, weighted)
         return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
+
+
+def products(a: Tensor, b: Tensor) -> Tensor:
+    """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M]: seed by seed, since a larger stack rounds otherwise.
+
+    `layers.by_seed` is for three axes; one function for both, by matmul, has other bits.
+    """
+    return torch.cat([*map(torch.matmul, a.split(1), b.split(1))])
