@@ -37,6 +37,7 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
     "tune": ("benchmarks.studies.tune", "the baselines' tuning", REPEATED),
     "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: scores under more and less noise", RESUMED),
+    "exploration": ("benchmarks.studies.exploration", "scores against the amount of exploration", RESUMED),
 }
 
 

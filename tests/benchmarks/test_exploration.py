@@ -1,0 +1,69 @@
+"""Scores against the amount of exploration: what is run, and what is shown of it."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.presets import changed, preset
+from deconfounded.benchmarks.studies import exploration
+
+PNG = b"\x89PNG"
+
+
+def point(task: str, method: str, share: int, last: list[float]) -> dict[str, Any]:
+    first = [score / 2 for score in last]
+    return {
+        **{"task": task, "method": method, "version": 6, "share": share, "explored": 512 // share},
+        **{"first": first, "last": last},
+    }
+
+
+@pytest.fixture
+def points() -> list[dict[str, Any]]:
+    of = [
+        point("curling", "deconfounded", share, [score, score + 0.2])
+        for share, score in ((1, 0.8), (4, 0.7), (16, 0.4))
+    ]
+    return [*of, point("windy_drone", "deconfounded", 4, [0.5]), point("windy_drone", "deconfounded", 1, [0.8])]
+
+
+def test_methods_are_those_that_explore_or_query() -> None:
+    """All but gail, whose interactions are no trials of the preset."""
+    able = exploration.explorers()
+    assert {"deconfounded", "dagger", "rma"} <= {*able}
+    assert not {"naive_rnn", "oracle_bc", "interventional", "gail"} & {*able}
+    assert all({"exploration", "queries"} & {*METHODS[name].uses} for name in able)
+
+
+@pytest.mark.parametrize("share", exploration.SHARES)
+def test_share_of_the_preset(share: int) -> None:
+    """Exploration and queries alone are fewer, and at least one trial is left."""
+    task = envs.get("slippery_cartpole")
+    whole = preset("default", task, "cpu")
+    less = changed(whole, exploration.fewer(whole, share))
+    assert less.explore_trials == whole.explore_trials // share
+    assert less.query_trials == max(1, whole.query_trials // share)
+    assert less.expert_trials == whole.expert_trials
+
+
+def test_table(points: list[dict[str, Any]]) -> None:
+    """First and last score, a mean over seeds, of each share, and nothing where it was not run."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in exploration.table(points).splitlines()[2:]]
+    assert rows == [
+        ["curling", "deconfounded", "v6", "2", "0.45, 0.90 (512)", "0.40, 0.80 (128)", "0.25, 0.50 (32)", ""],
+        ["windy_drone", "deconfounded", "v6", "1", "0.40, 0.80 (512)", "0.25, 0.50 (128)", "", ""],
+    ]
+
+
+def test_median_loss(points: list[dict[str, Any]]) -> None:
+    """Over tasks: .1 and .3 with a quarter; .4 of one task with a 16th; none with a 64th."""
+    last = exploration.median_losses(points).splitlines()[-1]
+    assert [cell.strip() for cell in last.split("|")[1:-1]] == ["deconfounded", "0.20 (2)", "0.40 (1)", ""]
+
+
+def test_picture(points: list[dict[str, Any]], tmp_path: Path) -> None:
+    exploration.picture(points, tmp_path / "exploration.png")
+    assert (tmp_path / "exploration.png").read_bytes().startswith(PNG)
