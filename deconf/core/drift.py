@@ -11,7 +11,7 @@ from deconfounded.deconf.core.data import Batch, Draws, trials_of
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.experts.rollout import Trials
 
-SHARES = 11  # 0, .1, ..., 1
+SHARES = 11  # 0, .1, ..., 1, or powers of these
 
 
 def split_episodes(trials: Trials) -> Trials:
@@ -26,7 +26,7 @@ def choose_kept(model: LatentModel, episodes: Batch, per_trial: int, draws: Draw
     """Set `kept` of each seed's model to the share of highest likelihood on episodes [S, B E, T], E = per_trial."""
     seeds, steps = len(episodes.mask), episodes.mask.shape[2]
     trials = Batch(*(x.unflatten(1, (-1, per_trial)).repeat(1, SHARES, *[1] * (x.dim() - 1)) for x in episodes.tensors))
-    shares = torch.linspace(0, 1, SHARES, device=episodes.mask.device)
+    shares = torch.linspace(0, 1, SHARES, device=episodes.mask.device) ** model.share_power
     share = shares.repeat_interleave(trials.mask.shape[1] // SHARES)[None, :, None]
     start = model.start(trials.mask.shape[1])
     memory, log_likelihood = start, torch.zeros(seeds, trials.mask.shape[1], device=share.device)

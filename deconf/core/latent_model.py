@@ -14,7 +14,8 @@ from deconfounded.deconf.core.nets import Inputs, per_seed
 class LatentModel(nn.Module, ABC):
     """A model that infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
 
-    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts.
+    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts. It is one of 0, .1, ..., 1 to
+    the power of `share_power`.
     """
 
     kind: str
@@ -23,6 +24,7 @@ class LatentModel(nn.Module, ABC):
     inputs: Inputs
     dynamics: DynamicsHead
     kept: Tensor
+    share_power: int = 1
     read_width: int = 0  # of what `read` gives; 0: it has no `read`
 
     def __init__(self, draws: Draws) -> None:

@@ -57,6 +57,24 @@ def test_mean_of_evidence_under_a_belief() -> None:
     assert exact == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
 
 
+def test_likelihood_of_the_next_step() -> None:
+    """That of the dynamics, of 200,000 samples of the belief, to five standard errors."""
+    data, _ = pushed(3, np.random.default_rng(1))
+    model, draws, count = untrained(2, data).eval(), streams(), 200_000
+    with torch.no_grad():
+        model.dynamics.log_std.fill_(-0.4)
+        memory, step = model.final_memory(data[:, :, :4]), data[:, :, 4]
+        exact = model.log_next(memory, step, draws)[0].exp()
+        belief = model.belief(memory)
+        for i in range(3):
+            one = (x[:, i : i + 1].expand(1, count, -1) for x in (step.obs, step.action, step.next_obs))
+            theta_hat = model.sample(belief[:, i : i + 1].expand(1, count, -1), draws)
+            likelihood = model.dynamics.log_prob(*one, theta_hat)[0, :, 0].exp().double()
+            error = 5 * likelihood.std().item() / count**0.5
+            assert error < 0.01 * exact[i].item()
+            assert exact[i].item() == pytest.approx(likelihood.mean().item(), abs=error)
+
+
 def test_memory_adds_up() -> None:
     """Step by step it is that of the whole trial; steps that did not take place leave it as it is."""
     data, _ = pushed(5, np.random.default_rng(1))

@@ -8,7 +8,7 @@ from torch import Tensor
 from deconfounded import envs
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.data import Batch, Draws, Signature
-from deconfounded.deconf.core.drift import choose_kept
+from deconfounded.deconf.core.drift import SHARES, choose_kept
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
@@ -98,18 +98,26 @@ class Average(LatentModel):
     final_memory = belief = sample = mode = mean = loss = None  # type: ignore[assignment]
 
 
-def test_kept_share_is_chosen_without_theta() -> None:
-    """Nearly 1 for constant thetas, 0 for thetas drawn anew at each episode; a share for each seed."""
+@pytest.mark.parametrize("power", [1, 3])
+def test_kept_share_is_chosen_without_theta(power: int) -> None:
+    """Nearly 1 for constant thetas, 0 for thetas drawn anew at each episode; a share for each seed.
+
+    For thetas of which .2 of the variance is new in each episode, it is a power of what the model says.
+    """
     generator, b, e, t = torch.Generator().manual_seed(0), 400, 6, 5
     constant = torch.randn(b, 1, 1, generator=generator).expand(b, e, 1)
     anew = torch.randn(b, e, 1, generator=generator)
-    theta = torch.stack([constant, anew]).reshape(2, b * e, 1, 1).expand(2, b * e, t, 1)
+    steps = torch.cat([constant[:, :1], 0.45 * torch.randn(b, e - 1, 1, generator=generator)], 1)
+    theta = torch.stack([constant, anew, steps.cumsum(1)]).reshape(3, b * e, 1, 1).expand(3, b * e, t, 1)
     readings = theta + torch.randn(theta.shape, generator=generator)
-    episodes = Batch(readings, readings, readings, torch.ones(2, b * e, t))
-    model = Average(Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
-    choose_kept(model, episodes, e, Draws([np.random.default_rng(i) for i in range(2)], "cpu"))
-    assert model.kept[0] >= 0.8  # .9 is a nat or so from 1
+    episodes = Batch(readings, readings, readings, torch.ones(3, b * e, t))
+    model = Average(Draws([np.random.default_rng(i) for i in range(3)], "cpu"))
+    model.share_power = power
+    choose_kept(model, episodes, e, Draws([np.random.default_rng(i) for i in range(3)], "cpu"))
+    assert model.kept[0] >= 0.9**power - 1e-6  # .9 is a nat or so from 1
     assert model.kept[1] == 0
+    assert 0 < model.kept[2] < 1
+    assert torch.isclose(model.kept[2], torch.linspace(0, 1, SHARES) ** power).any()
 
 
 @pytest.mark.parametrize("kind", ["evidence", "discrete"])
