@@ -76,12 +76,10 @@ def table(points: list[Point]) -> str:
 
 
 def picture(points: list[Point], file: Path, mark: str = "") -> None:
-    """A column for each task with several amounts: first episode above, last below."""
-    drawn = [
-        task
-        for task in dict.fromkeys(point["task"] for point in points)
-        if len({point["share"] for point in points if point["task"] == task}) >= ENOUGH
-    ]
+    """A column for each task with several amounts, if there is one, or else each: first episode above, last below."""
+    tasks = dict.fromkeys(point["task"] for point in points)
+    amounts = {task: {point["share"] for point in points if point["task"] == task} for task in tasks}
+    drawn = [task for task in tasks if len(amounts[task]) >= ENOUGH] or list(tasks)
     size = (4.6 * len(drawn), 7.0)
     with panels(file, 2, len(drawn), size=size, dpi=100, mark=mark, sharex="col", sharey=True) as grid:
         for task, column in zip(drawn, grid.T, strict=True):

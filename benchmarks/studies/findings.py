@@ -1,11 +1,11 @@
-"""What studies left in docs/, as parts of pages: of speed.json, validation.json, spectrum.json and tuning.json."""
+"""What studies left in docs/, as parts of pages: of speed.json, validation.json, spectrum.json and others."""
 
 from typing import Any
 
 import numpy as np
 
 from deconfounded.benchmarks.output import records, scoring
-from deconfounded.benchmarks.studies import spectrum, validate
+from deconfounded.benchmarks.studies import exploration, spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 from deconfounded.benchmarks.studies.foreign import report
 
@@ -72,6 +72,16 @@ def noises() -> str:
     points = measured["points"]
     about = f"Means over {measured['seeds']} seeds; {_origins(points)}."
     return "\n\n".join([spectrum.foretold(points), spectrum.table(points), about])
+
+
+def explored() -> str:
+    """The tables of docs/exploration.md: what less exploration costs."""
+    points = kept("exploration")
+    about = f"Made on {_origins(points)}."
+    losses = "Loss in the last episode against all trials, the median over tasks (their number in brackets):"
+    scores = "Score in the first and in the last episode, means over seeds, and explored trials of a seed in brackets:"
+    parts = losses, exploration.median_losses(points), scores, exploration.table(points), about
+    return "\n\n".join(parts)
 
 
 def chosen(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -25,7 +25,17 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.output import aggregation, index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of, still
-from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, results, spectrum, validate
+from deconfounded.benchmarks.studies import (
+    cards,
+    exploration,
+    findings,
+    gap,
+    hard,
+    headroom,
+    results,
+    spectrum,
+    validate,
+)
 from deconfounded.benchmarks.studies.cards import DOCS, TIERS
 from deconfounded.envs.support.files import write_atomically
 
@@ -123,6 +133,7 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "diagnose.md": {"validation": findings.validated(), "foreign": findings.foreign()},
         DOCS / "baselines.md": {"fared": results.fared(found, certified), "tuning": findings.tuning()},
         DOCS / "spectrum.md": {"noises": findings.noises()},
+        DOCS / "exploration.md": {"exploration": findings.explored()},
         DOCS / "speed.md": {"costs": results.costs(found), "rates": findings.rates()},
         DOCS / "paper.md": {"controls": results.controls(found)},
         DOCS / "concepts.md": {"certificates": cards.certificates(certified)},
@@ -156,6 +167,7 @@ def write() -> str:
     redraw(DOCS / "headroom.png", headroom.picture, headroom.points(found, cards.certified()))
     redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
+    redraw(DOCS / "exploration.png", exploration.picture, cards.kept("exploration"))
     return results.summary(found, cards.certified())
 
 

@@ -29,7 +29,7 @@ CONTENTS: dict[
         **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "headroom": "docs/headroom.md"},
         **{"hard": "docs/hard.md"},
         **{"baselines": "docs/baselines.md", "paper": "docs/paper.md", "spectrum": "docs/spectrum.md"},
-        **{"speed": "docs/speed.md"},
+        **{"exploration": "docs/exploration.md", "speed": "docs/speed.md"},
     },
     "How to": {
         **{"environments": "docs/environments.md", "own_task": "docs/own_task.md", "own_method": "docs/own_method.md"},

@@ -64,6 +64,8 @@ def test_median_loss(points: list[dict[str, Any]]) -> None:
     assert [cell.strip() for cell in last.split("|")[1:-1]] == ["deconfounded", "0.20 (2)", "0.40 (1)", ""]
 
 
-def test_picture(points: list[dict[str, Any]], tmp_path: Path) -> None:
-    exploration.picture(points, tmp_path / "exploration.png")
+@pytest.mark.parametrize("count", [1, 5])
+def test_picture(count: int, points: list[dict[str, Any]], tmp_path: Path) -> None:
+    """Of the first point alone, too, and of tasks with more and with fewer amounts."""
+    exploration.picture(points[:count], tmp_path / "exploration.png")
     assert (tmp_path / "exploration.png").read_bytes().startswith(PNG)
