@@ -102,7 +102,7 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
 
 
 def recorded(task: envs.Task, settings: "Preset", method: str, seeds: int) -> "list[Record]":
-    """The records in docs/ of a method's seeds and of the references; empty unless all are of today."""
+    """The records in docs/ of a method and of the references, of the seeds 0, 1, ...; empty unless all are of today."""
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.studies.table import missing
@@ -112,7 +112,7 @@ def recorded(task: envs.Task, settings: "Preset", method: str, seeds: int) -> "l
     if missing(job, "default", held):
         return []
     of_task = records.of_task(DOCS / "records", task.name)
-    return [record for record in of_task if record["method"] in (method, *REFERENCES)]
+    return [record for record in of_task if record["method"] in (method, *REFERENCES) and record["seed"] < seeds]
 
 
 def measured(made: "list[Record]", method: str, share: int) -> Point:
