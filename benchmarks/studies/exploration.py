@@ -130,14 +130,13 @@ def measured(made: "list[Record]", method: str, share: int) -> Point:
 
 
 def main() -> None:
-    able = explorers()
-    parser = commands.parser(__doc__, f"some of {', '.join(able)}; default: all", seeds=1)
+    parser = commands.parser(__doc__, "some of those that explore or query; default: all of them", seeds=1)
     several = f"names, or {', '.join(published.GROUPS)}; default: {' '.join(TASKS)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(TASKS), help=several)
     shares = f"n, of an n-th of the preset's trials; default: {' '.join(map(str, SHARES))}"
     parser.add_argument("--shares", nargs="+", type=int, choices=SHARES, default=list(SHARES), help=shares)
     args = parser.parse_args()
-    methods = commands.check(args, able, able)
+    methods = commands.check(args, able := explorers(), able)
     tasks = published.tasks(args.tasks)
     from deconfounded.benchmarks.engine.presets import changed, preset
 
