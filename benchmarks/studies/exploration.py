@@ -18,7 +18,7 @@ from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import runs
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
-from deconfounded.envs.support.files import write_json
+from deconfounded.envs.support.files import check_folder, write_json
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -107,11 +107,10 @@ def recorded(task: envs.Task, settings: "Preset", method: str, seeds: int) -> "l
     from deconfounded.benchmarks.output import records
     from deconfounded.benchmarks.studies.table import missing
 
-    held = records.held(DOCS / "records" / records.place(task.name))
-    job = BenchmarkJob(task.reference, settings, method, tuple(range(seeds)), Path())
-    if missing(job, "default", held):
-        return []
     of_task = records.of_task(DOCS / "records", task.name)
+    job = BenchmarkJob(task.reference, settings, method, tuple(range(seeds)), Path())
+    if missing(job, "default", of_task):
+        return []
     return [record for record in of_task if record["method"] in (method, *REFERENCES) and record["seed"] < seeds]
 
 
@@ -141,20 +140,19 @@ def main() -> None:
     from deconfounded.benchmarks.engine.presets import changed, preset
 
     folder = args.out or Path("results") / "exploration"
+    check_folder(folder)
     file, points = folder / "exploration.json", dict[tuple[str, str, int], Point]()
     if file.is_file():
         points = {(p["task"], p["method"], p["share"]): p for p in json.loads(file.read_bytes())}
     for task in tasks:
         whole = changed(preset(args.preset, task, args.device), args.set)
         for share in args.shares:
-            changes = [*args.set, *fewer(whole, share)]
-            settings, own = changed(whole, fewer(whole, share)), folder / f"{task.name}-{share}"
+            changes, own = fewer(whole, share), folder / f"{task.name}-{share}"
+            settings, changes = changed(whole, changes), [*args.set, *changes]
             options = {"preset": args.preset, "changes": changes, "cluster": args.cluster}
             for method in methods:
-                known = share == 1 and args.preset == "default" and not args.set
-                made = recorded(task, settings, method, args.seeds) if known else []
-                wanted = (*REFERENCES, method)
-                made = made or runs.run(task, settings, wanted, range(args.seeds), own, **options)
+                made = [] if changes or args.preset != "default" else recorded(task, settings, method, args.seeds)
+                made = made or runs.run(task, settings, (*REFERENCES, method), range(args.seeds), own, **options)
                 points[task.name, method, share] = point = measured(made, method, share)
                 write_json(file, [points[key] for key in sorted(points)])
                 ends = ", ".join(two_decimals(float(np.mean(point[end]))) for end in ENDS)

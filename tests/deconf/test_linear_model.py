@@ -67,9 +67,9 @@ def test_likelihood_of_the_next_step() -> None:
         exact = model.log_next(memory, step, draws)[0].exp()
         belief = model.belief(memory)
         for i in range(3):
-            one = (x[:, i : i + 1].expand(1, count, -1) for x in (step.obs, step.action, step.next_obs))
+            repeated = (x[:, i : i + 1].expand(1, count, -1) for x in (step.obs, step.action, step.next_obs))
             theta_hat = model.sample(belief[:, i : i + 1].expand(1, count, -1), draws)
-            likelihood = model.dynamics.log_prob(*one, theta_hat)[0, :, 0].exp().double()
+            likelihood = model.dynamics.log_prob(*repeated, theta_hat)[0, :, 0].exp().double()
             error = 5 * likelihood.std().item() / count**0.5
             assert error < 0.01 * exact[i].item()
             assert exact[i].item() == pytest.approx(likelihood.mean().item(), abs=error)
