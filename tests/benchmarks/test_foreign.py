@@ -69,7 +69,13 @@ def test_scores() -> None:
 
 
 def test_report() -> None:
-    row = {"world": "arm:Arm", "tier": 2, "unseen": False, "scores": {"naive_rnn": 0.2, "deconfounded": 0.9}}
+    row = {
+        "case": "arm_arm",
+        "world": "arm:Arm",
+        "tier": 2,
+        "unseen": False,
+        "scores": {"naive_rnn": 0.2, "deconfounded": 0.9},
+    }
     wrong = {"verdict": "confounded", "diagnosed_tier": 3, "right": False, "predicted": 0.5, "splits": 3}
     unsure = {"verdict": "cannot tell", "diagnosed_tier": None, "right": None, "predicted": 0.0}
     rows = [row | wrong | {"agreeing": 2}, row | wrong | {"agreeing": 3}, row | unsure | {"unseen": True}, row]
@@ -81,3 +87,15 @@ def test_report() -> None:
     assert lines[2].endswith("| confounded, Tier 3 | 2 of 3 | wrong |")
     assert lines[4].endswith("| cannot tell |  | cannot tell |")
     assert lines[5].endswith("|  |  |  |")
+
+
+def test_report_says_of_which_version_scores_are() -> None:
+    def row(case: str, version: int | None, **more: float) -> dict[str, object]:
+        return {"case": case, "scores": more, "method_versions": {} if version is None else {"deconfounded": version}}
+
+    rows = [row("old", 5, deconfounded=0.9), row("unknown", None, deconfounded=0.8), row("not_there", None)]
+    assert report.scored(rows[1:]) == ""
+    assert report.scored([*rows, row("new", 6, deconfounded=1)]) == (
+        "Scores of deconfounded are of its version 6; of an earlier one: old, unknown."
+    )
+    assert report.scored([row("new", 6, deconfounded=1)]) == "Scores of deconfounded are of its version 6."

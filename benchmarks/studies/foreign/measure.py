@@ -14,7 +14,7 @@ import numpy as np
 
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import identity
-from deconfounded.benchmarks.engine.catalogue import check_names
+from deconfounded.benchmarks.engine.catalogue import METHODS, check_names
 from deconfounded.benchmarks.studies.cards import DOCS, kept
 from deconfounded.benchmarks.studies.foreign.cases import CASES, EXPLORED, SEED, TRIALS, Case
 from deconfounded.benchmarks.studies.foreign.report import KEPT
@@ -40,6 +40,7 @@ class Bench:
     def __init__(self, case: Case, folder: Path) -> None:
         self.case, self.file = case, folder / "returns.json"
         self.returns: dict[str, list[float]] = json.loads(self.file.read_bytes()) if self.file.is_file() else {}
+        self.method_versions: dict[str, int] = rows().get(case.name, {}).get("method_versions", {})
         self._scorer: Scorer | None = None
         self._demonstrated: Rollout | None = None
 
@@ -66,8 +67,15 @@ class Bench:
                 return "none"
             self.returns[name] = self.scorer.returns(agent).mean(0).tolist()
             write_json(self.file, self.returns)
+            if name in METHODS:
+                self.method_versions[name] = METHODS[name].version
         if {"random", "expert", "told another"} <= self.returns.keys():
-            write(self.case, returns=self.returns, scores=scores(self.returns))
+            write(
+                self.case,
+                returns=self.returns,
+                scores=scores(self.returns),
+                method_versions=self.method_versions,
+            )
         return f"{self.returns[name][-1]:.4g}"
 
 
@@ -154,14 +162,19 @@ def diagnosed(case: Case, folder: Path) -> str:
     return f"{diagnosis.verdict}, tier {diagnosis.tier}: {'right' if right else 'not right'}"
 
 
+def rows() -> dict[str, dict[str, Any]]:
+    """What was measured, a row a case."""
+    return {row["case"]: row for row in kept(KEPT) or ()}
+
+
 def write(case: Case, **measured: Any) -> None:
     """Put what was measured in the case's row."""
-    rows = {row["case"]: row for row in kept(KEPT) or ()}
+    by_case = rows()
     versions = identity.versions() | {name: metadata.version(name) for name in SIMULATORS}
     about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": versions}
     row = {"case": case.name, "world": case.reference, "tier": case.tier, "unseen": case.unseen}
-    rows[case.name] = rows.get(case.name, {}) | row | measured | about
-    write_json(DOCS / f"{KEPT}.json", [rows[case.name] for case in CASES if case.name in rows])
+    by_case[case.name] = by_case.get(case.name, {}) | row | measured | about
+    write_json(DOCS / f"{KEPT}.json", [by_case[case.name] for case in CASES if case.name in by_case])
 
 
 def main() -> None:

@@ -27,9 +27,24 @@ def summary(rows: list[dict[str, Any]]) -> str:
         rank = stats.spearmanr(*zip(*both, strict=True)).statistic if len(both) > 2 else None
         alike = "" if rank is None else f"; the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
         sentences.append(f"Of the half {what}, {share}{alike}.")
+    if of_version := scored(rows):
+        sentences.append(of_version)
     if few := [row["case"] for row in rows if row.get("splits") == 1]:
         sentences.append(f"Judged by a single split of their trials, so far: {', '.join(few)}.")
     return " ".join(sentences)
+
+
+def scored(rows: list[dict[str, Any]]) -> str:
+    """Which version of `deconfounded` has the scores: the latest, and where an earlier one was measured."""
+    name = "deconfounded"
+    versions = {
+        row["case"]: row.get("method_versions", {}).get(name, 0) for row in rows if name in row.get("scores", {})
+    }
+    latest = max(versions.values(), default=0)
+    if not latest:
+        return ""
+    earlier = ", ".join(case for case, version in versions.items() if version < latest)
+    return f"Scores of {name} are of its version {latest}" + f"; of an earlier one: {earlier}" * bool(earlier) + "."
 
 
 def measured(row: dict[str, Any]) -> float | None:
