@@ -93,6 +93,7 @@ def main() -> None:
             print(f"{task_name}, {method}: seeds {' '.join(map(str, seeds_left))}")
         print(f"{sum(map(len, lacking.values()))} seeds are missing or stale")
         return
+    print(f"{sum(map(len, left.values()))} seeds to make, kept one by one: stop when you like")
     options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():
         made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)

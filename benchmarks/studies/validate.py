@@ -9,7 +9,7 @@ that were measured; a case that is diagnosed again takes its row's place. Interr
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -20,11 +20,10 @@ from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
 from deconfounded.benchmarks.studies.cards import DOCS, kept, markdown_table
+from deconfounded.deconf.diagnosis.advice import VARY_LATENT
+from deconfounded.deconf.diagnosis.verdict import Diagnosis, with_tier
 from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
-
-if TYPE_CHECKING:
-    from deconfounded.deconf.diagnosis.verdict import Diagnosis
 
 CASES: dict[str, str | None] = {
     **dict.fromkeys(envs.SUITE),
@@ -46,13 +45,11 @@ FIGURES = (  # of the table
 )
 
 
-def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
+def right(task: envs.Task, certified: bool, diagnosis: Diagnosis) -> bool:
     """Whether a diagnosis says what is so; of a certified task, that Tier 2 cures it.
 
     That of a task without latent may be that trials are alike: those of one theta look no other.
     """
-    from deconfounded.deconf.diagnosis.advice import VARY_LATENT
-
     truth = ("confounded", 2) if certified else ("not confounded", 1)
     if task.tier in (None, 3) and not certified and task.name in envs.SUITE:
         truth = ("confounded", 3)
@@ -61,10 +58,8 @@ def right(task: envs.Task, certified: bool, diagnosis: "Diagnosis") -> bool:
     return alike or (verdict, diagnosis.tier) == truth
 
 
-def predicted(diagnosis: "Diagnosis") -> float:
+def predicted(diagnosis: Diagnosis) -> float:
     """The gap that Tier 2 could close, in scores; 0 where nothing is confounded, or alike, or queries are needed."""
-    from deconfounded.deconf.diagnosis.advice import VARY_LATENT
-
     nothing = (
         diagnosis.verdict in ("not confounded", "nothing at stake")
         or diagnosis.tier == 3
@@ -151,7 +146,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     """A row a case."""
     lines = []
     for row in rows:
-        verdict = row["verdict"] + (f", Tier {row['tier']}" if row["verdict"] == "confounded" and row["tier"] else "")
+        verdict = with_tier(row["verdict"], row["tier"])
         figures = (row["figures"][key]["value"] if key in row["figures"] else None for key in FIGURES)
         cells = ("" if value is None else two_decimals(value) for value in (*figures, row["predicted"]))
         certified, judged = "passed" if row["certified"] else "failed", "" if row["right"] else "wrong"

@@ -99,7 +99,7 @@ class LearnedAgent(Agent):
             raise InputError(
                 f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
             )
-        return torch.as_tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)
+        return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)  # a copy
 
     @abstractmethod
     def choose(self, obs: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from deconfounded.deconf.diagnosis.thresholds import (
     TRAIT_STAKES,
     UNUSED,
 )
-from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure
+from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure, with_tier
 from deconfounded.envs.support.errors import InputError
 
 
@@ -50,7 +50,7 @@ def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
     dissent = [split for split in alone if split.tier != diagnosis.tier]
-    dissenting = dict.fromkeys(s.verdict + f", Tier {s.tier}" * (s.verdict == "confounded") for s in dissent)
+    dissenting = dict.fromkeys(with_tier(split.verdict, split.tier) for split in dissent)
     return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(dissenting))
 
 

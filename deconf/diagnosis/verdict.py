@@ -31,6 +31,11 @@ class Figure(NamedTuple):
         return f"{value} ({low} to {high})"
 
 
+def with_tier(verdict: str, tier: int | None) -> str:
+    """A verdict in a table or a list: `confounded` has its tier with it, if that is known."""
+    return f"{verdict}, Tier {tier}" if verdict == "confounded" and tier else verdict
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """The verdict, figures by name, the reasons, the paper's tier that is needed (None: unknown), and what to do next.

@@ -453,7 +453,7 @@ def test_table_makes_what_is_missing(
     table()
     made = records.read(tmp_path / "records" / "bandit.jsonl")
     assert [(one["method"], one["seed"]) for one in made] == [(m, i) for m in ("expert", "random") for i in (0, 1)]
-    assert table() == ""
+    assert table() == "0 seeds to make, kept one by one: stop when you like\n"
     assert table("--list") == "0 seeds are missing or stale\n"
     (tmp_path / "records" / "bandit.jsonl").unlink()
     records.write(tmp_path / "records", [made[0], made[2], {**made[3], "method_version": 0}])

@@ -6,6 +6,7 @@ from scipy import stats
 
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
+from deconfounded.deconf.diagnosis.verdict import with_tier
 
 KEPT = "diagnose/foreign"
 AGENTS = ("told another", "blind_bc", "naive_rnn", "deconfounded", "oracle_bc", "filter")
@@ -58,8 +59,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = []
     for row in rows:
         cells = (two_decimals(row["scores"][name]) if name in row["scores"] else "" for name in AGENTS)
-        verdict = row.get("verdict", "")
-        verdict += f", Tier {row['diagnosed_tier']}" if verdict == "confounded" else ""
+        verdict = with_tier(row.get("verdict", ""), row.get("diagnosed_tier"))
         judged = JUDGED[row["right"]] if "verdict" in row else ""
         half = "judged" if row["unseen"] else "set"
         agree = f"{row['agreeing']} of {row['splits']}" if "agreeing" in row else ""
