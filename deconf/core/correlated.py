@@ -8,11 +8,11 @@ from deconfounded.deconf.core.data import Draws
 from deconfounded.deconf.core.layers import Mlp
 
 LEAST = 0.05  # least conditional std
-ROUNDING = 1e-5  # of sums in single precision, relative to the largest
+ROUNDING, TRIES = 1e-5, 12  # of sums in single precision, relative to the largest; tenfold at each further try
 
 
 class Correlated:
-    """Gaussians over theta_hat [D], each by its parameters [P]: mean [D], stds s [D] and A [D (D - 1) / 2].
+    """Gaussians over theta_hat [D], each by its parameters [P]: mean [D], conditional stds s [D], A [D (D - 1) / 2].
 
     A is strictly lower triangular, and (1 + A) (theta_hat - mean) is normal with independent stds s: the modified
     Cholesky decomposition (Pourahmadi, 1999). Latents of different thetas lie near a surface in the latent space, which
@@ -20,11 +20,11 @@ class Correlated:
     """
 
     def __init__(self, latent: int) -> None:
-        self.latent, self.width = latent, 2 * latent + latent * (latent - 1) // 2
+        self.latent, self.parameters = latent, 2 * latent + latent * (latent - 1) // 2
 
     def network(self, inputs: int, width: int, draws: Draws) -> Mlp:
         """A network [..., I] -> [..., P] for `about`, whose output is 0 before training."""
-        net = Mlp(inputs, width, self.width, draws)
+        net = Mlp(inputs, width, self.parameters, draws)
         for parameter in net[-1].parameters():
             nn.init.zeros_(parameter)
         return net
@@ -54,10 +54,11 @@ class Correlated:
         drawn = torch.linalg.solve_triangular(self.triangle(lower), noise, upper=False, unitriangular=True)
         return mean + drawn[..., 0]
 
-    def log_mean(self, belief: Tensor, precision: Tensor, weighted: Tensor) -> Tensor:
-        """log E exp(b theta_hat - theta_hat P theta_hat / 2) [...], in closed form, of P [..., D, D] and b [..., D].
+    def log_expected(self, belief: Tensor, precision: Tensor, weighted: Tensor) -> Tensor:
+        """log E exp(b^T theta_hat - theta_hat^T P theta_hat / 2) [...], in closed form: P [..., D, D], b [..., D].
 
-        That is what a belief makes of evidence that is quadratic in theta_hat; both in double precision.
+        That is the log-likelihood of evidence that is quadratic in theta_hat under the belief, but for a constant. P
+        and b are in double precision.
         """
         mean, std, lower = self.split(belief)
         root = torch.linalg.solve_triangular(  # theta_hat = mean + root e, e normal
@@ -66,11 +67,11 @@ class Correlated:
         column = mean.double()[..., None]
         slope = weighted[..., None] - precision @ column
         at_mean = ((weighted[..., None] + slope) * column).sum((-1, -2)) / 2
-        return (at_mean + log_integral(root.mT @ precision @ root, root.mT @ slope)).float()
+        return (at_mean + log_expected_of_normal(root.mT @ precision @ root, root.mT @ slope)).float()
 
 
-def log_integral(precision: Tensor, weighted: Tensor) -> Tensor:
-    """log E exp(b e - e P e / 2) [...] of a standard normal e [D]: P [..., D, D], b [..., D, 1]."""
+def log_expected_of_normal(precision: Tensor, weighted: Tensor) -> Tensor:
+    """log E exp(b^T e - e^T P e / 2) [...] of a standard normal e [D]: P [..., D, D], b [..., D, 1]."""
     lower = posterior_root(precision)
     half = torch.linalg.solve_triangular(lower, weighted, upper=False)
     return half.square().sum((-1, -2)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -79,11 +80,18 @@ def log_integral(precision: Tensor, weighted: Tensor) -> Tensor:
 def posterior_root(precision: Tensor) -> Tensor:
     """The Cholesky factor [..., D, D] of 1 + P: of the precision of a posterior whose prior is a standard normal.
 
-    P is a sum in single precision; where evidence is so strong that its rounding exceeds the prior, that is added.
+    P is a sum in single precision, or a difference of two. Where its rounding exceeds the prior, as much is added to
+    that matrix, and to no other of the stack, as it needs to have a root. A matrix that is not finite has none: its
+    root is not finite either.
     """
     unit = torch.eye(precision.shape[-1], dtype=precision.dtype, device=precision.device)
     lower, failed = torch.linalg.cholesky_ex(precision + unit)
-    if failed.any():
-        rounding = ROUNDING * precision.diagonal(dim1=-2, dim2=-1).sum(-1)
-        lower = torch.linalg.cholesky(precision + (1 + rounding[..., None, None]) * unit)
-    return lower  # type: ignore[no-any-return]
+    if not failed.any():
+        return lower  # type: ignore[no-any-return]
+    with torch.no_grad():
+        amount = ROUNDING * precision.diagonal(dim1=-2, dim2=-1).abs().sum(-1)
+        added = torch.zeros_like(amount)
+        for i in range(TRIES):
+            added = torch.where(failed > 0, amount * 10**i, added)
+            failed = torch.linalg.cholesky_ex(precision + (1 + added[..., None, None]) * unit).info
+    return torch.linalg.cholesky_ex(precision + (1 + added[..., None, None]) * unit).L  # type: ignore[no-any-return]

@@ -1,8 +1,8 @@
 """Tasks whose theta drifts from episode to episode of a trial: learning from episodes, and forgetting between them.
 
 Within an episode theta is constant, so that the belief and the policy are trained on single episodes. A belief of
-earlier episodes keeps a share of its memory: evidence is tempered, p(theta | earlier) to the power of that share. The
-share is chosen without theta, by how well the belief predicts the next observations of exploration trials.
+earlier episodes keeps a share of its memory. So evidence is tempered: the likelihood of earlier episodes has that
+share for its power. The share is chosen without theta, by how well the belief predicts the next observations of trials.
 """
 
 import torch
@@ -27,12 +27,11 @@ def choose_kept(model: LatentModel, episodes: Batch, per_trial: int, draws: Draw
     seeds, steps = len(episodes.mask), episodes.mask.shape[2]
     trials = Batch(*(x.unflatten(1, (-1, per_trial)).repeat(1, SHARES, *[1] * (x.dim() - 1)) for x in episodes.tensors))
     shares = torch.linspace(0, 1, SHARES, device=episodes.mask.device) ** model.share_power
-    share = shares.repeat_interleave(trials.mask.shape[1] // SHARES)[None, :, None]
-    start = model.start(trials.mask.shape[1])
-    memory, log_likelihood = start, torch.zeros(seeds, trials.mask.shape[1], device=share.device)
+    share = shares.repeat_interleave(trials.mask.shape[1] // SHARES).expand(seeds, -1)
+    memory = model.start(trials.mask.shape[1])
+    log_likelihood = torch.zeros_like(share)
     for e in range(per_trial):
-        model.kept.fill_(1)
-        memory = model.forget(torch.lerp(start, memory, share))
+        memory = model.forget(memory, share)
         for t in range(steps):
             step = trials[:, :, e, t]
             log_likelihood += model.log_next(memory, step, draws) * step.mask

@@ -81,11 +81,11 @@ class DeconfoundedAgent(LearnedAgent):
         self._memory = self.model.update(self._memory, step)
 
     def loss(self, batch: Batch, belief: Tensor, steps: int | None, draws: Draws) -> Tensor:
-        """The imitation loss [S] on steps of expert trials; theta_hat_H is that of `final_belief`, by `hindsight`."""
+        """The imitation loss [S] on steps of expert trials; theta_hat_H is that of `final_belief`, by `for_cloning`."""
         index = batch.draw_steps(steps, draws)
         pairs = batch.steps(index)
         steps_each = batch.mask.shape[1:].numel() // belief.shape[1]  # of a belief: a trial's, or one
-        theta_hat = self.model.hindsight(take(belief, index // steps_each), draws)
+        theta_hat = self.model.for_cloning(take(belief, index // steps_each), draws)
         with torch.no_grad():
             inputs = self.model.inputs.obs(pairs.obs)
         return imitation_loss(self.policy.log_prob(torch.cat([inputs, theta_hat], -1), pairs.action), pairs.mask)

@@ -8,14 +8,14 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.dynamics import DynamicsHead
-from deconfounded.deconf.core.nets import Inputs, per_seed
+from deconfounded.deconf.core.nets import Inputs
 
 
 class LatentModel(nn.Module, ABC):
     """A model that infers theta_hat [D]. A *belief* is the parameters [P] of a distribution over theta_hat.
 
-    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts. It is one of 0, .1, ..., 1 to
-    the power of `share_power`.
+    `kept` [S]: the share of the memory that outlives an episode, 1 unless theta drifts. `drift.choose_kept` chooses one
+    of 0, .1, ..., 1 to the power of `share_power`.
     """
 
     kind: str
@@ -31,9 +31,10 @@ class LatentModel(nn.Module, ABC):
         super().__init__()
         self.register_buffer("kept", torch.ones(len(draws), device=draws.device))
 
-    def forget(self, memory: Tensor) -> Tensor:
-        """The memory [S, N, M] with which the next episode of a trial begins."""
-        return torch.lerp(self.start(memory.shape[1]), memory, per_seed(self.kept[:, None], memory))
+    def forget(self, memory: Tensor, share: Tensor | None = None) -> Tensor:
+        """The memory [S, N, M] with which the next episode of a trial begins. share [S, N]: by default, `kept`."""
+        share = self.kept[:, None] if share is None else share
+        return torch.lerp(self.start(memory.shape[1]), memory, share[..., None])
 
     @abstractmethod
     def start(self, n: int) -> Tensor:
@@ -63,7 +64,7 @@ class LatentModel(nn.Module, ABC):
         """The likeliest theta_hat [..., D]: of Gaussians the mean."""
         return self.mean(belief)
 
-    def hindsight(self, belief: Tensor, draws: Draws) -> Tensor:
+    def for_cloning(self, belief: Tensor, draws: Draws) -> Tensor:
         """The theta_hat [S, ..., D] on which policies are cloned, of beliefs [S, ..., P] about whole trials."""
         return self.sample(belief, draws)
 
@@ -89,10 +90,10 @@ class LatentModel(nn.Module, ABC):
         raise NotImplementedError
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
-        """Fit p(theta_hat) to beliefs [S, B, P] of whole trials."""
+        """Fit p(theta_hat), or the scale of latents, to beliefs [S, B, P] of whole trials."""
 
-    def spread(self) -> Tensor:
-        """The stds [S, D] of theta_hat, of the fitted prior."""
+    def latent_stds(self) -> Tensor:
+        """The stds [S, D] of theta_hat over trials, as `set_prior` has fitted them."""
         raise NotImplementedError
 
     def learn(self, optimizer: Adam, batch: Batch, steps: int | None, beta: float, draws: Draws) -> float:

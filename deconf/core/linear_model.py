@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.correlated import Correlated, log_integral, posterior_root
+from deconfounded.deconf.core.correlated import Correlated, log_expected_of_normal, posterior_root
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_model import LatentModel
@@ -20,12 +20,13 @@ ALIKE = 40  # steps in whose sum the error of f, alike in all of them, is as lar
 class LinearModel(LatentModel):
     """Bayesian linear regression on learned features (ALPaCA; Harrison, Sharma and Pavone, 2018), and a belief of it.
 
-    Dynamics are s' - s = f(s, a) + G(s, a) theta_hat + noise, and p(theta_hat) is a standard normal. What a trial tells
-    of theta_hat is then b theta_hat - theta_hat P theta_hat / 2, with sums over its steps, P of G' G and b of G' (s' -
-    s - f), in units of the noise: they are the memory. f, G and the noise maximise the likelihood of whole trials, in
-    which theta_hat is integrated out: Eq. (6) with the exact posterior in place of q_phi, so that the bound is tight,
-    and beta 1. With a drawn latent of a network in its place, whose error makes G too small, f learns theta's effect
-    wherever the state tells of theta, as it does if a controller that is wrong about theta drifts to one side.
+    Dynamics are s_next - s = f(s, a) + G(s, a) theta_hat + noise, and p(theta_hat) is a standard normal. The
+    log-likelihood of a trial is then b^T theta_hat - theta_hat^T P theta_hat / 2, but for a constant. P and b are sums
+    over its steps, of G^T G and of G^T (s_next - s - f), in units of the noise: they are the memory. f, G and the noise
+    maximise the exact marginal likelihood of trials and their beginnings: theta_hat is integrated out, by exact
+    inference (footnote 4 of the paper) in place of Eq. (6). Eq. (6) draws theta_hat from a network. The error of what
+    it draws makes G too small, and f learns theta's effect wherever the state tells of theta, as it does if a
+    controller that is wrong about theta drifts to one side.
 
     The posterior of this regression is not the belief. f is never exact; its errors add up over a trial, depend on
     where the behaviour goes, and the latents of an expert's trials are then not those of an agent's. And latents of
@@ -93,13 +94,13 @@ class LinearModel(LatentModel):
         posterior = self._posterior(memory)
         return posterior, self.mean(self._belief_of(posterior))
 
-    def hindsight(self, belief: Tensor, draws: Draws) -> Tensor:
+    def for_cloning(self, belief: Tensor, draws: Draws) -> Tensor:
         return self.mean(belief)
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         self.stds.copy_(self.mean(belief).std(1, correction=0).clamp(min=0.05))
 
-    def spread(self) -> Tensor:
+    def latent_stds(self) -> Tensor:
         return self.stds
 
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
@@ -110,10 +111,10 @@ class LinearModel(LatentModel):
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
         precision, weighted, squares = self._sums(self._terms(step))
-        log_mean = self.gaussian.log_mean(self.belief(memory), precision, weighted)
+        log_expected = self.gaussian.log_expected(self.belief(memory), precision, weighted)
         log_std = self.dynamics.log_std
         constant = log_std.sum(-1) + log_std.shape[-1] * math.log(2 * math.pi) / 2
-        return log_mean - squares.float() / 2 - constant[:, None]
+        return log_expected - squares.float() / 2 - constant[:, None]
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         terms = self._terms(batch)
@@ -132,16 +133,19 @@ class LinearModel(LatentModel):
         return self.surprise(terms.sum(2)) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
 
     def surprise(self, memory: Tensor) -> Tensor:
-        """-log p [S] of trials with memories [S, B, M], theta_hat integrated out; a step, but for a constant."""
+        """-log p [S] of trials with memories [S, B, M], theta_hat integrated out: a mean over steps.
+
+        Without its constant, log(2 pi) / 2 for each number of an observation.
+        """
         precision, weighted, squares = self._sums(memory)
-        total = squares / 2 - log_integral(precision, weighted[..., None])
+        total = squares / 2 - log_expected_of_normal(precision, weighted[..., None])
         return (total.sum(-1) / memory[..., -1].sum(-1).clamp(min=1)).float() + self.dynamics.log_std.sum(-1)
 
     def prediction_loss(self, before: Tensor, after: Tensor) -> Tensor:
-        """-log p [S] of the evidence in memories `after` under the beliefs of `before`, both [S, N, M]; a step."""
+        """-log p [S] of the evidence in memories `after` under the beliefs of `before`, both [S, N, M]: by step."""
         after = after / (1 + after[..., -1:] / ALIKE)
         precision, weighted, _ = self._sums(after)
-        log_likelihood = self.gaussian.log_mean(self.belief(before), precision, weighted)
+        log_likelihood = self.gaussian.log_expected(self.belief(before), precision, weighted)
         return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
 
 

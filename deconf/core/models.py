@@ -112,7 +112,7 @@ class VariationalModel(LatentModel):
         assert isinstance(self.encoder, InnovationBelief)
         return self.encoder.read(memory), self.mean(self.belief(memory))
 
-    def spread(self) -> Tensor:
+    def latent_stds(self) -> Tensor:
         return self.encoder.prior_std
 
 
@@ -156,8 +156,8 @@ class DiscreteModel(LatentModel):
     def mean(self, belief: Tensor) -> Tensor:
         return belief
 
-    def forget(self, memory: Tensor) -> Tensor:
-        return super().forget(memory).log_softmax(-1)
+    def forget(self, memory: Tensor, share: Tensor | None = None) -> Tensor:
+        return super().forget(memory, share).log_softmax(-1)
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
         return torch.logsumexp(memory + self._evidence(step), -1)

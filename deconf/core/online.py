@@ -17,11 +17,11 @@ class OnlineBelief(nn.Module):
     """q(theta_hat_H | tau_:t), a Gaussian: a second network that reads the memory of a model.
 
     The policy is cloned given latents of whole trials, theta_hat_H, and deployed on what beginnings tell of them. The
-    model's own belief is not trained for that: by Eq. (6) with a beta far below 1 its std says little of how far its
-    mean is from theta_hat_H (ten times as far and more, early in a trial), and its mean may lie where no trial's latent
-    is. This network is trained on exploration to give the density of theta_hat_H, inferred on the whole trial. It gives
-    what is to be added to the mean of the model's belief, and the covariance: a *belief* is that of `Correlated`,
-    deviations from the mean in units of the stds of theta_hat_H.
+    model's own belief is not trained for that. The linear model's is to predict evidence. By Eq. (6) with a beta far
+    below 1, a belief's std says little of how far its mean is from theta_hat_H (ten times as far and more, early in a
+    trial), and its mean may lie where no trial's latent is. This network is trained on exploration to give the density
+    of theta_hat_H, inferred on the whole trial. It gives what is to be added to the mean of the model's belief, and the
+    covariance: a *belief* is that of `Correlated`, deviations from the mean in units of the stds of theta_hat_H.
     """
 
     unit: Tensor  # stds of theta_hat_H [S, D]
@@ -29,14 +29,14 @@ class OnlineBelief(nn.Module):
     def __init__(self, model: LatentModel, width: int, draws: Draws) -> None:
         super().__init__()
         self.gaussian = Correlated(model.latent)
-        self.register_buffer("unit", torch.ones_like(model.spread()))
+        self.register_buffer("unit", torch.ones_like(model.latent_stds()))
         self.net = self.gaussian.network(model.read_width, width, draws)
 
     def forward(self, model: LatentModel, memory: Tensor) -> Tensor:
         """Memories [S, ..., M] -> beliefs [S, ..., P]."""
         with torch.no_grad():
             read, mean = model.read(memory)
-        apart = self.gaussian.about(torch.zeros_like(mean), self.net(read))
+        apart = self.gaussian.about(torch.zeros_like(mean), self.net(read))  # from the mean, in units
         added, *rest = self.gaussian.split(apart)
         return torch.cat([mean + per_seed(self.unit, mean) * added, *rest], -1)
 
@@ -69,7 +69,7 @@ class OnlineBelief(nn.Module):
         self, model: LatentModel, explored: Batch, updates: int, draws: Draws, latents: Tensor | None = None
     ) -> None:
         """Train on trials [S, B, T] of exploration. latents [S, B, D]: theirs; None: those inferred on whole trials."""
-        self.unit.copy_(model.spread())
+        self.unit.copy_(model.latent_stds())
         memory, theta_hat = memories(model, explored, draws, latents)
         optimizer = Adam([self], RATE, updates)
         for _ in range(updates):

@@ -32,8 +32,8 @@ Explore = Callable[[Agent | None], Trials]
 class DeconfoundedConfig(Configuration):
     """Hyperparameters for each seed. Each round explores, then updates the model, the online belief and the policy.
 
-    The linear and the discrete model have exact likelihoods: beta, warm_up, inference_steps and fit_prior do not apply
-    to them.
+    The linear and the discrete model have exact likelihoods: beta, warm_up and inference_steps do not apply to them.
+    Their priors are fixed; by fit_prior the linear model takes the scale of latents, for its online belief.
     """
 
     model: Literal["linear", "innovations", "evidence", "forgetting", "gru", "discrete"] = "linear"
@@ -118,7 +118,7 @@ def train(
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)
         belief = final_belief(model, expert)
-        latents = model.hindsight(belief, draws)
+        latents = model.for_cloning(belief, draws)
         if config.fit_prior:
             model.set_prior(belief, draws)
         if online is not None:

@@ -8,8 +8,9 @@ from torch.distributions import MultivariateNormal
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.correlated import Correlated, posterior_root
 from deconfounded.deconf.core.data import Batch, Signature
+from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.latent_model import final_belief
-from deconfounded.deconf.core.linear_model import LinearModel
+from deconfounded.deconf.core.linear_model import ALIKE, LinearModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
 from tests.deconf.ball import STEPS, pushed, streams
@@ -53,7 +54,7 @@ def test_mean_of_evidence_under_a_belief() -> None:
     weighted = torch.tensor([0.8, -0.4], dtype=torch.float64)
     drawn = gaussian.sample(belief.expand(1, 400_000, -1), draws)[0].double()
     likelihood = (drawn @ weighted - ((drawn @ precision) * drawn).sum(-1) / 2).exp()
-    exact = gaussian.log_mean(belief, precision[None, None], weighted[None, None]).exp().item()
+    exact = gaussian.log_expected(belief, precision[None, None], weighted[None, None]).exp().item()
     assert exact == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
 
 
@@ -117,7 +118,7 @@ def test_belief_is_the_posterior(trained: LinearModel) -> None:
     online.fit(trained, data, 300, streams())
     innovation = (fresh.next_obs - fresh.obs - fresh.action)[0, ..., 0]
     with torch.no_grad():
-        whole = trained.hindsight(final_belief(trained, fresh), streams())[0]
+        whole = trained.for_cloning(final_belief(trained, fresh), streams())[0]
         weights = torch.linalg.lstsq(whole, theta[:, None]).solution
         assert ((whole @ weights)[:, 0] - theta).square().mean() < 1.5 / (STEPS + 1)
         for t in (4, 12):
@@ -160,6 +161,60 @@ def test_evidence_without_noise() -> None:
     assert torch.isfinite(belief).all()
 
 
+def test_evidence_is_predicted_from_what_was_before() -> None:
+    """The belief after t steps of a trial predicts the evidence of its others, step t + 1 among them."""
+    data, _ = pushed(6, np.random.default_rng(4))
+    model = untrained(2, data)
+    pairs = []
+    model.prediction_loss = lambda *pair: pairs.append(pair) or torch.zeros(1)  # type: ignore[func-returns-value, method-assign]
+    model.loss(data, None, 0.0, streams())
+    (before, after), (course, whole) = pairs[0], model.course(data)
+    done = before[0, :, -1].long()
+    assert (done.min().item(), done.max().item()) == (0, STEPS - 1)
+    trial = torch.cdist(before[0] + after[0], whole[0, :, 0]).argmin(1)
+    torch.testing.assert_close(before[0], course[0, trial, done], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(before[0] + after[0], whole[0, trial, 0], rtol=1e-4, atol=1e-3)
+
+
+def test_an_error_alike_in_all_steps_is_allowed_for() -> None:
+    """The mean innovation of n steps has variance 1 / n of noise and 1 / ALIKE of f's error, given theta_hat."""
+    data, _ = pushed(3, np.random.default_rng(1))
+    model, n, gain, seen = untrained(1, data), 30, 1.5, 0.7
+    after = torch.tensor([[[n * gain**2, n * gain * seen, n * gain * seen, n * seen**2, n]]])
+    losses, exact = [], []
+    for mean, std in ((0.2, 0.3), (-0.4, 1.0)):
+        model.belief = lambda memory, mean=mean, std=std: torch.tensor([[[mean, std]]])  # type: ignore[method-assign]
+        losses.append(model.prediction_loss(after, after).item() * n / (1 + n / ALIKE))
+        scale = torch.tensor((gain * std) ** 2 + 1 / n + 1 / ALIKE).sqrt()
+        exact.append(-torch.distributions.Normal(gain * mean, scale).log_prob(torch.tensor(seen)).item())
+    assert losses[0] - losses[1] == pytest.approx(exact[0] - exact[1], rel=1e-4)
+
+
+def test_how_much_of_earlier_episodes_is_kept(trained: LinearModel) -> None:
+    """Nearly all where theta stays, nothing where it is drawn anew: halves of trials, and of others' trials."""
+    data, _ = pushed(512, np.random.default_rng(6))
+    halves = data[:, :, : STEPS // 2].tensors, data[:, :, STEPS // 2 :].tensors
+    for shift, low, high in ((0, 0.7, 1.0), (1, 0.0, 0.01)):
+        paired = [torch.stack([one, other.roll(shift, 1)], 2).flatten(1, 2) for one, other in zip(*halves, strict=True)]
+        choose_kept(trained, Batch(*paired), 2, streams())
+        assert low <= trained.kept.item() <= high
+    trained.kept.fill_(1)
+
+
+def test_evidence_that_is_strong_at_first() -> None:
+    """What follows is a difference of large sums: where its rounding exceeds it, training goes on."""
+    data, _ = pushed(64, np.random.default_rng(5))
+    model = untrained(4, data)
+    terms = model._terms(data).detach()
+    terms[:, :, : STEPS // 2] *= 1e9
+    terms[:, :, STEPS // 2 :, :-1] *= 30
+    terms[..., -1] = 1
+    model._terms = lambda batch: terms.clone().requires_grad_()  # type: ignore[method-assign]
+    for _ in range(5):
+        model.loss(data, None, 0.0, streams()).sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.reader.parameters() if p.grad is not None)
+
+
 def test_a_posterior_of_rounded_sums() -> None:
     """1 + P is not positive definite any more where P is rounded: its root is that of a matrix nearby."""
     direction = torch.tensor([1.0, 0.7, -0.3])
@@ -168,3 +223,10 @@ def test_a_posterior_of_rounded_sums() -> None:
     assert torch.linalg.cholesky_ex(precision + torch.eye(3)).info > 0
     root = posterior_root(precision)
     assert (root @ root.T - precision).abs().max() < 1e-4 * precision.max()
+    other = torch.diag(torch.tensor([1e4, 3.0, 2.0])).double()
+    difference = other - 1e3 * torch.diag(torch.tensor([0.0, 0.0, 1.0])).double()  # rounding, of sums of 1e10
+    both = posterior_root(torch.stack([precision, other, difference]))
+    assert torch.equal(both[1], posterior_root(other))
+    assert torch.equal(both[0], root)
+    assert torch.isfinite(both).all()
+    assert not torch.isfinite(posterior_root(torch.stack([other, other * torch.nan]))[1]).all()
