@@ -14,6 +14,7 @@ from deconfounded.deconf.core.nets import Inputs, Scales, per_seed
 
 READ = 256  # memories an update, from each of which the evidence that follows is predicted
 HALVES = 8  # of a trial an update, from each of which the evidence of the other half is predicted
+ERROR = 0.1  # variance of the error of f and G in a step, relative to that of theta's effect there
 ALIKE = 40  # steps in whose sum the error of f, alike in all of them, is as large as the noise
 
 
@@ -28,6 +29,11 @@ class LinearModel(LatentModel):
     it draws makes G too small, and f learns theta's effect wherever the state tells of theta, as it does if a
     controller that is wrong about theta drifts to one side.
 
+    The noise of a column has a variance that is learned, s^2, and ERROR of that of theta's effect in the step, |G|^2:
+    f and G are never exact, so that a step of one column is worth at most 1 / ERROR readings of theta. Without that, G
+    grows without bound where f is poor and s^2, which is the same everywhere, too small: an angle that wraps, a
+    contact, the end of a lane. Such a step then outweighs all others of its trial.
+
     The posterior of this regression is not the belief. f is never exact; its errors add up over a trial, depend on
     where the behaviour goes, and the latents of an expert's trials are then not those of an agent's. And latents of
     different thetas lie near a surface, not all over the prior. So the belief is a Gaussian with covariance that a
@@ -40,6 +46,7 @@ class LinearModel(LatentModel):
     kind = "linear"
     share_power = 3  # evidence is strong: of an episode's, what a drift of theta leaves is a hundredth or so
     stds: Tensor
+    error: Tensor
 
     def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(draws)
@@ -47,23 +54,26 @@ class LinearModel(LatentModel):
         self.dynamics: LinearDynamicsHead = LinearDynamicsHead(latent, width, self.inputs, draws)
         self.gaussian, self.read_width = Correlated(latent), 2 * latent + 1
         self.register_buffer("stds", torch.ones(len(draws), latent, device=draws.device))
+        self.register_buffer("error", torch.full((len(draws), 1), ERROR, device=draws.device))
         self.reader = self.gaussian.network(self.read_width, width, draws)
 
     def _terms(self, batch: Batch) -> Tensor:
-        """Increments of the memory [..., M], one a transition: products of (G, s' - s - f), and a count of 1."""
+        """Increments of the memory [..., M], one a transition: products of (G, s_next - s - f), log s, a count of 1."""
         expected, gains = self.dynamics.parts(batch.obs, batch.action)
         innovation = self.dynamics.change(batch.next_obs - batch.obs) - expected
-        weight = batch.mask[..., None] / per_seed(self.dynamics.log_std.exp(), expected)
-        both = torch.cat([gains, innovation[..., None]], -1) * weight[..., None]
-        return torch.cat([products(both.mT, both).flatten(-2), batch.mask[..., None]], -1)
+        noise, error = (per_seed(x, expected) for x in ((2 * self.dynamics.log_std).exp(), self.error))
+        variance = noise + error * gains.square().sum(-1)
+        both = torch.cat([gains, innovation[..., None]], -1) * (batch.mask[..., None] * variance.rsqrt())[..., None]
+        log_std = batch.mask[..., None] * variance.log().sum(-1, keepdim=True) / 2
+        return torch.cat([products(both.mT, both).flatten(-2), log_std, batch.mask[..., None]], -1)
 
     def _sums(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """P [..., D, D], b [..., D] and the squares of innovations [...], in double precision."""
-        sums = memory[..., :-1].double().unflatten(-1, (self.latent + 1, -1))
+        sums = memory[..., :-2].double().unflatten(-1, (self.latent + 1, -1))
         return sums[..., :-1, :-1], sums[..., :-1, -1], sums[..., -1, -1]
 
     def start(self, n: int) -> Tensor:
-        return self.kept.new_zeros(len(self.kept), n, (self.latent + 1) ** 2 + 1)
+        return self.kept.new_zeros(len(self.kept), n, (self.latent + 1) ** 2 + 2)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)
@@ -110,11 +120,11 @@ class LinearModel(LatentModel):
         return self.gaussian.split(belief)[0]
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
-        precision, weighted, squares = self._sums(self._terms(step))
+        terms = self._terms(step)
+        precision, weighted, squares = self._sums(terms)
         log_expected = self.gaussian.log_expected(self.belief(memory), precision, weighted)
-        log_std = self.dynamics.log_std
-        constant = log_std.sum(-1) + log_std.shape[-1] * math.log(2 * math.pi) / 2
-        return log_expected - squares.float() / 2 - constant[:, None]
+        constant = step.mask * self.dynamics.log_std.shape[-1] * math.log(2 * math.pi) / 2
+        return log_expected - squares.float() / 2 - terms[..., -2] - constant
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         terms = self._terms(batch)
@@ -138,8 +148,8 @@ class LinearModel(LatentModel):
         Without its constant, log(2 pi) / 2 for each number of an observation.
         """
         precision, weighted, squares = self._sums(memory)
-        total = squares / 2 - log_expected_of_normal(precision, weighted[..., None])
-        return (total.sum(-1) / memory[..., -1].sum(-1).clamp(min=1)).float() + self.dynamics.log_std.sum(-1)
+        total = squares / 2 - log_expected_of_normal(precision, weighted[..., None]) + memory[..., -2]
+        return (total.sum(-1) / memory[..., -1].sum(-1).clamp(min=1)).float()
 
     def prediction_loss(self, before: Tensor, after: Tensor) -> Tensor:
         """-log p [S] of the evidence in memories `after` under the beliefs of `before`, both [S, N, M]: by step."""

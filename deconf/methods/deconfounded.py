@@ -83,7 +83,7 @@ def train(
     model, policy, online = agent.model, agent.policy, agent.online
     inference_batch = config.inference_batch
     if config.drifts:
-        model.kept.fill_(0.5)  # during exploration
+        model.kept.fill_(0.5**model.share_power)  # during exploration
         inference_batch = inference_batch and inference_batch * episodes  # as many steps as of whole trials
 
     inferences = config.rounds * config.inference_updates
@@ -187,7 +187,7 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 
 
 @uses(
-    *USES, version=6, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+    *USES, version=7, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""
