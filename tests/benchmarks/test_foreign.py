@@ -99,3 +99,16 @@ def test_report_says_of_which_version_scores_are() -> None:
         "Scores of deconfounded are of its version 6; of an earlier one: old, unknown."
     )
     assert report.scored([row("new", 6, deconfounded=1)]) == "Scores of deconfounded are of its version 6."
+
+
+def test_report_correlates_gaps_that_are_predicted() -> None:
+    """Where the diagnosis cannot tell it predicts none; the figure with what its rollouts have there is in brackets."""
+
+    def row(predicted: float, gap: float, right: bool | None) -> dict[str, object]:
+        scores = {"naive_rnn": 0.0, "deconfounded": gap}
+        verdict = {"verdict": "confounded", "right": right, "predicted": predicted, "splits": 3}
+        return {"case": "", "unseen": True, "scores": scores} | verdict
+
+    rows = [row(0.1, 0.2, True), row(0.2, 0.3, True), row(0.3, 0.4, False), row(0.9, 0.0, None)]
+    assert "measured gaps is 1.00 (-0.20 with those of which it cannot tell" in report.summary(rows)
+    assert "correlation" not in report.summary(rows[2:])

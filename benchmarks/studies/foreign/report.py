@@ -24,15 +24,24 @@ def summary(rows: list[dict[str, Any]]) -> str:
         sure = sum(row.get("agreeing") == row["splits"] for row in wrong)
         share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {len(wrong)} wrong"
         share += f" ({sure} of these with all splits agreeing)" * bool(wrong)
-        both = [(row["predicted"], gap) for row in of if (gap := measured(row)) is not None]
-        rank = stats.spearmanr(*zip(*both, strict=True)).statistic if len(both) > 2 else None
-        alike = "" if rank is None else f"; the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
+        gaps = [(row, gap) for row in of if (gap := measured(row)) is not None]
+        of_sure = [(row, gap) for row, gap in gaps if row["right"] is not None]
+        ranks = [rank for rows_of in (of_sure, gaps) if (rank := rank_correlation(rows_of))]
+        alike = f"; the rank correlation of predicted and measured gaps is {' ('.join(ranks)}" * bool(ranks)
+        alike += " with those of which it cannot tell, and predicts none)" * (len(ranks) == 2)
         sentences.append(f"Of the half {what}, {share}{alike}.")
     if of_version := scored(rows):
         sentences.append(of_version)
     if few := [row["case"] for row in rows if row.get("splits") == 1]:
         sentences.append(f"Judged by a single split of their trials, so far: {', '.join(few)}.")
     return " ".join(sentences)
+
+
+def rank_correlation(gaps: list[tuple[dict[str, Any], float]]) -> str:
+    """Spearman's, of predicted and measured gaps; nothing of less than three."""
+    if len(gaps) < 3:
+        return ""
+    return two_decimals(stats.spearmanr([row["predicted"] for row, _ in gaps], [gap for _, gap in gaps]).statistic)
 
 
 def scored(rows: list[dict[str, Any]]) -> str:
