@@ -94,4 +94,6 @@ def posterior_root(precision: Tensor) -> Tensor:
         for i in range(TRIES):
             added = torch.where(failed > 0, amount * 10**i, added)
             failed = torch.linalg.cholesky_ex(precision + (1 + added[..., None, None]) * unit).info
+            if not failed.any():
+                break
     return torch.linalg.cholesky_ex(precision + (1 + added[..., None, None]) * unit).L  # type: ignore[no-any-return]

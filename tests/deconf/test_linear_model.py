@@ -13,6 +13,7 @@ from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.linear_model import ALIKE, ERROR, LinearModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
+from deconfounded.envs.support.errors import InputError
 from tests.deconf.ball import STEPS, pushed, streams
 
 
@@ -260,3 +261,13 @@ def test_a_posterior_of_rounded_sums() -> None:
     assert torch.equal(both[0], root)
     assert torch.isfinite(both).all()
     assert not torch.isfinite(posterior_root(torch.stack([other, other * torch.nan]))[1]).all()
+
+
+def test_training_that_diverges_says_so() -> None:
+    """Numbers that are not finite reach the optimiser, which has a line for them; no factorisation fails first."""
+    data, _ = pushed(8, np.random.default_rng(6))
+    model = untrained(2, data)
+    with torch.no_grad():
+        model.dynamics.gains[-1].bias.fill_(1e25)
+    with pytest.raises(InputError, match="lower learning rate"):
+        model.learn(Adam([model], 1e-2, 10), data, None, 0.0, streams())
