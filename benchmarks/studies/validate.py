@@ -136,10 +136,15 @@ def summary(rows: list[dict[str, Any]]) -> str:
         of = [row for row in rows if _unseen(row) is unseen]
         if len(of) > 2:
             share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
-            rank = stats.spearmanr([row["predicted"] for row in of], [row["measured"] for row in of]).statistic
-            alike = f"the rank correlation of predicted and measured gaps is {two_decimals(rank)}"
+            rank = rank_correlation([(row["predicted"], row["measured"]) for row in of])
+            alike = f"the rank correlation of predicted and measured gaps is {rank}"
             sentences.append(f"Of cases {what}, {share}; {alike}.")
     return " ".join(sentences)
+
+
+def rank_correlation(gaps: list[tuple[float, float]]) -> str:
+    """Spearman's, of predicted and measured gaps, three pairs or more."""
+    return two_decimals(stats.spearmanr(*zip(*gaps, strict=True)).statistic)
 
 
 def table(rows: list[dict[str, Any]]) -> str:

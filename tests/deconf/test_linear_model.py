@@ -21,14 +21,17 @@ def untrained(latent: int, data: Batch) -> LinearModel:
     return LinearModel(latent, 32, Scales.of(Signature(1, 1, 0, False), data), streams())
 
 
+def fitted(model: LinearModel, data: Batch, updates: int) -> LinearModel:
+    draws, optimizer = streams(), Adam([model], 1e-2, updates)
+    for update in range(updates):
+        model.learn(optimizer, data.beginnings(update, 0.1).draw_trials(32, draws), None, 0.0, draws)
+    return model.eval()
+
+
 @pytest.fixture(scope="module")
 def trained() -> LinearModel:
     data, _ = pushed(256, np.random.default_rng(0))
-    model, draws = untrained(2, data), streams()
-    optimizer = Adam([model], 1e-2, 900)
-    for update in range(900):
-        model.learn(optimizer, data.beginnings(update, 0.1).draw_trials(32, draws), None, 0.0, draws)
-    return model.eval()
+    return fitted(untrained(2, data), data, 900)
 
 
 def test_likelihood_of_a_trial() -> None:
@@ -71,9 +74,10 @@ def test_likelihood_of_the_next_step() -> None:
         exact = model.log_next(memory, step, draws)[0].exp()
         belief = model.belief(memory)
         for i in range(3):
-            repeated = (x[:, i : i + 1].expand(1, count, -1) for x in (step.obs, step.action, step.next_obs))
+            obs, action, next_obs = (
+                x[:, i : i + 1].expand(1, count, -1) for x in (step.obs, step.action, step.next_obs)
+            )
             theta_hat = model.sample(belief[:, i : i + 1].expand(1, count, -1), draws)
-            obs, action, next_obs = repeated
             expected, gains = model.dynamics.parts(obs, action)
             rest = model.dynamics.change(next_obs - obs) - expected - (gains * theta_hat[..., None, :]).sum(-1)
             noise = (np.exp(-0.8) + ERROR * gains.square().sum(-1)).sqrt()
@@ -181,13 +185,11 @@ def test_steps_that_no_dynamics_explain() -> None:
         return Batch(obs, data.action, next_obs, data.mask), theta
 
     data, _ = wrapped(256, 0)
-    model, draws = LinearModel(2, 32, Scales.of(Signature(2, 1, 0, False), data), streams()), streams()
-    optimizer = Adam([model], 1e-2, 600)
-    for update in range(600):
-        model.learn(optimizer, data.beginnings(update, 0.1).draw_trials(32, draws), None, 0.0, draws)
+    scales = Scales.of(Signature(2, 1, 0, False), data)
+    model = fitted(LinearModel(2, 32, scales, streams()), data, 600)
     fresh, theta = wrapped(2048, 1)
     with torch.no_grad():
-        whole = model.eval().mean(final_belief(model, fresh))[0]
+        whole = model.mean(final_belief(model, fresh))[0]
     weights = torch.linalg.lstsq(whole, theta[:, None]).solution
     assert ((whole @ weights)[:, 0] - theta).square().mean() < 0.3
 

@@ -38,9 +38,9 @@ class Bench:
     """What a world's agents are made of, made when first asked for, and the returns of those that were scored."""
 
     def __init__(self, case: Case, folder: Path) -> None:
-        self.case, self.file = case, folder / "returns.json"
-        self.returns: dict[str, list[float]] = json.loads(self.file.read_bytes()) if self.file.is_file() else {}
-        self.method_versions: dict[str, int] = rows().get(case.name, {}).get("method_versions", {})
+        self.case, self.file = case, folder / "measured.json"
+        made = json.loads(self.file.read_bytes()) if self.file.is_file() else {"returns": {}, "method_versions": {}}
+        self.made: dict[str, dict[str, Any]] = made
         self._scorer: Scorer | None = None
         self._demonstrated: Rollout | None = None
 
@@ -61,22 +61,18 @@ class Bench:
 
     def measure(self, name: str) -> str:
         """Measure the mean return of each episode of an agent, and keep it; returns the last one, to print."""
-        if name not in self.returns:
+        returns, versions = self.made["returns"], self.made["method_versions"]
+        if name not in returns:
             agent = (AGENTS | LATER)[name](self)
             if agent is None:
                 return "none"
-            self.returns[name] = self.scorer.returns(agent).mean(0).tolist()
-            write_json(self.file, self.returns)
+            returns[name] = self.scorer.returns(agent).mean(0).tolist()
             if name in METHODS:
-                self.method_versions[name] = METHODS[name].version
-        if {"random", "expert", "told another"} <= self.returns.keys():
-            write(
-                self.case,
-                returns=self.returns,
-                scores=scores(self.returns),
-                method_versions=self.method_versions,
-            )
-        return f"{self.returns[name][-1]:.4g}"
+                versions[name] = METHODS[name].version
+            write_json(self.file, self.made)
+        if {"random", "expert", "told another"} <= returns.keys():
+            write(self.case, scores=scores(returns), **self.made)
+        return f"{returns[name][-1]:.4g}"
 
 
 def _naive_rnn(bench: Bench) -> Agent:
@@ -162,19 +158,14 @@ def diagnosed(case: Case, folder: Path) -> str:
     return f"{diagnosis.verdict}, tier {diagnosis.tier}: {'right' if right else 'not right'}"
 
 
-def rows() -> dict[str, dict[str, Any]]:
-    """What was measured, a row a case."""
-    return {row["case"]: row for row in kept(KEPT) or ()}
-
-
 def write(case: Case, **measured: Any) -> None:
     """Put what was measured in the case's row."""
-    by_case = rows()
+    rows = {row["case"]: row for row in kept(KEPT) or ()}
     versions = identity.versions() | {name: metadata.version(name) for name in SIMULATORS}
     about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": versions}
     row = {"case": case.name, "world": case.reference, "tier": case.tier, "unseen": case.unseen}
-    by_case[case.name] = by_case.get(case.name, {}) | row | measured | about
-    write_json(DOCS / f"{KEPT}.json", [by_case[case.name] for case in CASES if case.name in by_case])
+    rows[case.name] = rows.get(case.name, {}) | row | measured | about
+    write_json(DOCS / f"{KEPT}.json", [rows[case.name] for case in CASES if case.name in rows])
 
 
 def main() -> None:

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from scipy import stats
-
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
+from deconfounded.benchmarks.studies.validate import rank_correlation
 from deconfounded.deconf.diagnosis.verdict import with_tier
 
 KEPT = "diagnose/foreign"
@@ -24,9 +23,10 @@ def summary(rows: list[dict[str, Any]]) -> str:
         sure = sum(row.get("agreeing") == row["splits"] for row in wrong)
         share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {len(wrong)} wrong"
         share += f" ({sure} of these with all splits agreeing)" * bool(wrong)
-        gaps = [(row, gap) for row in of if (gap := measured(row)) is not None]
-        of_sure = [(row, gap) for row, gap in gaps if row["right"] is not None]
-        ranks = [rank for rows_of in (of_sure, gaps) if (rank := rank_correlation(rows_of))]
+        ranks = []
+        for rows_of in ([row for row in of if row["right"] is not None], of):
+            gaps = [(row["predicted"], gap) for row in rows_of if (gap := measured(row)) is not None]
+            ranks += [rank_correlation(gaps)] if len(gaps) > 2 else []
         alike = f"; the rank correlation of predicted and measured gaps is {' ('.join(ranks)}" * bool(ranks)
         alike += " with those of which it cannot tell, and predicts none)" * (len(ranks) == 2)
         sentences.append(f"Of the half {what}, {share}{alike}.")
@@ -35,13 +35,6 @@ def summary(rows: list[dict[str, Any]]) -> str:
     if few := [row["case"] for row in rows if row.get("splits") == 1]:
         sentences.append(f"Judged by a single split of their trials, so far: {', '.join(few)}.")
     return " ".join(sentences)
-
-
-def rank_correlation(gaps: list[tuple[dict[str, Any], float]]) -> str:
-    """Spearman's, of predicted and measured gaps; nothing of less than three."""
-    if len(gaps) < 3:
-        return ""
-    return two_decimals(stats.spearmanr([row["predicted"] for row, _ in gaps], [gap for _, gap in gaps]).statistic)
 
 
 def scored(rows: list[dict[str, Any]]) -> str:
