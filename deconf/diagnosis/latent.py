@@ -95,7 +95,7 @@ def from_dynamics(
     gain = _gain(log_policy(policy), log_policy(other), model, held_out, draws)
     in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
     in_trials = _evidence(log_next(dynamics), model, held_out, per_theta, draws)
-    return Explanation(dynamics, policy, model.sample(belief, draws), gain, in_actions, evidence, in_trials)
+    return Explanation(dynamics, policy, model.for_cloning(belief, draws), gain, in_actions, evidence, in_trials)
 
 
 def typical(x: Tensor, batch: Batch) -> float:
@@ -157,7 +157,7 @@ def in_range(expert: Batch, explored: Batch) -> Batch:
 @torch.no_grad()
 def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
     """Its dynamics, with noise of the residuals' size in these trials: falls and the like inflate that of training."""
-    head, latents = copy.deepcopy(model.dynamics), _per_step(data, model.sample(_belief(model, data), draws))
+    head, latents = copy.deepcopy(model.dynamics), _per_step(data, model.for_cloning(_belief(model, data), draws))
     if not model.inputs.signature.binary:
         residual = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
         variance = masked_mean(residual.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
@@ -171,7 +171,7 @@ def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int
 
     Nats a step. The other trial is `per_theta` before.
     """
-    odd, latents = odd_steps(data), model.sample(_belief(model, data), draws)
+    odd, latents = odd_steps(data), model.for_cloning(_belief(model, data), draws)
     own, other = (log_prob(odd, _per_step(odd, x)) for x in (latents, latents.roll(per_theta, 1)))
     return typical(own - other, odd)
 
@@ -179,7 +179,7 @@ def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int
 @torch.no_grad()
 def _gain(log_prob: LogProb, less: LogProb, model: LatentModel, data: Batch, draws: Draws) -> float:
     """Log-likelihood of odd steps given the latent of the even ones, less that by another policy; nats a step."""
-    odd, latents = odd_steps(data), _per_step(data, model.sample(_belief(model, data), draws))
+    odd, latents = odd_steps(data), _per_step(data, model.for_cloning(_belief(model, data), draws))
     return typical(log_prob(odd, latents) - less(odd, latents), odd)
 
 

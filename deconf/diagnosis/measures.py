@@ -59,7 +59,7 @@ class Amounts:
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
     offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
     exploring: DeconfoundedConfig = field(
-        default_factory=lambda: DeconfoundedConfig(model="innovations", inference_updates=2000, shortest=1 / 4)
+        default_factory=lambda: DeconfoundedConfig(inference_updates=2000, shortest=1 / 4)
     )  # with shorter sets the bandit's latent is ignored for too long
 
     def fitting(self, width: int) -> "Amounts":

@@ -31,7 +31,7 @@ TINY = Amounts(
     cloning=MemorylessConfig(updates=5, batch=64),
     naive=RecurrentConfig(updates=6, batch=4),
     offline=OfflineConfig(offline_updates=5, online_updates=0, offline_batch=4, offline_steps=16),
-    exploring=DeconfoundedConfig(model="innovations", inference_updates=5, inference_batch=4, inference_steps=32),
+    exploring=DeconfoundedConfig(inference_updates=5, inference_batch=4, inference_steps=32),
 )
 
 

@@ -16,7 +16,7 @@ from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.experts.rollout import Trials
 
 NOISE, FALL = 0.1, 1.5
-EXPLORING = DeconfoundedConfig(model="innovations", inference_updates=400, inference_rate=3e-3)
+EXPLORING = DeconfoundedConfig(inference_updates=1600, inference_rate=3e-3)
 CLONING = MemorylessConfig(updates=200)
 
 
@@ -95,7 +95,7 @@ def test_how_much_trials_and_episodes_differ() -> None:
 @pytest.mark.slow
 def test_theta_that_drifts() -> None:
     """Each episode of the 48 training trials has a latent of its own; in whole trials there is no evidence of one."""
-    few = replace(EXPLORING, inference_updates=250, inference_rate=6e-3)
+    few = replace(EXPLORING, inference_updates=1000, inference_rate=6e-3)
     rng, amounts = np.random.default_rng(0), Amounts(exploring=few, cloning=replace(CLONING, updates=20))
     expert, explored = (
         split(world(0.2, kind, 64, seed, 4, drifts=True), 0.25, rng) for seed, kind in enumerate((True, False))

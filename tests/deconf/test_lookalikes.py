@@ -21,7 +21,7 @@ SMALL = Amounts(
     rollouts=48,
     cloning=MemorylessConfig(updates=200, width=32),
     naive=RecurrentConfig(updates=130, width=32),
-    exploring=DeconfoundedConfig(model="innovations", inference_updates=200, inference_rate=5e-3, width=32, latent=2),
+    exploring=DeconfoundedConfig(inference_updates=200, inference_rate=5e-3, width=32, latent=2),
 )
 NOISE = 0.1
 
