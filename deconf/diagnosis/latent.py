@@ -116,6 +116,11 @@ def _belief(model: LatentModel, batch: Batch) -> Tensor:
     return final_belief(model, replace(batch, mask=batch.mask - odd_steps(batch).mask))
 
 
+def _latents(model: LatentModel, batch: Batch, draws: Draws) -> Tensor:
+    """The latent [1, B, D] of each trial, inferred from its even steps."""
+    return model.for_cloning(_belief(model, batch), draws)
+
+
 def _per_step(batch: Batch, latents: Tensor) -> Tensor:
     """Each trial's latent [1, B, D] at each of its steps."""
     return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
@@ -157,7 +162,7 @@ def in_range(expert: Batch, explored: Batch) -> Batch:
 @torch.no_grad()
 def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
     """Its dynamics, with noise of the residuals' size in these trials: falls and the like inflate that of training."""
-    head, latents = copy.deepcopy(model.dynamics), _per_step(data, model.for_cloning(_belief(model, data), draws))
+    head, latents = copy.deepcopy(model.dynamics), _per_step(data, _latents(model, data, draws))
     if not model.inputs.signature.binary:
         residual = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
         variance = masked_mean(residual.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
@@ -171,7 +176,7 @@ def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int
 
     Nats a step. The other trial is `per_theta` before.
     """
-    odd, latents = odd_steps(data), model.for_cloning(_belief(model, data), draws)
+    odd, latents = odd_steps(data), _latents(model, data, draws)
     own, other = (log_prob(odd, _per_step(odd, x)) for x in (latents, latents.roll(per_theta, 1)))
     return typical(own - other, odd)
 
@@ -179,7 +184,7 @@ def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int
 @torch.no_grad()
 def _gain(log_prob: LogProb, less: LogProb, model: LatentModel, data: Batch, draws: Draws) -> float:
     """Log-likelihood of odd steps given the latent of the even ones, less that by another policy; nats a step."""
-    odd, latents = odd_steps(data), _per_step(data, model.for_cloning(_belief(model, data), draws))
+    odd, latents = odd_steps(data), _per_step(data, _latents(model, data, draws))
     return typical(log_prob(odd, latents) - less(odd, latents), odd)
 
 
