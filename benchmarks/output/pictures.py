@@ -6,11 +6,12 @@ import hashlib
 import io
 import itertools
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically
 
 COLOURS = {
@@ -87,6 +88,31 @@ def panels(
             write_atomically(file.with_suffix(".pdf"), buffer.getvalue())
     finally:
         plt.close(figure)
+
+
+PLACES = (*((across, up) for up in (1, -1, 3, -3, 5, -5) for across in (1, -1)), (1, 1))
+"""Of a name beside its point: across and up, in 4 points of type."""
+
+
+def label(axes: Any, names: Sequence[str], points: Array) -> None:
+    """Write names beside points [N, 2], each at the first place around its point where it hides no other name or point.
+
+    If there is none, it stands above to the right. The limits of the axes must be set.
+    """
+    from matplotlib.transforms import Bbox
+
+    axes.figure.draw_without_rendering()  # it lays out the axes, by which distances on the page are known
+    taken = [Bbox.from_bounds(x - 3, y - 3, 6, 6) for x, y in axes.transData.transform(points)]
+    for name, point in zip(names, points, strict=True):
+        text = axes.annotate(name, point, xytext=(0, 0), textcoords="offset points", fontsize=8)
+        for across, up in PLACES:
+            text.set(ha="left" if across > 0 else "right", va="bottom" if up > 0 else "top")
+            text.set_position((4 * across, 4 * up))
+            box = text.get_window_extent()
+            within = (axes.bbox.min <= box.min).all() and (box.max <= axes.bbox.max).all()
+            if within and not box.count_overlaps(taken):
+                break
+        taken.append(box)
 
 
 def save_figure(figure: Any, file: Path | io.BytesIO, dpi: int, mark: str = "") -> None:

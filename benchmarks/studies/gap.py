@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from deconfounded import envs
-from deconfounded.benchmarks.output.pictures import panels
+from deconfounded.benchmarks.output.pictures import label, panels
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 
@@ -58,11 +58,11 @@ def picture(points: Sequence[Sequence[Any]], file: Path, foretold: str = FORETOL
     """
     with panels(file, size=(6.4, 5.2), dpi=100, mark=mark) as [[axes]]:
         axes.axline((0, 0), slope=1, color="0.8", lw=1)
-        for name, predicted, measured, *style in points:
+        for _, predicted, measured, *style in points:
             hue, fill = style or ("tab:blue", "full")
             axes.plot(predicted, measured, "o", color=hue, fillstyle=fill)
-            if np.hypot(predicted, measured) > 0.05:
-                axes.annotate(name, (predicted, measured), xytext=(4, 4), textcoords="offset points", fontsize=8)
         axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
         axes.margins(0.14, 0.08)
         axes.set_title("what cloning loses, score in the last episode", fontsize=11)
+        named = [point for point in points if np.hypot(point[1], point[2]) > 0.05]
+        label(axes, [point[0] for point in named], np.array([point[1:3] for point in named], float).reshape(-1, 2))

@@ -136,15 +136,22 @@ def summary(rows: list[dict[str, Any]]) -> str:
         of = [row for row in rows if _unseen(row) is unseen]
         if len(of) > 2:
             share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
-            rank = rank_correlation([(row["predicted"], row["measured"]) for row in of])
-            alike = f"the rank correlation of predicted and measured gaps is {rank}"
-            sentences.append(f"Of cases {what}, {share}; {alike}.")
+            gaps = [(row["predicted"], row["measured"], row["right"] or row["verdict"] != "cannot tell") for row in of]
+            sentences.append(f"Of cases {what}, {share}{rank_correlation(gaps)}.")
     return " ".join(sentences)
 
 
-def rank_correlation(gaps: list[tuple[float, float]]) -> str:
-    """Spearman's, of predicted and measured gaps, three pairs or more."""
-    return two_decimals(stats.spearmanr(*zip(*gaps, strict=True)).statistic)
+def rank_correlation(gaps: list[tuple[float, float, bool]]) -> str:
+    """Spearman's, of predicted and measured gaps, where the diagnosis predicts one (the flag), and of all; in words."""
+    sure = [(predicted, measured) for predicted, measured, predicts in gaps if predicts]
+    every = [pair[:2] for pair in gaps]
+    ranks = [
+        two_decimals(stats.spearmanr(*zip(*pairs, strict=True)).statistic)
+        for pairs in (sure, every)[: 1 + (len(sure) < len(gaps))]
+        if len(pairs) > 2
+    ]
+    said = f"; the rank correlation of predicted and measured gaps is {' ('.join(ranks)}" * bool(ranks)
+    return said + " with those of which it cannot tell, and predicts none)" * (len(ranks) == 2)
 
 
 def table(rows: list[dict[str, Any]]) -> str:

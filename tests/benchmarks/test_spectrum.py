@@ -1,5 +1,6 @@
 """Tasks under more and less noise, and the pictures over tasks."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
+from deconfounded.benchmarks.output.pictures import label, panels
 from deconfounded.benchmarks.studies import gap, noise, spectrum, validate
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
@@ -114,6 +116,22 @@ def test_validation_has_what_the_spectrum_found() -> None:
     assert unseen == sum(factor != 1 for factor in noise.FACTORS["process"]) * len(noise.BASES)
 
 
+def test_names_of_points_hide_no_other() -> None:
+    """Of points that lie close, and at the edges, names lie within the axes, apart from each other and all points."""
+    points = np.array([(0, 0), (0.02, 0), (0.04, 0.01), (1, 1), (0.99, 0.97), (1, 0), (0.5, 0.5)])
+    with panels(io.BytesIO(), size=(6.4, 5.2)) as [[axes]]:
+        axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
+        label(axes, [f"a_longer_name {i}" for i in range(7)], points)
+        assert [text.get_text() for text in axes.texts] == [f"a_longer_name {i}" for i in range(7)]
+        boxes = [text.get_window_extent() for text in axes.texts]
+        dots = axes.transData.transform(points)
+        for i, box in enumerate(boxes):
+            assert not box.count_overlaps(boxes[:i])
+            assert not any(box.contains(*dot) for dot in dots)
+            assert (axes.bbox.min <= box.min).all()
+            assert (box.max <= axes.bbox.max).all()
+
+
 def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> None:
     def row(case: str, right: bool, predicted: float, measured: float) -> dict[str, Any]:
         verdict = {"verdict": "confounded", "tier": 2, "right": right, "certified": right}
@@ -125,6 +143,8 @@ def test_validation_counts_apart_what_thresholds_were_set_by(tmp_path: Path) -> 
     assert validate.summary(seen) == f"Of cases by which thresholds were set, 2 of 3 {ranked} 1.00."
     other = [row(noise.title("icy_road", "process", factor), True, factor, -factor) for factor in (2, 4, 8)]
     assert validate.summary([*seen, *other]).endswith(f" Of cases added later, 3 of 3 {ranked} -1.00.")
+    unsure = row("rolling_deck", False, 0.0, 2.0) | {"verdict": "cannot tell", "tier": None}
+    assert f"{ranked} 1.00 (-0.20 with those of which it cannot tell" in validate.summary([*seen, unsure])
     table = validate.table([*seen, *other]).splitlines()
     assert table[3].startswith("| curling | failed | confounded, Tier 2 | wrong |")
     assert table[-1].endswith("| 16.00 |  |  |  | 8.00 | -8.00 |")

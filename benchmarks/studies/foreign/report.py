@@ -23,13 +23,8 @@ def summary(rows: list[dict[str, Any]]) -> str:
         sure = sum(row.get("agreeing") == row["splits"] for row in wrong)
         share = f"{sum(row['right'] is True for row in of)} of {len(of)} verdicts are right, {len(wrong)} wrong"
         share += f" ({sure} of these with all splits agreeing)" * bool(wrong)
-        ranks = []
-        for rows_of in ([row for row in of if row["right"] is not None], of):
-            gaps = [(row["predicted"], gap) for row in rows_of if (gap := measured(row)) is not None]
-            ranks += [rank_correlation(gaps)] if len(gaps) > 2 else []
-        alike = f"; the rank correlation of predicted and measured gaps is {' ('.join(ranks)}" * bool(ranks)
-        alike += " with those of which it cannot tell, and predicts none)" * (len(ranks) == 2)
-        sentences.append(f"Of the half {what}, {share}{alike}.")
+        gaps = [(row["predicted"], gap, row["right"] is not None) for row in of if (gap := measured(row)) is not None]
+        sentences.append(f"Of the half {what}, {share}{rank_correlation(gaps)}.")
     if of_version := scored(rows):
         sentences.append(of_version)
     if few := [row["case"] for row in rows if row.get("splits") == 1]:
