@@ -17,7 +17,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
-VERSION = 11  # raised when figures or verdicts of the same trials change
+VERSION = 12  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)

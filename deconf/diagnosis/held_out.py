@@ -1,5 +1,6 @@
-"""Monitors of a diagnosis' trainings: progress, and how well held-out actions are predicted at best."""
+"""How well held-out trials are predicted, typically and at the best of a training; and the progress of a diagnosis."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -7,15 +8,48 @@ from torch import Tensor
 
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.diagnosis.latent import typical
 from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.experts.rollout import Agent
 
 CHECKS = 12  # of a training
+TRIM = 0.1  # share of held-out trials that is left out at either end, when likelihoods are averaged
 
 Report = Callable[[float], None]
 """Takes the share of the work that is done."""
+
+
+def typical(x: Tensor, batch: Batch) -> float:
+    """The trimmed mean over trials of the means of x [1, B, T] over their steps: no single one, a fall say, decides."""
+    steps = batch.mask[0].sum(-1)
+    means = ((x * batch.mask)[0].sum(-1) / steps.clamp(min=1))[steps > 0].sort().values
+    trimmed = min(math.ceil(TRIM * len(means)), (len(means) - 1) // 2)
+    return float(means[trimmed : len(means) - trimmed].mean())
+
+
+class Best:
+    """The log-likelihood [1, B, T] of held-out actions at the number of updates, of CHECKS, where it is highest.
+
+    A clone learns few trials by heart, sooner with a memory, or a latent that names the trial, than without. What is
+    left at the end of training says how soon, and not how much the observation, the memory or the latent tells.
+    """
+
+    log_prob: Tensor
+
+    def __init__(self, held_out: Batch) -> None:
+        self.held_out, self.highest, self.checked = held_out, float("-inf"), 0
+
+    @torch.no_grad()
+    def check(self, done: int, total: int, log_prob: Callable[[], Tensor]) -> bool:
+        """Check, if it is time, and return whether the log-likelihood is the highest so far."""
+        if CHECKS * done // total == self.checked:
+            return False
+        self.checked, now = CHECKS * done // total, log_prob()
+        likely = typical(now, self.held_out)
+        if likely <= self.highest:
+            return False
+        self.highest, self.log_prob = likely, now  # nan is kept too
+        return True
 
 
 class PartMonitor(Monitor):
@@ -30,29 +64,19 @@ class PartMonitor(Monitor):
 
 
 class BestMonitor(PartMonitor):
-    """Also keeps the log-likelihood [1, B, T] of held-out actions at the number of updates where it is highest.
-
-    A clone learns few trials by heart, sooner with a memory than without one; what is left at the end of training says
-    how soon, and not how much the present observation, or a memory, tells.
-    """
-
-    best: Tensor
+    """Also keeps the best log-likelihood of held-out actions, see `Best`."""
 
     def __init__(self, report: Report, begin: float, end: float, held_out: Batch) -> None:
         super().__init__(report, begin, end)
-        self.held_out, self.most, self.checked = held_out, float("-inf"), 0
+        self.best = Best(held_out)
 
-    @torch.no_grad()
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         super().update(done, total, losses, agent)
-        if CHECKS * done // total == self.checked:
-            return
-        self.checked, x = CHECKS * done // total, self.held_out
-        if isinstance(agent, RecurrentAgent):
-            log_prob = agent.log_prob(x)
-        else:
-            assert isinstance(agent, MemorylessAgent)
-            log_prob = agent.policy.log_prob(agent.scales.obs(x.obs), x.action)
-        likely = typical(log_prob, x)
-        if not likely <= self.most:  # nan is kept too
-            self.most, self.best = likely, log_prob
+        self.best.check(done, total, lambda: _log_prob(agent, self.best.held_out))
+
+
+def _log_prob(agent: Agent | None, x: Batch) -> Tensor:
+    if isinstance(agent, RecurrentAgent):
+        return agent.log_prob(x)
+    assert isinstance(agent, MemorylessAgent)
+    return agent.policy.log_prob(agent.scales.obs(x.obs), x.action)

@@ -4,7 +4,6 @@ Likelihoods are trimmed means over held-out trials, so that no single one, a fal
 """
 
 import copy
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from deconfounded.deconf.core.latent_model import LatentModel, final_belief
 from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
+from deconfounded.deconf.diagnosis.held_out import Best, typical
 from deconfounded.deconf.diagnosis.learned_env import valid_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
@@ -31,7 +31,6 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Trials
 
 MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
-TRIM = 0.1  # share of held-out trials that is left out at either end, when likelihoods are averaged
 
 LogProb = Callable[[Batch, Tensor], Tensor]
 """Log-likelihoods [1, B, T] of steps given latents [1, B, T, D]."""
@@ -42,8 +41,8 @@ class Explanation(NamedTuple):
 
     Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
-    much to overfit. action_evidence: the former less that given another trial's latent; exploration_evidence,
-    expert_evidence: as much of next observations, in exploration and in expert trials.
+    much to overfit, each at its best. action_evidence: the former less that given another trial's latent;
+    exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
     """
 
     dynamics: DynamicsHead
@@ -91,19 +90,15 @@ def from_dynamics(
 
     evidence = _evidence(log_next(_refitted(model, explored, draws)), model, explored_held_out, per_theta, draws)
     dynamics, belief = _refitted(model, train, draws), _belief(model, train)
-    policy, other = (_train_policy(model, train, x, cloning, draws) for x in (belief, belief.roll(per_theta, 1)))
-    gain = _gain(log_policy(policy), log_policy(other), model, held_out, draws)
+    odd = odd_steps(held_out)
+    latents = _per_step(odd, _latents(model, held_out, draws))
+    (policy, own), (_, other) = (
+        _train_policy(model, train, x, odd, latents, cloning, draws) for x in (belief, belief.roll(per_theta, 1))
+    )
+    gain = typical(own - other, odd)
     in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
     in_trials = _evidence(log_next(dynamics), model, held_out, per_theta, draws)
     return Explanation(dynamics, policy, model.for_cloning(belief, draws), gain, in_actions, evidence, in_trials)
-
-
-def typical(x: Tensor, batch: Batch) -> float:
-    """The trimmed mean over trials of the means of x [1, B, T] over their steps."""
-    steps = batch.mask[0].sum(-1)
-    means = ((x * batch.mask)[0].sum(-1) / steps.clamp(min=1))[steps > 0].sort().values
-    trimmed = min(math.ceil(TRIM * len(means)), (len(means) - 1) // 2)
-    return float(means[trimmed : len(means) - trimmed].mean())
 
 
 def odd_steps(batch: Batch) -> Batch:
@@ -181,20 +176,26 @@ def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int
     return typical(own - other, odd)
 
 
-@torch.no_grad()
-def _gain(log_prob: LogProb, less: LogProb, model: LatentModel, data: Batch, draws: Draws) -> float:
-    """Log-likelihood of odd steps given the latent of the even ones, less that by another policy; nats a step."""
-    odd, latents = odd_steps(data), _per_step(data, _latents(model, data, draws))
-    return typical(log_prob(odd, latents) - less(odd, latents), odd)
-
-
 def _train_policy(
-    model: LatentModel, data: Batch, belief: Tensor, config: MemorylessConfig, draws: Draws
-) -> ActionHead:
-    """A policy, cloned given latents of beliefs [1, B, P] about the trials."""
+    model: LatentModel,
+    data: Batch,
+    belief: Tensor,
+    held_out: Batch,
+    latents: Tensor,
+    config: MemorylessConfig,
+    draws: Draws,
+) -> tuple[ActionHead, Tensor]:
+    """A policy, cloned given latents of beliefs [1, B, P] about the trials, and log-likelihoods of held-out actions.
+
+    Both as they are when the latter [1, B, T], given latents [1, B, T, D], are highest.
+    """
     policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)
-    agent = DeconfoundedAgent(model, policy)
+    agent, best, kept = DeconfoundedAgent(model, policy), Best(held_out), policy.state_dict()
     optimizer = Adam([policy], config.learning_rate, config.updates)
-    for _ in range(config.updates):
+    inputs = torch.cat([model.inputs.obs(held_out.obs), latents], -1)
+    for update in range(config.updates):
         optimizer.step(agent.loss(data, belief, config.batch, draws))
-    return policy
+        if best.check(update + 1, config.updates, lambda: policy.log_prob(inputs, held_out.action)):
+            kept = copy.deepcopy(policy.state_dict())
+    policy.load_state_dict(kept)
+    return policy, best.log_prob

@@ -22,8 +22,8 @@ from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis import fits, latent, trait
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
-from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report
-from deconfounded.deconf.diagnosis.latent import Explanation, typical
+from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report, typical
+from deconfounded.deconf.diagnosis.latent import Explanation
 from deconfounded.deconf.diagnosis.learned_env import (
     Actor,
     AgentActor,
@@ -76,16 +76,16 @@ class Amounts:
 
 
 class Findings(NamedTuple):
-    """The figures of one split. Nats are a step, on held-out trials, of which no single one decides (`latent.typical`).
+    """The figures of one split. Nats are a step, on held-out trials, of which none decides alone (`held_out.typical`).
 
     memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone, each
-    at its best (`held_out.BestMonitor`).
-    latent_gain: that by the latent inferred from the dynamics, over latents of other trials. Evidence is the
-    log-likelihood given a trial's own latent less that given another trial's. exploration_evidence, expert_evidence:
-    evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the expert's actions,
-    for which a naive clone takes its own. dynamics_differ: rank correlation of what two halves of an exploration trial,
-    or of an episode, do beyond a fit of all trials; 0 if that is chance, None if they are too few to know
-    (`fits.own_dynamics`).
+    at its best (`held_out.Best`).
+    latent_gain: that by the latent inferred from the dynamics, over latents of other trials, each at its best, too.
+    Evidence is the log-likelihood given a trial's own latent less that given another trial's. exploration_evidence,
+    expert_evidence: evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the
+    expert's actions, for which a naive clone takes its own.
+    dynamics_differ: rank correlation of what two halves of an exploration trial, or of an episode, do beyond a fit of
+    all trials; 0 if that is chance, None if they are too few to know (`fits.own_dynamics`).
 
     The others are of the last episode of rollouts in the learned dynamics; deviations are relative to chance, 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
@@ -133,7 +133,7 @@ def measure(
     alone, remembering = (BestMonitor(report, begin, end, held_out) for begin, end in ((0, 0.1), (0.1, 0.25)))
     blind = memoryless_bc.train(train, amounts.cloning, rng, monitor=alone)
     recurrent = naive_rnn.train(train, amounts.naive, rng, remembering)
-    memory = typical(remembering.best - alone.best, held_out)
+    memory = typical(remembering.best.log_prob - alone.best.log_prob, held_out)
     draws = Draws(rngs, "cpu")
     if explore is None:
         explanation = latent.from_expert_trials(train, amounts.offline, draws, PartMonitor(report, 0.25, 0.8))

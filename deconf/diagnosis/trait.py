@@ -15,7 +15,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
-from deconfounded.deconf.diagnosis.latent import typical
+from deconfounded.deconf.diagnosis.held_out import typical
 from deconfounded.deconf.diagnosis.learned_env import LatentPolicy
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
