@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.data import Batch, Draws
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import LabelScaler, Scaler
 from deconfounded.deconf.diagnosis import fits, judgement, latent, measures
 from deconfounded.deconf.diagnosis.measures import Amounts
@@ -204,3 +205,19 @@ class TestHeavyTails:
         other = 50 * self.x - 3
         pair = LabelScaler(self.x, self.mask)(self.x), LabelScaler(other, self.mask)(other)
         torch.testing.assert_close(*pair, rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.slow
+def test_a_latent_tells_no_more_of_actions_than_what_is_hidden() -> None:
+    """Of 24 trials, which policies learn by heart: those given latents of other trials, whose error is no gain, most.
+
+    Given the wind, actions have a deviation of .05; without it, of about that of the push, .4 / sqrt(3), besides.
+    """
+    sizes = ((24, False), (96, True))
+    expert, exploration = ((world("wind", n, 0, explores), world("wind", 24, 2, explores)) for n, explores in sizes)
+    cloning = MemorylessConfig(updates=600, learning_rate=3e-3)
+    exploring = DeconfoundedConfig(inference_updates=200, inference_rate=5e-3, width=32)
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    gain = latent.from_dynamics(expert, exploration, 1, exploring, cloning, draws, Monitor()).latent_gain
+    assert gain is not None
+    assert 0.5 < gain < np.log(np.hypot(0.05, 0.4 / 3**0.5) / 0.05) + 0.2
