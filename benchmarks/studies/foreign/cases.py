@@ -65,12 +65,16 @@ _TIERS = {
     **dict.fromkeys(("mujoco:ArmTrembles", "mujoco:PushedPole", "motor:MotorIntegral"), 1),
     **dict.fromkeys(("lane:LaneHabits", "lane:LaneLate", "reactor:ReactorTwice", "motor:MotorCalm"), 1),
 }
-# wrong verdicts, by which the diagnosis was changed, or was tried to be:
-_LEARNED_FROM = ("reactor:ReactorHeat", "motor:MotorCalm", "mujoco:PushedDouble", "lane:LaneBias")
+# wrong or missing verdicts, by which the diagnosis was changed, or was tried to be:
+_LEARNED_FROM = (
+    *("reactor:ReactorHeat", "motor:MotorCalm", "mujoco:PushedDouble", "lane:LaneBias"),
+    *("classic:GustyCart", "motor:Motor"),
+)
 _ADDED = {  # in their place
     **dict.fromkeys(("mujoco:PushedDouble", "classic:PendulumCalm"), 2),
     **dict.fromkeys(("lane:LaneBias", "classic:PoleLength"), 1),
     **dict.fromkeys(("mujoco:SlopingRail", "reactor:ReactorCalm"), 2),
+    **dict.fromkeys(("motor:MotorBattery", "lane:LaneReversed"), 2),
 }
 CASES = tuple(
     Case(reference, tier, reference not in _LEARNED_FROM and (reference in _ADDED or i % 2 == 1))

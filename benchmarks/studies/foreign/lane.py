@@ -1,4 +1,4 @@
-"""highway-env's lane-keeping, by a dynamic bicycle model: a side wind, a bent steering, habits, and late logs."""
+"""highway-env's lane-keeping, by a dynamic bicycle model: a side wind, bent or reversed steering, habits, late logs."""
 
 from typing import Any, SupportsFloat
 
@@ -98,6 +98,24 @@ class LaneBias(LaneWind):
 
     def expert(self, obs: Array, theta: Array) -> Array:
         return super().expert(obs, np.zeros(1)) - theta
+
+
+class LaneReversed(LaneWind):
+    """theta: 1, or -1 where the steering turns the other way [1], which gusts on the yaw rate hide for a while."""
+
+    gust = SWAY
+    evidence = []
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        env = gymnasium.make("lane-keeping-v0", disable_env_checker=True)
+        bent = Bent(env.unwrapped, 0.0, self.gust)
+        return gymnasium.wrappers.TransformAction(bent, lambda action: theta[0] * action, None)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.choice([-1.0, 1.0], 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return theta * super().expert(obs, np.zeros(1))
 
 
 class LaneHabits(LaneWind):

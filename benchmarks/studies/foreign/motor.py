@@ -1,4 +1,4 @@
-"""gym-electric-motor's permanently excited DC motor, which turns a hidden load."""
+"""gym-electric-motor's permanently excited DC motor, which turns a hidden load, or runs on a worn battery."""
 
 import warnings
 from typing import Any, SupportsFloat
@@ -103,6 +103,21 @@ class MotorIntegral(Motor):
             return self.expert(obs, theta) + total + self.noise * rng.standard_normal(1)
 
         return act
+
+
+class MotorBattery(Motor):
+    """theta: the share [1] of the voltage that a worn battery supplies. The expert asks for more. No load."""
+
+    evidence = []
+
+    def make(self, theta: Array) -> gymnasium.Env:
+        return gymnasium.wrappers.TransformAction(super().make(np.zeros(1)), lambda action: theta[0] * action, None)
+
+    def sample_theta(self, rng: np.random.Generator) -> Array:
+        return rng.uniform(0.4, 1.0, 1)
+
+    def expert(self, obs: Array, theta: Array) -> Array:
+        return super().expert(obs, np.zeros(1)) / theta
 
 
 class MotorCalm(Motor):
