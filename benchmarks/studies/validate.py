@@ -145,11 +145,8 @@ def rank_correlation(gaps: list[tuple[float, float, bool]]) -> str:
     """Spearman's, of predicted and measured gaps, where the diagnosis predicts one (the flag), and of all; in words."""
     sure = [(predicted, measured) for predicted, measured, predicts in gaps if predicts]
     every = [pair[:2] for pair in gaps]
-    ranks = [
-        two_decimals(stats.spearmanr(*zip(*pairs, strict=True)).statistic)
-        for pairs in (sure, every)[: 1 + (len(sure) < len(gaps))]
-        if len(pairs) > 2
-    ]
+    groups = [sure] if len(sure) == len(every) else [sure, every]
+    ranks = [two_decimals(stats.spearmanr(*zip(*of, strict=True)).statistic) for of in groups if len(of) > 2]
     said = f"; the rank correlation of predicted and measured gaps is {' ('.join(ranks)}" * bool(ranks)
     return said + " with those of which it cannot tell, and predicts none)" * (len(ranks) == 2)
 

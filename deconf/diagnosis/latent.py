@@ -85,19 +85,16 @@ def from_dynamics(
     def log_next(head: DynamicsHead) -> LogProb:
         return lambda x, latent: head.log_prob(x.obs, x.action, x.next_obs, latent)[..., 0]
 
-    def log_policy(of: ActionHead) -> LogProb:
-        return lambda x, latent: of.log_prob(torch.cat([model.inputs.obs(x.obs), latent], -1), x.action)
-
-    evidence = _evidence(log_next(_refitted(model, explored, draws)), model, explored_held_out, per_theta, draws)
+    odd, latents = odd_steps(explored_held_out), _latents(model, explored_held_out, draws)
+    evidence = _evidence(log_next(_refitted(model, explored, draws)), odd, latents, per_theta)
     dynamics, belief = _refitted(model, train, draws), _belief(model, train)
-    odd = odd_steps(held_out)
-    latents = _per_step(odd, _latents(model, held_out, draws))
+    odd, latents = odd_steps(held_out), _latents(model, held_out, draws)
     (policy, own), (_, other) = (
         _train_policy(model, train, x, odd, latents, cloning, draws) for x in (belief, belief.roll(per_theta, 1))
     )
     gain = typical(own - other, odd)
-    in_actions = _evidence(log_policy(policy), model, held_out, per_theta, draws)
-    in_trials = _evidence(log_next(dynamics), model, held_out, per_theta, draws)
+    in_actions = _evidence(_log_action(model, policy), odd, latents, per_theta)
+    in_trials = _evidence(log_next(dynamics), odd, latents, per_theta)
     return Explanation(dynamics, policy, model.for_cloning(belief, draws), gain, in_actions, evidence, in_trials)
 
 
@@ -166,14 +163,17 @@ def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
 
 
 @torch.no_grad()
-def _evidence(log_prob: LogProb, model: LatentModel, data: Batch, per_theta: int, draws: Draws) -> float:
-    """Log-likelihood of odd steps given the latent of the even ones, less that given the latent of another trial.
+def _evidence(log_prob: LogProb, data: Batch, latents: Tensor, per_theta: int) -> float:
+    """Log-likelihood of steps given the latent [1, B, D] of their trial, less that given the latent of another trial.
 
     Nats a step. The other trial is `per_theta` before.
     """
-    odd, latents = odd_steps(data), _latents(model, data, draws)
-    own, other = (log_prob(odd, _per_step(odd, x)) for x in (latents, latents.roll(per_theta, 1)))
-    return typical(own - other, odd)
+    own, other = (log_prob(data, _per_step(data, x)) for x in (latents, latents.roll(per_theta, 1)))
+    return typical(own - other, data)
+
+
+def _log_action(model: LatentModel, policy: ActionHead) -> LogProb:
+    return lambda x, latent: policy.log_prob(torch.cat([model.inputs.obs(x.obs), latent], -1), x.action)
 
 
 def _train_policy(
@@ -187,15 +187,15 @@ def _train_policy(
 ) -> tuple[ActionHead, Tensor]:
     """A policy, cloned given latents of beliefs [1, B, P] about the trials, and log-likelihoods of held-out actions.
 
-    Both as they are when the latter [1, B, T], given latents [1, B, T, D], are highest.
+    Both as they are when the latter [1, B, T], given latents [1, B, D] of the trials, are highest.
     """
     policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)
     agent, best, kept = DeconfoundedAgent(model, policy), Best(held_out), policy.state_dict()
     optimizer = Adam([policy], config.learning_rate, config.updates)
-    inputs = torch.cat([model.inputs.obs(held_out.obs), latents], -1)
+    log_prob, per_step = _log_action(model, policy), _per_step(held_out, latents)
     for update in range(config.updates):
         optimizer.step(agent.loss(data, belief, config.batch, draws))
-        if best.check(update + 1, config.updates, lambda: policy.log_prob(inputs, held_out.action)):
+        if best.check(update + 1, config.updates, lambda: log_prob(held_out, per_step)):
             kept = copy.deepcopy(policy.state_dict())
     policy.load_state_dict(kept)
     return policy, best.log_prob
