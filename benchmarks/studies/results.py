@@ -215,7 +215,7 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
     """The table of docs/baselines.md: each method over the tasks whose certificate is passed, best first."""
     scores, rows = index.certified(found, certified), list[tuple[str, ...]]()
     over = index.over_tasks(scores, list(scores))["methods"]
-    for name in sorted(set(METHODS) & set(over), key=lambda name: -over[name]["iqm"]["value"]):
+    for name in sorted((name for name in METHODS if name in over), key=lambda name: -over[name]["iqm"]["value"]):
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
         ends = (end(means, key=means.__getitem__) for end in (min, max))
         extremes = (f"{task}, {scoring.two_decimals(means[task])}" for task in ends)
