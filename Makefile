@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 
+unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not by each of the tests' processes
+
 .PHONY: setup demo test pytest quick lint docs notebooks
 
 setup: $(VENV)/installed
