@@ -69,12 +69,14 @@ class TestChangesAreNoticed:
         tasks = ("task:weak_thruster", "task:curling", "expert:weak_thruster", "method:interventional")
         assert moved(*tasks) == {"task:weak_thruster"}
 
+    @pytest.mark.slow
     def test_adams_epsilon(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Ten times as much: whatever trains with Adam."""
         monkeypatch.setattr(adam, "EPSILON", 1e-7)
         labels = {f"method:{name}" for name in LEARNED}
         assert moved(*labels, "method:conditional", "task:bandit", "scores:all") == labels
 
+    @pytest.mark.slow
     def test_a_mask_that_is_ignored(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(
             deconfounded_offline,
@@ -83,6 +85,7 @@ class TestChangesAreNoticed:
         )
         assert moved("method:deconfounded_offline", "method:deconfounded") == {"method:deconfounded_offline"}
 
+    @pytest.mark.slow
     def test_beta_of_one_method(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """10% more."""
         amounts = fingerprints.preset

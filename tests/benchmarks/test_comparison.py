@@ -167,6 +167,7 @@ class TestScores:
         foreign = [{**r, "expert": "0" * 64} for r in both[0]]  # an expert of one's own: its run's own references
         assert aggregation.gather(foreign)["methods"]["expert"]["score"] != few["expert"]["score"]
 
+    @pytest.mark.slow
     def test_coverage(self) -> None:
         """Of the interval that tables show, by an independent simulation."""
         rng = np.random.default_rng(1)

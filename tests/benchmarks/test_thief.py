@@ -114,6 +114,7 @@ def test_no_theta_can_be_drawn_again(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert (tmp_path / "state").read_text() != state
 
 
+@pytest.mark.slow
 def test_salts_of_a_record_give_it_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`deconf verify` can use them: the same bits."""
     data = run(tmp_path, "    given.demonstrations\n", monkeypatch)

@@ -411,6 +411,7 @@ def gail_env(n: int = 3, task: str = CONTROL) -> tuple[Any, Vector]:
 
 
 class TestGail:
+    @pytest.mark.slow
     def test_the_agent_is_what_ppo_trained(self) -> None:
         """Step by step the same distribution of actions as Stable-Baselines3's policy; to 1e-5."""
         for task in (CONTROL, "bandit"):

@@ -301,6 +301,7 @@ def test_gain_by_memory() -> None:
     assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory_gain < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A page that needs no other file, a json that says the same; a second time nothing is measured again."""

@@ -79,6 +79,7 @@ def test_even_steps_predict_odd_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not odd[..., ::2].any()
 
 
+@pytest.mark.slow
 def test_how_much_trials_and_episodes_differ() -> None:
     """theta lasts for a trial, for an episode, or is in no dynamics; and of a few trials nobody knows."""
     lasting, passing, none = (

@@ -375,6 +375,7 @@ def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
     assert betas == pytest.approx([*rising, 0.1, 0.1, 0.1, 0.1])
 
 
+@pytest.mark.slow
 def test_offline_beta_rises(monkeypatch: pytest.MonkeyPatch) -> None:
     betas = watch_betas(monkeypatch)
     preset = tiny_preset().configured("deconfounded_offline", offline_updates=1, online_updates=8, beta=0.1)

@@ -99,6 +99,7 @@ def test_memory_adds_up() -> None:
     torch.testing.assert_close(memory[:, 2:], model.final_memory(data[:, 2:, : STEPS // 2]), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_action_does_not_stand_in_for_theta(trained: LinearModel) -> None:
     """Exploration pushes the ball against theta, so that a regression on place and action finds a quarter of a push.
 
@@ -117,6 +118,7 @@ def test_the_action_does_not_stand_in_for_theta(trained: LinearModel) -> None:
     assert size.numpy() == pytest.approx(1, abs=0.3)
 
 
+@pytest.mark.slow
 def test_belief_is_the_posterior(trained: LinearModel) -> None:
     """On fresh trials its mean is as near theta as that of the exact posterior, by a linear map of the latents.
 
@@ -172,6 +174,7 @@ def test_evidence_without_noise() -> None:
     assert torch.isfinite(belief).all()
 
 
+@pytest.mark.slow
 def test_steps_that_no_dynamics_explain() -> None:
     """A second column is an angle, which turns by how far the ball is off and wraps: theta is in the first alone."""
 
@@ -223,6 +226,7 @@ def test_an_error_alike_in_all_steps_is_allowed_for() -> None:
     assert losses[0] - losses[1] == pytest.approx(exact[0] - exact[1], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_how_much_of_earlier_episodes_is_kept(trained: LinearModel) -> None:
     """Nearly all where theta stays, nothing where it is drawn anew: halves of trials, and of others' trials."""
     data, _ = pushed(512, np.random.default_rng(6))

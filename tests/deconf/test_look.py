@@ -160,6 +160,7 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
 
 
+@pytest.mark.slow
 def test_how_far_simple_guesses_get() -> None:
     """By hand: of slow noise, nearly all by repeating; of a constant for each trial, all by its mean."""
     rng = np.random.default_rng(0)
@@ -190,6 +191,7 @@ def test_dynamics_of_exploration(name: str, differ: bool) -> None:
     assert "Trials do not differ" in said(look(Trials(obs, action, mask), blind=True), "dynamics")
 
 
+@pytest.mark.slow
 def test_dynamics_of_an_expert() -> None:
     assert "Trials differ in their dynamics" in said(look(driven()), "dynamics")
     assert "No difference in dynamics is seen" in said(look(driven(same=True)), "dynamics")
@@ -267,6 +269,7 @@ def test_from_csv_to_a_verdict(
     assert (tmp_path / "agent" / "agent.json").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("advice", [advices.CLONE, advices.CLONE_HABITS, advices.EXPLORE_FIRST, advices.QUERY])
 def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an .npz too; what only the user can write says so."""

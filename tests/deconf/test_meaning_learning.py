@@ -224,6 +224,7 @@ def trained(data: Batch, latent: int, updates: int, rng: np.random.Generator, ki
     return model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "least"), [("evidence", 0.45), ("innovations", 0.6), ("linear", 0.6)])
 def test_a_small_effect_is_learned_beside_large_ones(kind: str, least: float) -> None:
     """Of two loads, small beside the noise, the belief knows most after 60 steps, on trials it has not seen.
@@ -253,6 +254,7 @@ def steered(n: int, informed: float, rng: np.random.Generator) -> Batch:
     return Batch(obs[:, :, :-1], action, obs[:, :, 1:], torch.ones(1, n, 40))
 
 
+@pytest.mark.slow
 def test_what_is_expected_of_a_step_is_blind_to_theta() -> None:
     """Informed actions bring the rudder back by .5 a step, on average; blind to theta, they do nothing on average.
 

@@ -48,6 +48,7 @@ def test_evidence_is_linear_in_innovations() -> None:
         assert evidence(other, 0).abs().max() > 0.1, "that of EvidenceBelief is not"
 
 
+@pytest.mark.slow
 def test_effects_are_linear_in_the_latent(model: tuple[VariationalModel, Batch]) -> None:
     """Means of next observations lie on the line between those of two latents, but not with EvidenceBelief."""
     made, data = model
@@ -66,6 +67,7 @@ def test_effects_are_linear_in_the_latent(model: tuple[VariationalModel, Batch])
     assert apart(other)[0] > 0.01
 
 
+@pytest.mark.slow
 def test_untrained_it_is_the_model_s_mean(model: tuple[VariationalModel, Batch]) -> None:
     made, data = model
     belief = OnlineBelief(made, 16, streams())
@@ -90,6 +92,7 @@ def test_samples_are_of_the_density() -> None:
     assert abs(belief.log_prob(given, drawn[None].float()).mean().item() + entropy) < 0.03
 
 
+@pytest.mark.slow
 def test_it_says_how_far_it_is_from_the_latent_of_the_whole_trial(model: tuple[VariationalModel, Batch]) -> None:
     """On trials that it has not seen: squared errors are 1 to 2 of its variance, and hundreds of the model's own.
 

@@ -349,6 +349,7 @@ def test_renderers_that_live_to_the_end_leave_in_silence() -> None:
 
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 class TestVideos:
+    @pytest.mark.slow
     def test_record_video(self, tmp_path: Path) -> None:
         """A frame for the reset and one for each step, at the task's speed."""
         env = gymnasium.make("deconf/SlipperyCartpole-v1", render_mode="rgb_array")

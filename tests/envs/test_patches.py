@@ -62,6 +62,7 @@ def test_the_expert_heeds_the_patch_a_metre_ahead() -> None:
     np.testing.assert_allclose(policy.load(task).mean(obs, theta), icy, atol=1e-5)  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("conditional", [False, True])
 def test_the_factorised_posterior_is_the_joint_one(conditional: bool) -> None:
     """Two grips of six patches: marginals of the joint posterior over 64 thetas, after 25 steps."""
