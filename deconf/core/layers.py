@@ -6,6 +6,7 @@ seed's numbers are the same, bit for bit, whatever runs beside it.
 
 import ctypes
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,18 +92,26 @@ def parameter_gradients(rows: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
     return by_seed(rows.transpose(1, 2), grad), bias[0] if len(bias) == 1 else torch.cat(bias)
 
 
+def activations(rows: Tensor, parameters: Sequence[Tensor]) -> list[Tensor]:
+    """Rows [S, R, I], and what each of some linear maps makes of them, with ReLU between.
+
+    parameters: the weight and the bias of each map in turn.
+    """
+    layers = [rows]
+    for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
+        before = layers[-1] if len(layers) == 1 else layers[-1].relu_()
+        layers.append(affine(bias, before, weight))
+    return layers
+
+
 class MlpFunction(torch.autograd.Function):
     """Rows [S, R, I] through three linear maps with ReLU between: one node of the graph, which writes in place."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *parameters: Tensor) -> Tensor:
-        inputs, weights = [rows], parameters[::2]
-        for weight, bias in zip(weights, parameters[1::2], strict=True):
-            inputs.append(affine(bias, inputs[-1], weight))
-            if len(inputs) <= len(weights):
-                inputs[-1].relu_()
-        ctx.save_for_backward(*inputs[:-1], *weights)
-        return inputs[-1]
+        *inputs, out = activations(rows, parameters)
+        ctx.save_for_backward(*inputs, *parameters[::2])
+        return out
 
     @staticmethod
     @once_differentiable
@@ -126,6 +135,8 @@ class Mlp(nn.Sequential):
         super().__init__(first, nn.ReLU(), second, nn.ReLU(), Linear(width, outputs, draws))
 
     def forward(self, x: Tensor) -> Tensor:
-        parameters = [p for layer in (self[0], self[2], self[4]) for p in (layer.weight, layer.bias)]
-        out = MlpFunction.apply(x.reshape(len(x), -1, x.shape[-1]), *parameters)
+        parameters = list(self.parameters())
+        rows = x.reshape(len(x), -1, x.shape[-1])
+        # A node of the graph costs an agent's step a tenth of its time, for a gradient that nobody asks for.
+        out = MlpFunction.apply(rows, *parameters) if torch.is_grad_enabled() else activations(rows, parameters)[-1]
         return out.reshape(*x.shape[:-1], out.shape[-1])
