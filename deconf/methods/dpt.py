@@ -118,17 +118,16 @@ class DptAgent(TransformerAgent):
             for cache in self._caches:
                 cache.count.zero_()
 
-    def _read(self, tokens: Tensor) -> Tensor:
-        """Features [S, N, W] of each trial's next token [S, N, I]; the next one overwrites it, if `count` stays."""
-        return torch.stack([self.net.step(*own) for own in zip(tokens, self._layers, self._caches, strict=True)])
-
     def choose(self, obs: Tensor) -> Tensor:
-        self._features = self._read(self.queries(obs))
+        """Act on the query. The next token overwrites it in the cache, since `count` stays."""
+        queries = zip(self.queries(obs), self._layers, self._caches, strict=True)
+        self._features = torch.stack([self.net.step(*of_seed) for of_seed in queries])
         return self.policy.sample(torch.cat([self._features, self.scales.obs(obs)], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
-        self._read(self.transitions(step))
-        for cache, mask in zip(self._caches, step.mask, strict=True):
+        parts = zip(self.transitions(step), step.mask, self._layers, self._caches, strict=True)
+        for transition, mask, layers, cache in parts:
+            self.net.write(transition, layers, cache)
             cache.count += mask.long()
 
     def loss(self, batch: Batch, label: Tensor) -> Tensor:

@@ -65,36 +65,46 @@ def rotated(x: Tensor, by: tuple[Tensor, Tensor]) -> Tensor:
 
 
 class Cache:
-    """A ring buffer of keys and values [2, N, H, window, D] of each layer's latest tokens, for N trials of one seed.
+    """A ring buffer of keys and values [2, N, H, D, window] of each layer's latest tokens, for N trials of one seed.
 
     Each seed has its own, since the order of sums depends on how far it is filled.
     """
 
     def __init__(self, layers: int, n: int, heads: int, window: int, width: int, device: torch.device) -> None:
-        self.kept = [torch.zeros(2, n, heads, window, width, device=device) for _ in range(layers)]
+        self.kept = [torch.zeros(2, n, heads, width, window, device=device) for _ in range(layers)]
         self.window, self.rows = window, torch.arange(n, device=device)
         self.count = torch.zeros(n, dtype=torch.int64, device=device)  # of tokens that stay
 
     def begin(self) -> None:
         """Begin with the next token of each trial: where it is written, and to what it attends."""
         low, high = self.count.min().item(), self.count.max().item()
-        self.turn = rotation(self.count[:, None, None], self.kept[0].shape[-1])
-        self.filled, self.mask = min(int(high) + 1, self.window), None
+        self.turn = rotation(self.count[:, None, None], self.kept[0].shape[-2])
+        self.filled, self.empty = min(int(high) + 1, self.window), None
         self.slot: int | Tensor = int(high) % self.window  # of all, where trials have as many steps
         if low < high:
             self.slot = self.count % self.window
-            self.mask = (torch.arange(self.filled, device=self.count.device) <= self.count[:, None])[:, None, None]
+            self.empty = (torch.arange(self.filled, device=self.count.device) > self.count[:, None])[:, None, None]
 
-    def attend(self, layer: int, qkv: Tensor) -> Tensor:
-        """Write each trial's next token and attend to it and those before; [3, N, H, 1, D] -> [N, H, 1, D]."""
-        (query, key), value, kept = rotated(qkv[:2], self.turn), qkv[2], self.kept[layer]
-        for buffer, new in zip(kept, (key, value), strict=True):
+    def write(self, layer: int, qkv: Tensor) -> Tensor:
+        """Write the key and value of each trial's next token [3, N, H, 1, D]; its query [N, H, 1, D]."""
+        (query, key), value = rotated(qkv[:2], self.turn), qkv[2]
+        for buffer, new in zip(self.kept[layer], (key, value), strict=True):
             if isinstance(self.slot, int):
-                buffer[:, :, self.slot] = new[:, :, 0]
+                buffer[..., self.slot] = new[:, :, 0]
             else:
-                buffer[self.rows, :, self.slot] = new[:, :, 0]
-        keys, values = kept[..., : self.filled, :]
-        return F.scaled_dot_product_attention(query, keys, values, self.mask)
+                buffer[self.rows, ..., self.slot] = new[:, :, 0]
+        return query
+
+    def attend(self, layer: int, query: Tensor) -> Tensor:
+        """What a query [N, H, 1, D] reads from its trial's tokens, the next one among them: [N, H, D].
+
+        On a CPU, torch's own attention, made for many queries at once, takes up to ten times as long.
+        """
+        keys, values = self.kept[layer][..., : self.filled]
+        alike = (keys * (query * query.shape[-1] ** -0.5).mT).sum(-2, keepdim=True)
+        if self.empty is not None:
+            alike.masked_fill_(self.empty, -torch.inf)
+        return (values * alike.softmax(-1)).sum(-1)
 
 
 class Transformer(nn.Module):
@@ -135,16 +145,31 @@ class Transformer(nn.Module):
         maps: list[Any] = [self.embed, *(linear for block in blocks for linear in block)]
         return [(linear.bias[seed], linear.weight[seed]) for linear in maps]
 
-    def step(self, token: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> Tensor:
-        """Features [N, W] of each trial's next token [N, I], with one seed's layers; it is written to the cache."""
+    def write(self, token: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> tuple[Tensor, Tensor]:
+        """Write each trial's next token [N, I] to the cache, with one seed's layers; the last layer's input and query.
+
+        What that layer reads is left to `step`: a token that only later ones read does not need it.
+        """
         cache.begin()
         x = torch.addmm(layers[0][0], token, layers[0][1])
         for i in range(self.depth):
-            attend, mix, widen, narrow = layers[1 + 4 * i : 5 + 4 * i]
-            qkv = torch.addmm(attend[0], normed(x), attend[1]).view(len(x), 3, self.heads, 1, -1).transpose(0, 1)
-            x = torch.addmm(x, cache.attend(i, qkv).reshape(x.shape), mix[1]).add_(mix[0])
-            x = torch.addmm(x, F.gelu(torch.addmm(widen[0], normed(x), widen[1])), narrow[1]).add_(narrow[0])
-        return normed(x)
+            bias, weight = layers[1 + 4 * i]
+            qkv = torch.addmm(bias, normed(x), weight).view(len(x), 3, self.heads, 1, -1).transpose(0, 1)
+            query = cache.write(i, qkv)
+            if i + 1 < self.depth:
+                x = self._read(i, x, query, layers, cache)
+        return x, query
+
+    def _read(self, i: int, x: Tensor, query: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> Tensor:
+        """Outputs [N, W] of a layer, from its inputs [N, W] and queries [N, H, 1, D]."""
+        mix, widen, narrow = layers[2 + 4 * i : 5 + 4 * i]
+        x = torch.addmm(x, cache.attend(i, query).reshape(x.shape), mix[1]).add_(mix[0])
+        return torch.addmm(x, F.gelu(torch.addmm(widen[0], normed(x), widen[1])), narrow[1]).add_(narrow[0])
+
+    def step(self, token: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> Tensor:
+        """Features [N, W] of each trial's next token [N, I], with one seed's layers; it is written to the cache."""
+        x, query = self.write(token, layers, cache)
+        return normed(self._read(self.depth - 1, x, query, layers, cache))
 
 
 class TransformerAgent(LearnedAgent):
