@@ -72,10 +72,10 @@ def page(found: index.Found, certified: dict[str, Any], others: Mapping[str, ind
 
 What is left to gain, and when the suite is to be made harder. Made by `deconf publish` from the [records](records)
 alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
-deployment: a posterior over theta, by the true dynamics. *Best* is the best method without theta in training (its tier
-in brackets), chosen after the fact, task by task; the *fifth* tells how far the five best lie apart, each in its best
-deployment. A task is *solved* where the best comes within {NEAR:g} of the ceiling. The ceiling is no bound: posterior
-sampling is not the best use of a belief.
+deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
+best method without theta in training (its tier in brackets), chosen after the fact, task by task; the *fifth* tells
+how far the five best lie apart, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
+the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief.
 
 The suite is to be made harder when {SHARE:.0%} of its tasks are solved in the last episode, without queries."""
     parts = [head, *_measured(found, certified)]
@@ -147,9 +147,10 @@ def deployments(found: index.Found, certified: dict[str, Any]) -> str:
     text = """## Ways of deploying one belief
 
 One training, and one belief. Under the method's own name the latent is drawn at every step; `_episode`: once an
-episode, from the belief at its start; `_mode`: the likeliest value; `_mean`: the belief's mean. Of a category the exact
-policy takes the mode for the mean, and the learned one the probabilities; a Gaussian's mean is its mode. Means over the
-tasks where all of a method's ways were run, with 95% intervals of a stratified bootstrap."""
+episode, from the belief at its start; `_mode`: the likeliest value; `_mean`: the belief's mean. Where theta is
+categorical, the `_mean` of the exact policy is its mode, and that of a learned agent are the probabilities. The mean of
+a Gaussian belief is its mode, so that it has no `_mean`. Means over the tasks where all of a method's ways were run,
+with 95% intervals of a stratified bootstrap."""
     return "\n\n".join([text, markdown_table(("agent", "tasks", *MEASURES), rows)])
 
 
