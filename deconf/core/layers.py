@@ -7,7 +7,6 @@ seed's numbers are the same, bit for bit, whatever runs beside it.
 import ctypes
 import platform
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,37 +17,29 @@ from deconfounded.deconf.core.data import Draws
 
 relu_backward = torch.ops.aten.threshold_backward.grad_input
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # of mallopt(3)
-ONEDNN_ABOVE = 16**3  # multiplications: torch hands larger products to oneDNN
+SMALL, NARROW = 16**3, 16  # multiplications, rows or columns: below which MKL's sums depend on what else is in a stack
 
 
 def prepare_torch() -> None:
-    """Set one thread, since networks are small; keep freed memory; and let oneDNN multiply where MKL is slow.
+    """Set one thread, since networks are small; and keep freed memory.
 
-    C's library gives freed memory back to the system, and to ask for it again takes longer than to use it. On AMD, MKL
-    does not use AVX-512, and oneDNN takes half the time; on Intel it takes twice the time. The setting that selects
-    oneDNN also allows it bfloat16, which it uses where there is AMX: there torch's default stays.
+    C's library gives freed memory back to the system, and to ask for it again takes longer than to use it.
     """
     torch.set_num_threads(1)
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
         for option, size in ((M_MMAP_THRESHOLD, 2**25), (M_TRIM_THRESHOLD, 2**30), (M_TOP_PAD, 2**26)):
             libc.mallopt(option, size)
-    capabilities, processor = torch.cpu.get_capabilities(), Path("/proc/cpuinfo")
-    amd = processor.exists() and "AuthenticAMD" in processor.read_text(encoding="utf-8", errors="replace")
-    if amd and capabilities.get("avx512_f") and not capabilities.get("amx_bf16"):
-        torch.backends.mkldnn.matmul.fp32_precision = "bf16"  # type: ignore[attr-defined]
 
 
 prepare_torch()
 
 
 def stack_differs(rows: Tensor, weight: Tensor) -> bool:
-    """Whether the product of stacked rows [S, R, I] and weights [S, I, O] has other bits than that of each seed alone.
-
-    A stack of small products can exceed ONEDNN_ABOVE, and MKL has another path for vectors.
-    """
+    """Whether a product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than that of a seed alone."""
     seeds, inputs, outputs = weight.shape
-    return seeds > 1 and (rows.shape[1] * inputs * outputs <= ONEDNN_ABOVE or min(inputs, outputs) == 1)
+    count = rows.shape[1]
+    return seeds > 1 and (min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL)
 
 
 def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
