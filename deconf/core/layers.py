@@ -36,7 +36,7 @@ prepare_torch()
 
 
 def stack_differs(rows: Tensor, weight: Tensor) -> bool:
-    """Whether a product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than that of a seed alone."""
+    """Whether the product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than a seed's alone."""
     seeds, inputs, outputs = weight.shape
     count = rows.shape[1]
     return seeds > 1 and (min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL)
