@@ -120,9 +120,7 @@ class DptAgent(TransformerAgent):
 
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the query. The next token overwrites it in the cache, since `count` stays."""
-        queries = zip(self.queries(obs), self._layers, self._caches, strict=True)
-        self._features = torch.stack([self.net.step(*of_seed) for of_seed in queries])
-        return self.policy.sample(torch.cat([self._features, self.scales.obs(obs)], -1), self._draws)
+        return self.act_on(self.queries(obs), obs)
 
     def remember(self, step: Batch) -> None:
         parts = zip(self.transitions(step), step.mask, self._layers, self._caches, strict=True)
