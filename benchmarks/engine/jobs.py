@@ -145,7 +145,7 @@ class JobMonitor(Monitor):
         super().__init__()
         self.identity, self.last_edit = identity(job), last_edit()
         self.ticks, self.share, self.told = job.ticks, share, 0
-        self.device = job.preset.device
+        self.device = job.preset.device if job.about.learned else "cpu"
         self.file = job.checkpoint
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []

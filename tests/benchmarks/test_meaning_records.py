@@ -12,6 +12,7 @@ from safetensors.numpy import load_file, save_file
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, job_files, progress
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
+from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.jobs import JobMonitor
 from deconfounded.benchmarks.output import records
@@ -121,3 +122,9 @@ class TestBudget:
         data = job.load(1)
         assert data is not None
         assert data["meta"]["cpu_s"] == 4.0
+
+    def test_only_what_is_learned_trains_on_a_gpu(self, tmp_path: Path) -> None:
+        on_gpu = replace(tiny_preset(), device="cuda")
+        jobs = (BenchmarkJob("bandit", on_gpu, method, (0,), tmp_path) for method in ("naive_rnn", "gail", *REFERENCES))
+        devices = [JobMonitor(job, 1.0).device for job in jobs]
+        assert devices == ["cuda", "cuda", *["cpu"] * len(REFERENCES)]
