@@ -87,7 +87,7 @@ class LearnedAgent(Agent):
             )
         self._draws = Draws(generators, self.device)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def act(self, obs: NDArray[np.float32]) -> Array:
         if not len(self._draws):
             raise InputError("act was called before begin and reset; begin(n) trials, reset([generator]), then act")
@@ -105,7 +105,7 @@ class LearnedAgent(Agent):
     def choose(self, obs: Tensor) -> Tensor:
         """Observation [S, N, O] -> action [S, N, A]."""
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:

@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.beliefs import Belief
 from deconfounded.deconf.core.data import Batch, Draws
-from deconfounded.deconf.core.layers import Linear, add_product, parameter_gradients
+from deconfounded.deconf.core.layers import Linear, add_product, affine, parameter_gradients
 from deconfounded.deconf.core.nets import Embedding, Scales
 
 
@@ -102,8 +102,13 @@ class GruMemory(nn.Module):
         return GruScan.apply(self._embed(batch), memory, self.recurrent.weight, self.recurrent.bias, batch.mask)
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        """Memory [S, N, W] after one more transition; unchanged where its mask is 0."""
-        return self(step[:, :, None], memory)[:, :, -1]
+        """Memory [S, N, W] after one more transition; unchanged where its mask is 0. A step of `GruScan`, alone."""
+        w = self.width
+        x = self._embed(step)
+        recurrent = affine(self.recurrent.bias + F.pad(x[..., : 2 * w], (0, w)), memory, self.recurrent.weight)
+        reset, keep = torch.sigmoid(recurrent[..., : 2 * w]).chunk(2, -1)
+        new = torch.addcmul(x[..., 2 * w :], reset, recurrent[..., 2 * w :]).tanh()
+        return torch.lerp(new, memory, keep.masked_fill(step.mask[..., None] == 0, 1))
 
 
 class GruBelief(Belief):

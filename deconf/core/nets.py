@@ -19,7 +19,9 @@ HEAVY = 30.0  # excess kurtosis of labels: a normal distribution has 0, Laplace'
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to broadcast against tensors [S, ..., F]."""
-    return statistic.reshape(len(statistic), *[1] * (like.dim() - 2), -1)
+    for _ in range(like.dim() - 2):
+        statistic = statistic.unsqueeze(1)
+    return statistic
 
 
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
