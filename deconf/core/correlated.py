@@ -1,7 +1,5 @@
 """Gaussians over latents whose dimensions are correlated, as parameters that a network gives."""
 
-from functools import cache
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -43,9 +41,11 @@ class Correlated:
 
     def triangle(self, lower: Tensor) -> Tensor:
         """1 + A [..., D, D]."""
-        unit, places = unit_triangle(self.latent, lower.device)
-        matrix = unit.expand(*lower.shape[:-1], -1).clone()
-        return matrix.index_copy_(-1, places, lower).unflatten(-1, (self.latent, -1))
+        d = self.latent
+        row, column = torch.tril_indices(d, d, -1, device=lower.device)
+        matrix = torch.eye(d, device=lower.device).expand(*lower.shape[:-1], d, d).clone()
+        matrix[..., row, column] = lower
+        return matrix
 
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
         """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
@@ -68,13 +68,6 @@ class Correlated:
         slope = weighted[..., None] - precision @ column
         at_mean = ((weighted[..., None] + slope) * column).sum((-1, -2)) / 2
         return (at_mean + log_expected_of_normal(root.mT @ precision @ root, root.mT @ slope)).float()
-
-
-@cache
-def unit_triangle(d: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """A unit matrix as [D D], and where the entries below its diagonal are in it, row by row."""
-    row, column = torch.tril_indices(d, d, -1, device=device)
-    return torch.eye(d, device=device).flatten(), d * row + column
 
 
 def log_expected_of_normal(precision: Tensor, weighted: Tensor) -> Tensor:
