@@ -172,7 +172,7 @@ def _scores(one: Headroom) -> tuple[float, list[float]]:
 def picture(made: Points, file: Path, mark: str = "") -> None:
     """A row a task, a panel an episode: the ceiling, the zone where it is solved, and the five best methods."""
     size, blue, green = (9, 1.2 + 0.3 * len(made)), "tab:blue", "#2ca02c"
-    with panels(file, 1, len(ENDS), size=size, mark=mark, sharey=True) as [row]:
+    with panels(file, 1, len(ENDS), size=size, mark=mark, sharex=True, sharey=True) as [row]:
         for panel, (end, said) in zip(row, ENDS.items(), strict=True):
             for y, (_, by_end) in enumerate(made):
                 ceiling, (first, *others) = by_end[end]
@@ -182,8 +182,9 @@ def picture(made: Points, file: Path, mark: str = "") -> None:
                 panel.hlines(y, min(others, default=first), first, color=blue, lw=1.2)
                 panel.plot(others, [y] * len(others), "o", ms=3.5, mfc="w", color=blue, label=labels[1])
                 panel.plot(first, y, "o", ms=6, color=blue, label=labels[2])
-            panel.set(title=f"score in {said}", xlim=(0.3, 1.12), ylim=(len(made) - 0.5, -0.5))
+            panel.set(title=f"score in {said}", xlim=(0.3, None), ylim=(len(made) - 0.5, -0.5))
             panel.grid(axis="x", color="0.92")
             panel.set_axisbelow(True)
         row[0].set_yticks(range(len(made)), [name for name, _ in made])
-        row[0].legend(loc="lower left", frameon=False, fontsize=8)
+        handles = row[0].get_legend_handles_labels()
+        row[0].figure.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
