@@ -182,9 +182,10 @@ def picture(made: Points, file: Path, mark: str = "") -> None:
                 panel.hlines(y, min(others, default=first), first, color=blue, lw=1.2)
                 panel.plot(others, [y] * len(others), "o", ms=3.5, mfc="w", color=blue, label=labels[1])
                 panel.plot(first, y, "o", ms=6, color=blue, label=labels[2])
-            panel.set(title=f"score in {said}", xlim=(0.3, None), ylim=(len(made) - 0.5, -0.5))
+            panel.set(title=f"score in {said}", ylim=(len(made) - 0.5, -0.5))
             panel.grid(axis="x", color="0.92")
             panel.set_axisbelow(True)
         row[0].set_yticks(range(len(made)), [name for name, _ in made])
+        row[0].set_xlim(left=0.3)  # of both, when all has been drawn
         handles = row[0].get_legend_handles_labels()
         row[0].figure.legend(*handles, loc="outside lower center", ncols=3, frameon=False, fontsize=8)

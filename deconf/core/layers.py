@@ -126,7 +126,8 @@ class Mlp(nn.Sequential):
         super().__init__(first, nn.ReLU(), second, nn.ReLU(), Linear(width, outputs, draws))
 
     def forward(self, x: Tensor) -> Tensor:
-        parameters = [parameter for layer in self._modules.values() for parameter in layer._parameters.values()]
+        layers = self._modules.values()  # `parameters()` takes several times as long
+        parameters = [each for layer in layers if layer for each in layer._parameters.values() if each is not None]
         rows = x.reshape(len(x), -1, x.shape[-1])
         # A node of the graph costs an agent's step a tenth of its time, for a gradient that nobody asks for.
         out = MlpFunction.apply(rows, *parameters) if torch.is_grad_enabled() else activations(rows, parameters)[-1]
