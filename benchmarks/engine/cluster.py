@@ -66,7 +66,7 @@ class Cluster(Engine):
             for file in files.values():
                 if file not in sent or file == job.checkpoint:
                     sent[file] = ray.put(file.read_bytes())
-            gpus = int(job.preset.device != "cpu" and job.about.learned)
+            gpus = int(job.device != "cpu")
             task = ray.remote(work).options(num_cpus=1, num_gpus=gpus, max_retries=0, scheduling_strategy="SPREAD")
             portable = replace(job, expert=absolute(job.expert))
             expected = {**identity.identity(job), "code": sources.package()}

@@ -66,6 +66,11 @@ class Job(ABC):
         return self.folder / f"{self.method}-{seed}.npz"
 
     @property
+    def device(self) -> str:
+        """What it trains on; the CPU if it trains nothing."""
+        return self.preset.device if self.about.learned else "cpu"
+
+    @property
     def checkpoint(self) -> Path:
         """What an interrupted job goes on from."""
         return self.folder / f".{self.method}-{'-'.join(map(str, self.seeds))}.pt"
@@ -145,7 +150,7 @@ class JobMonitor(Monitor):
         super().__init__()
         self.identity, self.last_edit = identity(job), last_edit()
         self.ticks, self.share, self.told = job.ticks, share, 0
-        self.device = job.preset.device if job.about.learned else "cpu"
+        self.device = job.device
         self.file = job.checkpoint
         self.start, self.saved = time.time(), time.monotonic()
         self.before: list[tuple[float, float]] = []

@@ -120,7 +120,7 @@ class DptAgent(TransformerAgent):
 
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the query. The next token overwrites it in the cache, since `count` stays."""
-        return self.act_on(self.queries(obs), obs)
+        return self.act_on(self.queries(obs), self.scales.obs(obs))
 
     def remember(self, step: Batch) -> None:
         parts = zip(self.transitions(step), step.mask, self._layers, self._caches, strict=True)

@@ -223,13 +223,14 @@ class TransformerAgent(LearnedAgent):
 
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the next token. It stays in the cache if the step takes place, and is overwritten otherwise."""
-        return self.act_on(torch.cat([self.scales.obs(obs), self._before], -1), obs)
+        scaled = self.scales.obs(obs)
+        return self.act_on(torch.cat([scaled, self._before], -1), scaled)
 
-    def act_on(self, tokens: Tensor, obs: Tensor) -> Tensor:
-        """Action [S, N, A], given each trial's next token [S, N, I] and its observation [S, N, O]."""
+    def act_on(self, tokens: Tensor, scaled: Tensor) -> Tensor:
+        """Action [S, N, A], given each trial's next token [S, N, I] and its scaled observation [S, N, O]."""
         steps = zip(tokens, self._layers, self._caches, strict=True)
         self._features = torch.stack([self.net.step(*of_seed) for of_seed in steps])
-        return self.policy.sample(torch.cat([self._features, self.scales.obs(obs)], -1), self._draws)
+        return self.policy.sample(torch.cat([self._features, scaled], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
         for cache, mask in zip(self._caches, step.mask, strict=True):
