@@ -34,18 +34,23 @@ def edges(u: Array) -> Array:
     return 2 * EDGE * u + (1 - 2 * EDGE) * (u >= 0.5)
 
 
+def why_not(protocol: str, task: envs.Task) -> str:
+    """Why a task cannot be under a protocol of PROTOCOLS; empty if it can."""
+    if protocol != "unseen":
+        return ""
+    if categories := [lat.name for lat in task.latents if lat.distribution == "categorical"]:
+        return f"{categories[0]} is categorical, which has no middle"
+    if not task.has_likelihood:
+        return "it draws theta by its own sample_theta alone"
+    return "its theta moves, and would leave the middle" if task.drifts or task.switches else ""
+
+
 def check(protocol: str, task: envs.Task) -> None:
     """Raises InputError for a protocol that there is not, or that the task cannot be under."""
     if protocol not in PROTOCOLS:
         raise envs.closest("protocol", protocol, list(PROTOCOLS))
-    if protocol != "unseen":
-        return
-    categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
-    why = f"{categories[0]} is categorical, which has no middle" if categories else ""
-    why = "its theta moves, and would leave the middle" if task.drifts or task.switches else why
-    why = why if task.has_likelihood else "it draws theta by its own sample_theta alone"
-    if why:
-        raise envs.InputError(f"--protocol unseen is not for {task.name}: {why}")
+    if why := why_not(protocol, task):
+        raise envs.InputError(f"--protocol {protocol} is not for {task.name}: {why}")
 
 
 def amounts(protocol: str, preset: "Preset") -> "Preset":

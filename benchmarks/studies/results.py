@@ -47,7 +47,7 @@ def published(protocol: str = STANDARD, names: Sequence[str] = envs.SUITE) -> in
 
 def other_protocols() -> dict[str, index.Found]:
     """The same under each other protocol that has records; reads the files that have any."""
-    files = {name: DOCS / "records" / records.place(name) for name in envs.SUITE}
+    files = {name: DOCS / "records" / records.place(name) for name in (*envs.SUITE, *envs.HARD)}
     names = [name for name, file in files.items() if file.exists() and records.NAME.encode() in file.read_bytes()]
     found = {protocol: published(protocol, names) for protocol in PROTOCOLS if protocol != STANDARD}
     return {protocol: of for protocol, of in found.items() if of}

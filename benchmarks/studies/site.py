@@ -27,7 +27,7 @@ CONTENTS: dict[
     "Tutorials": {f"tutorials/{name}": f"docs/tutorials/{name}.md" for name in ("bandit", "lander", "logs")},
     "Benchmark": {
         **{"tasks/index": None, "methods/index": None, "results": "docs/results.md", "headroom": "docs/headroom.md"},
-        **{"hard": "docs/hard.md"},
+        **{"hard": "docs/hard.md", "protocols": "docs/protocols.md"},
         **{"baselines": "docs/baselines.md", "paper": "docs/paper.md", "spectrum": "docs/spectrum.md"},
         **{"exploration": "docs/exploration.md", "speed": "docs/speed.md"},
     },

@@ -18,7 +18,17 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import aggregation, index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure, still
-from deconfounded.benchmarks.studies import cards, findings, gap, hard, headroom, publish, results, tune
+from deconfounded.benchmarks.studies import (
+    cards,
+    findings,
+    gap,
+    hard,
+    headroom,
+    protocol_scores,
+    publish,
+    results,
+    tune,
+)
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -238,7 +248,8 @@ def scored(method: str, first: float, last: float, tier: str = "2", deployment: 
         "seeds": [0, 1],
         "reference": int(method == "expert"),
     }
-    return {**about, "version": 1, "score_first": first, "score_last": last, "return": [[first, last]] * 2}
+    around = {name: [score - 0.1, score + 0.1] for name, score in (("ci95_first", first), ("ci95", last))}
+    return {**about, **around, "version": 1, "score_first": first, "score_last": last, "return": [[first, last]] * 2}
 
 
 class TestHeadroom:
@@ -303,6 +314,52 @@ class TestHeadroom:
         assert made == [("curling", {"first": (0.85, [0.7, 0.1]), "last": (0.98, [0.95, 0.9])})]
         headroom.picture(made, tmp_path / "headroom.png")
         assert (tmp_path / "headroom.png").stat().st_size > 5000
+
+
+class TestProtocols:
+    ALL = {
+        **{"random": scored("random", 0, 0, "reference"), "expert": scored("expert", 1, 1, "reference")},
+        **{name: scored(name.removesuffix("_mode"), 0.5, 0.75) for name in protocol_scores.SHOWN},
+    }
+
+    def test_page(self) -> None:
+        """The scores of both episodes, each with its own interval; what is missing, and what cannot be."""
+        mine = {**self.ALL, "dagger": scored("dagger", 0.25, 0.5)}
+        some = {name: mine[name] for name in ("random", "expert", "dagger")}
+        standard = [(envs.get(name), {"methods": self.ALL}) for name in ("curling", "icy_road")]
+        under = [(envs.get("curling"), {"methods": mine}), (envs.get("icy_road"), {"methods": some})]
+        page = protocol_scores.page(standard, {"unseen": under, "once": under[:1]})
+        unseen = page.partition("## unseen")[2].partition("## once")[0]
+        first, last = unseen.split("| first episode |")[1].split("| last episode |")
+        dagger = 1 + protocol_scores.SHOWN.index("dagger")
+
+        def cells(table: str, row: str) -> list[str]:
+            line, *others = [line for line in table.splitlines() if line.startswith(f"| {row} |")]
+            assert not others
+            return [cell.strip() for cell in line.strip("| ").split(" | ")]
+
+        assert cells(first, "curling")[dagger] == "0.25 (0.15 to 0.35)"
+        assert cells(last, "curling")[dagger] == "0.50 (0.40 to 0.60)"
+        assert cells(last, "curling")[1] == "0.75 (0.65 to 0.85)"
+        assert "| icy_road |  |  |  | 0.50 (0.40 to 0.60) |" in last
+        # over curling alone, where both have all
+        assert (cells(last, "interquartile mean")[dagger], cells(last, "the same, standard")[dagger]) == (
+            "0.50",
+            "0.75",
+        )
+        missing = last.partition("Not yet made: ")[2].partition(".")[0].split(", ")
+        assert "weak_thruster" in missing
+        assert not {"curling", "icy_road", "bandit"} & {*missing}
+        assert "- Not for bandit: best_arm is categorical" in last
+        assert "Not for" not in page.partition("## once")[2]
+
+    def test_once(self) -> None:
+        """A trial of one episode has one table."""
+        once = protocol_scores.page([], {"once": [(envs.get("curling"), {"methods": self.ALL})]}).partition("## once")[
+            2
+        ]
+        assert once.count("| curling |") == 1
+        assert "interquartile mean" not in once
 
 
 @pytest.fixture(scope="module")
