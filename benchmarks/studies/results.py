@@ -46,11 +46,17 @@ def published(protocol: str = STANDARD, names: Sequence[str] = envs.SUITE) -> in
 
 
 def other_protocols() -> dict[str, index.Found]:
-    """The same under each other protocol that has records; reads the files that have any."""
+    """The same under each other protocol, of the tasks whose references have records; reads the files that have any."""
     files = {name: DOCS / "records" / records.place(name) for name in (*envs.SUITE, *envs.HARD)}
     names = [name for name, file in files.items() if file.exists() and records.NAME.encode() in file.read_bytes()]
-    found = {protocol: published(protocol, names) for protocol in PROTOCOLS if protocol != STANDARD}
+    found = {protocol: published(protocol, _scored(protocol, names)) for protocol in PROTOCOLS if protocol != STANDARD}
     return {protocol: of for protocol, of in found.items() if of}
+
+
+def _scored(protocol: str, names: Sequence[str]) -> list[str]:
+    """The tasks with the records that scores need: a table that is being made has them last."""
+    kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
+    return [name for name in names if {*REFERENCES} <= {record["method"] for record in kept[name]}]
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:

@@ -361,6 +361,18 @@ class TestProtocols:
         assert once.count("| curling |") == 1
         assert "interquartile mean" not in once
 
+    def test_table_in_the_making(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A task appears with its references, without which it has no scores; pages can be made before that."""
+        for name in ("curling", "slippery_cartpole"):
+            kept = records.of_task(publish.DOCS / "records", name, protocol="scarce")
+            records.write(
+                tmp_path / "records", [of for of in kept if (name, of["method"]) != ("slippery_cartpole", "random")]
+            )
+        monkeypatch.setattr(results, "DOCS", tmp_path)
+        assert {protocol: [task.name for task, _ in of] for protocol, of in results.other_protocols().items()} == {
+            "scarce": ["curling"]
+        }
+
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, Any]:
