@@ -64,8 +64,12 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
 
 
 def pick(file: Path, method: str, seed: int) -> records.Record:
-    """The record of a method and seed in a file. Raises InputError if there is none, or if there are several."""
+    """The record of a method and seed in a file: of the standard protocol, if the file has any of that.
+
+    Raises InputError if there is none, or if there are several.
+    """
     every = records.read(file)
+    every = [record for record in every if records.NAME not in record] or every
     ours = [record for record in every if records.named(record) == method]
     if not ours:
         raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")

@@ -380,6 +380,8 @@ class TestVerify:
     def test_which_record(self, job: BenchmarkJob, tmp_path: Path) -> None:
         one, two = kept(job)
         file = tmp_path / "bandit.jsonl"
+        records.write(tmp_path, [{**one, "protocol_name": "scarce"}])
+        assert verify.pick(file, "blind_bc", 0)["protocol_name"] == "scarce"  # where there is no other
         records.write(tmp_path, [one, two, {**two, "salt": "salt"}])
         assert verify.pick(file, "blind_bc", 0) == one
         for method, seed, says in (
