@@ -38,11 +38,12 @@ def why_not(protocol: str, task: envs.Task) -> str:
     """Why a task cannot be under a protocol of PROTOCOLS; empty if it can."""
     if protocol != "unseen":
         return ""
-    if categories := [lat.name for lat in task.latents if lat.distribution == "categorical"]:
-        return f"{categories[0]} is categorical, which has no middle"
     if not task.has_likelihood:
         return "it draws theta by its own sample_theta alone"
-    return "its theta moves, and would leave the middle" if task.drifts or task.switches else ""
+    if task.drifts or task.switches:
+        return "its theta moves, and would leave the middle"
+    categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
+    return f"{categories[0]} is categorical, which has no middle" if categories else ""
 
 
 def check(protocol: str, task: envs.Task) -> None:

@@ -140,14 +140,14 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "concepts.md": {"certificates": cards.certificates(certified)},
         README: {"summary": results.summary(found, certified)},
     }
-    hard_found, others = results.published(names=envs.HARD), results.other_protocols()
+    hard_tasks, by_protocol = results.published(names=envs.HARD), results.other_protocols()
     return {
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
         DOCS / "results.md": results.results_page(found, certified),
-        DOCS / "hard.md": hard.page(hard_found, cards.certified(envs.HARD)),
-        DOCS / "headroom.md": headroom.page(found, certified, others),
-        DOCS / "protocols.md": protocol_scores.page([*found, *hard_found], others),
+        DOCS / "hard.md": hard.page(hard_tasks, cards.certified(envs.HARD)),
+        DOCS / "headroom.md": headroom.page(found, certified, by_protocol),
+        DOCS / "protocols.md": protocol_scores.page([*found, *hard_tasks], by_protocol),
         **{file: _filled(file, of) for file, of in tables.items()},
     }
 

@@ -1,6 +1,6 @@
 """Results on pages: docs/results.md, and the tables of results in README, docs/speed.md, paper.md and baselines.md."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -41,22 +41,28 @@ TIMED = ("bandit", "tilted_cartpole", "slippery_cartpole")  # in docs/speed.md
 
 def published(protocol: str = STANDARD, names: Sequence[str] = envs.SUITE) -> index.Found:
     """In the registry's order, the tasks that have records in docs/, and what these come to. Reads every record."""
-    kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
-    return [(envs.get(name), aggregation.gather(of, list(METHODS))) for name, of in kept.items() if of]
+    return _gathered({name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names})
 
 
 def other_protocols() -> dict[str, index.Found]:
     """The same under each other protocol, of the tasks whose references have records; reads the files that have any."""
     files = {name: DOCS / "records" / records.place(name) for name in (*envs.SUITE, *envs.HARD)}
     names = [name for name, file in files.items() if file.exists() and records.NAME.encode() in file.read_bytes()]
-    found = {protocol: published(protocol, _scored(protocol, names)) for protocol in PROTOCOLS if protocol != STANDARD}
-    return {protocol: of for protocol, of in found.items() if of}
+    by_protocol: dict[str, index.Found] = {}
+    for protocol in PROTOCOLS:
+        if protocol == STANDARD:
+            continue
+        kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
+        # a table that is being made has the references last, which scores need
+        scored = {name: of for name, of in kept.items() if {*REFERENCES} <= {record["method"] for record in of}}
+        if scored:
+            by_protocol[protocol] = _gathered(scored)
+    return by_protocol
 
 
-def _scored(protocol: str, names: Sequence[str]) -> list[str]:
-    """The tasks with the records that scores need: a table that is being made has them last."""
-    kept = {name: records.of_task(DOCS / "records", name, protocol=protocol) for name in names}
-    return [name for name in names if {*REFERENCES} <= {record["method"] for record in kept[name]}]
+def _gathered(kept: Mapping[str, Sequence[records.Record]]) -> index.Found:
+    """The tasks that have records, and what these come to."""
+    return [(envs.get(name), aggregation.gather(of, list(METHODS))) for name, of in kept.items() if of]
 
 
 def command(task: envs.Task, results: dict[str, Any], method: str = "") -> str:
@@ -187,7 +193,7 @@ def summary(found: index.Found, certified: dict[str, Any]) -> str:
         link = f"[{name}](deconf/methods/{registry.METHODS[name].partition(':')[0]}.py)"
         rank[link] = figures[1]["value"] if figures[1] else 0.0
         made_of = ", ".join(f"v{version}" for version in sorted(versions)) + now
-        rows.append((link, what, METHODS[name].tier, *map(_with_interval, figures), made_of))
+        rows.append((link, what, METHODS[name].tier, *map(with_interval, figures), made_of))
     rows.sort(key=lambda row: -rank[row[0]])
     table = markdown_table(("method", "what it is", "tier", "first episode", "last episode", "version"), rows)
     return f"Interquartile means over {len(tasks)} tasks, and 95% intervals:\n\n{table}"
@@ -225,13 +231,13 @@ def fared(found: index.Found, certified: dict[str, Any]) -> str:
         means = {task: float(np.mean([*of[name].values()])) for task, of in scores.items() if name in of}
         ends = (end(means, key=means.__getitem__) for end in (min, max))
         extremes = (f"{task}, {scoring.two_decimals(means[task])}" for task in ends)
-        figures = (_with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
+        figures = (with_interval(over[name].get(figure)) for figure in ("iqm", "improvement"))
         rows.append((name, METHODS[name].tier, str(len(means)), *figures, *extremes))
     summary = ("interquartile mean", f"probability that {PEER} is better", "least on", "most on")
     return markdown_table(("method", "tier", "tasks", *summary), rows)
 
 
-def _with_interval(figure: dict[str, Any] | None) -> str:
+def with_interval(figure: dict[str, Any] | None) -> str:
     """Two decimals, and from where to where."""
     value, *ends = map(scoring.two_decimals, (figure["value"], *(figure["interval"] or ()))) if figure else [""]
     return f"{value} ({' to '.join(ends)})" if ends else value

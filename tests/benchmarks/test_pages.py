@@ -325,28 +325,24 @@ class TestProtocols:
     def test_page(self) -> None:
         """The scores of both episodes, each with its own interval; what is missing, and what cannot be."""
         mine = {**self.ALL, "dagger": scored("dagger", 0.25, 0.5)}
-        some = {name: mine[name] for name in ("random", "expert", "dagger")}
+        dagger_alone = {name: mine[name] for name in ("random", "expert", "dagger")}
         standard = [(envs.get(name), {"methods": self.ALL}) for name in ("curling", "icy_road")]
-        under = [(envs.get("curling"), {"methods": mine}), (envs.get("icy_road"), {"methods": some})]
+        under = [(envs.get("curling"), {"methods": mine}), (envs.get("icy_road"), {"methods": dagger_alone})]
         page = protocol_scores.page(standard, {"unseen": under, "once": under[:1]})
         unseen = page.partition("## unseen")[2].partition("## once")[0]
         first, last = unseen.split("| first episode |")[1].split("| last episode |")
         dagger = 1 + protocol_scores.SHOWN.index("dagger")
 
         def cells(table: str, row: str) -> list[str]:
-            line, *others = [line for line in table.splitlines() if line.startswith(f"| {row} |")]
-            assert not others
+            [line] = (line for line in table.splitlines() if line.startswith(f"| {row} |"))
             return [cell.strip() for cell in line.strip("| ").split(" | ")]
 
         assert cells(first, "curling")[dagger] == "0.25 (0.15 to 0.35)"
         assert cells(last, "curling")[dagger] == "0.50 (0.40 to 0.60)"
         assert cells(last, "curling")[1] == "0.75 (0.65 to 0.85)"
         assert "| icy_road |  |  |  | 0.50 (0.40 to 0.60) |" in last
-        # over curling alone, where both have all
-        assert (cells(last, "interquartile mean")[dagger], cells(last, "the same, standard")[dagger]) == (
-            "0.50",
-            "0.75",
-        )
+        means = [cells(last, row)[dagger] for row in ("interquartile mean", "the same, standard")]
+        assert means == ["0.50", "0.75"]  # over curling alone, where both have all
         missing = last.partition("Not yet made: ")[2].partition(".")[0].split(", ")
         assert "weak_thruster" in missing
         assert not {"curling", "icy_road", "bandit"} & {*missing}
@@ -355,9 +351,8 @@ class TestProtocols:
 
     def test_once(self) -> None:
         """A trial of one episode has one table."""
-        once = protocol_scores.page([], {"once": [(envs.get("curling"), {"methods": self.ALL})]}).partition("## once")[
-            2
-        ]
+        curling = [(envs.get("curling"), {"methods": self.ALL})]
+        once = protocol_scores.page([], {"once": curling}).partition("## once")[2]
         assert once.count("| curling |") == 1
         assert "interquartile mean" not in once
 
@@ -365,13 +360,11 @@ class TestProtocols:
         """A task appears with its references, without which it has no scores; pages can be made before that."""
         for name in ("curling", "slippery_cartpole"):
             kept = records.of_task(publish.DOCS / "records", name, protocol="scarce")
-            records.write(
-                tmp_path / "records", [of for of in kept if (name, of["method"]) != ("slippery_cartpole", "random")]
-            )
+            made = [record for record in kept if (name, record["method"]) != ("slippery_cartpole", "random")]
+            records.write(tmp_path / "records", made)
         monkeypatch.setattr(results, "DOCS", tmp_path)
-        assert {protocol: [task.name for task, _ in of] for protocol, of in results.other_protocols().items()} == {
-            "scarce": ["curling"]
-        }
+        tasks = {protocol: [task.name for task, _ in of] for protocol, of in results.other_protocols().items()}
+        assert tasks == {"scarce": ["curling"]}
 
 
 @pytest.fixture(scope="module")
