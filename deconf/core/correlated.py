@@ -1,7 +1,11 @@
 """Gaussians over latents whose dimensions are correlated, as parameters that a network gives."""
 
+import math
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Draws
@@ -21,6 +25,8 @@ class Correlated:
 
     def __init__(self, latent: int) -> None:
         self.latent, self.parameters = latent, 2 * latent + latent * (latent - 1) // 2
+        row, column = torch.tril_indices(latent, latent, -1)
+        self._below = latent * row + column  # where A's entries are in a flat matrix
 
     def network(self, inputs: int, width: int, draws: Draws) -> Mlp:
         """A network [..., I] -> [..., P] for `about`, whose output is 0 before training."""
@@ -42,10 +48,9 @@ class Correlated:
     def triangle(self, lower: Tensor) -> Tensor:
         """1 + A [..., D, D]."""
         d = self.latent
-        row, column = torch.tril_indices(d, d, -1, device=lower.device)
-        matrix = torch.eye(d, device=lower.device).expand(*lower.shape[:-1], d, d).clone()
-        matrix[..., row, column] = lower
-        return matrix
+        unit = torch.eye(d, dtype=lower.dtype, device=lower.device)
+        flat = unit.flatten().expand(*lower.shape[:-1], d * d).contiguous()
+        return flat.index_copy_(-1, self._below.to(lower.device), lower).unflatten(-1, (d, d))
 
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
         """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
@@ -54,27 +59,114 @@ class Correlated:
         drawn = torch.linalg.solve_triangular(self.triangle(lower), noise, upper=False, unitriangular=True)
         return mean + drawn[..., 0]
 
+    def log_prob(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
+        """The log density [...] of theta_hat [..., D] under beliefs [..., P], differentiable in these."""
+        return LogProb.apply(self, belief, theta_hat)
+
     def log_expected(self, belief: Tensor, precision: Tensor, weighted: Tensor) -> Tensor:
         """log E exp(b^T theta_hat - theta_hat^T P theta_hat / 2) [...], in closed form: P [..., D, D], b [..., D].
 
-        That is the log-likelihood of evidence that is quadratic in theta_hat under the belief, but for a constant. P
-        and b are in double precision.
+        That is the log-likelihood of evidence that is quadratic in theta_hat under the belief, but for a constant. It
+        is differentiable in the belief. P and b are in double precision.
         """
-        mean, std, lower = self.split(belief)
-        root = torch.linalg.solve_triangular(  # theta_hat = mean + root e, e normal
-            self.triangle(lower).double(), torch.diag_embed(std.double()), upper=False, unitriangular=True
-        )
-        column = mean.double()[..., None]
+        return LogExpected.apply(self, belief, precision, weighted)
+
+    def log_prob_gradient(self, triangle: Tensor, std: Tensor, mean: Tensor, square: Tensor, product: Tensor) -> Tensor:
+        """The gradient [..., P] of log N(theta_hat) in the belief, or its mean over theta_hat.
+
+        e = (1 + A) (theta_hat - m) / s is standard normal. mean and square [..., D]: of e and e^2; product [..., D, D]:
+        of e (theta_hat - m)^T.
+        """
+        by_mean = (triangle.mT @ (mean / std)[..., None])[..., 0]
+        by_lower = -(product / std[..., None]).flatten(-2).index_select(-1, self._below.to(std.device))
+        return torch.cat([by_mean, (square - 1) / std, by_lower], -1)
+
+
+class LogProb(torch.autograd.Function):
+    """`Correlated.log_prob`."""
+
+    @staticmethod
+    def forward(ctx: Any, gaussian: Correlated, belief: Tensor, theta_hat: Tensor) -> Tensor:
+        mean, std, lower = gaussian.split(belief)
+        triangle, apart = gaussian.triangle(lower), theta_hat - mean
+        e = (triangle @ apart[..., None])[..., 0] / std
+        ctx.gaussian = gaussian
+        ctx.save_for_backward(triangle, std, apart, e)
+        return -(e.square() / 2 + std.log() + math.log(2 * math.pi) / 2).sum(-1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
+        triangle, std, apart, e = ctx.saved_tensors
+        product = e[..., None] * apart[..., None, :]
+        return None, grads[0][..., None] * ctx.gaussian.log_prob_gradient(triangle, std, e, e.square(), product), None
+
+
+class LogExpected(torch.autograd.Function):
+    """`Correlated.log_expected`. Its gradient is that of log N(theta_hat), averaged over the posterior of theta_hat.
+
+    That is Fisher's identity: d/dx log E f(theta_hat) = E_post d/dx log p(theta_hat; x).
+    """
+
+    @staticmethod
+    def forward(ctx: Any, gaussian: Correlated, belief: Tensor, precision: Tensor, weighted: Tensor) -> Tensor:
+        mean, std, lower = gaussian.split(belief.double())
+        triangle = gaussian.triangle(lower)
+        root = torch.linalg.solve_triangular(triangle, torch.diag_embed(std), upper=False, unitriangular=True)
+        column = mean[..., None]  # theta_hat = mean + root e, e normal
         slope = weighted[..., None] - precision @ column
         at_mean = ((weighted[..., None] + slope) * column).sum((-1, -2)) / 2
-        return (at_mean + log_expected_of_normal(root.mT @ precision @ root, root.mT @ slope)).float()
+        log_expected, factor, half = expect_of_normal(root.mT @ precision @ root, root.mT @ slope)
+        ctx.gaussian = gaussian
+        ctx.save_for_backward(triangle, std, root, factor, half)
+        return (at_mean + log_expected).float()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None, None]:
+        triangle, std, root, factor, half = ctx.saved_tensors
+        mean, second = posterior_moments(factor, half)
+        square = second.diagonal(dim1=-2, dim2=-1)
+        by_belief = ctx.gaussian.log_prob_gradient(triangle, std, mean, square, second @ root.mT)
+        return None, grads[0][..., None] * by_belief.float(), None, None
+
+
+class LogExpectedOfNormal(torch.autograd.Function):
+    """`log_expected_of_normal`."""
+
+    @staticmethod
+    def forward(ctx: Any, precision: Tensor, weighted: Tensor) -> Tensor:
+        log_expected, factor, half = expect_of_normal(precision, weighted)
+        ctx.save_for_backward(factor, half)
+        return log_expected
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor]:
+        mean, second = posterior_moments(*ctx.saved_tensors)
+        grad = grads[0][..., None]
+        return grad[..., None] * second / -2, (grad * mean)[..., None]
 
 
 def log_expected_of_normal(precision: Tensor, weighted: Tensor) -> Tensor:
-    """log E exp(b^T e - e^T P e / 2) [...] of a standard normal e [D]: P [..., D, D], b [..., D, 1]."""
-    lower = posterior_root(precision)
-    half = torch.linalg.solve_triangular(lower, weighted, upper=False)
-    return half.square().sum((-1, -2)) / 2 - lower.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    """log E exp(b^T e - e^T P e / 2) [...] of a standard normal e [D]: P [..., D, D], b [..., D, 1].
+
+    It is differentiable in both: its gradient is E[e] in b, and -E[e e^T] / 2 in P, of the posterior.
+    """
+    return LogExpectedOfNormal.apply(precision, weighted)
+
+
+def expect_of_normal(precision: Tensor, weighted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """What `log_expected_of_normal` gives, the root L of 1 + P, and L^-1 b [..., D, 1]."""
+    factor = posterior_root(precision)
+    half = torch.linalg.solve_triangular(factor, weighted, upper=False)
+    return half.square().sum((-1, -2)) / 2 - factor.diagonal(dim1=-2, dim2=-1).log().sum(-1), factor, half
+
+
+def posterior_moments(factor: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
+    """E[e] [..., D] and E[e e^T] [..., D, D] of the posterior of `expect_of_normal`."""
+    mean = torch.linalg.solve_triangular(factor.mT, half, upper=True)
+    return mean[..., 0], torch.cholesky_inverse(factor) + mean * mean.mT
 
 
 def posterior_root(precision: Tensor) -> Tensor:

@@ -1,9 +1,11 @@
 """A model whose dynamics are linear in theta_hat: evidence adds up, and likelihoods are exact (`LinearModel`)."""
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.correlated import Correlated, log_expected_of_normal, posterior_root
@@ -57,15 +59,17 @@ class LinearModel(LatentModel):
         self.register_buffer("error", torch.full((len(draws), 1), ERROR, device=draws.device))
         self.reader = self.gaussian.network(self.read_width, width, draws)
 
-    def _terms(self, batch: Batch) -> Tensor:
-        """Increments of the memory [..., M], one a transition: products of (G, s_next - s - f), log s, a count of 1."""
+    def _effects(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Arguments of `weigh`."""
         expected, gains = self.dynamics.parts(batch.obs, batch.action)
         innovation = self.dynamics.change(batch.next_obs - batch.obs) - expected
         noise, error = (per_seed(x, expected) for x in ((2 * self.dynamics.log_std).exp(), self.error))
-        variance = noise + error * gains.square().sum(-1)
-        both = torch.cat([gains, innovation[..., None]], -1) * (batch.mask[..., None] * variance.rsqrt())[..., None]
-        log_std = batch.mask[..., None] * variance.log().sum(-1, keepdim=True) / 2
-        return torch.cat([products(both.mT, both).flatten(-2), log_std, batch.mask[..., None]], -1)
+        return gains, innovation, noise.expand_as(innovation), error, batch.mask[..., None]
+
+    @torch.no_grad()
+    def _terms(self, batch: Batch) -> Tensor:
+        """Increments of the memory [..., M], one a transition: products of (G, s_next - s - f), log s, a count of 1."""
+        return weigh(*self._effects(batch))[0]
 
     def _sums(self, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """P [..., D, D], b [..., D] and the squares of innovations [...], in double precision."""
@@ -127,20 +131,20 @@ class LinearModel(LatentModel):
         return log_expected - squares.float() / 2 - terms[..., -2] - constant
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        terms = self._terms(batch)
+        terms, total = Evidence.apply(*self._effects(batch))
         with torch.no_grad():
             sums = terms.cumsum(2)
             index = batch.draw_steps(READ, draws)
             before = take((sums - terms).flatten(1, 2), index)
             after = take(sums[:, :, -1], index // terms.shape[2]) - before
-        return self.surprise(terms.sum(2)) + self.prediction_loss(before, after)
+        return self.surprise(total) + self.prediction_loss(before, after)
 
     def loss_on_sets(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        terms = self._terms(batch)
+        terms, total = Evidence.apply(*self._effects(batch))
         with torch.no_grad():
             half = (draws.uniform(len(batch), HALVES, terms.shape[2]) < 0.5).float()
             before, after = products(half, terms), products(1 - half, terms)
-        return self.surprise(terms.sum(2)) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
+        return self.surprise(total) + self.prediction_loss(before.flatten(1, 2), after.flatten(1, 2))
 
     def surprise(self, memory: Tensor) -> Tensor:
         """-log p [S] of trials with memories [S, B, M], theta_hat integrated out: a mean over steps.
@@ -157,6 +161,45 @@ class LinearModel(LatentModel):
         precision, weighted, _ = self._sums(after)
         log_likelihood = self.gaussian.log_expected(self.belief(before), precision, weighted)
         return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
+
+
+def weigh(gains: Tensor, innovation: Tensor, noise: Tensor, error: Tensor, mask: Tensor) -> tuple[Tensor, ...]:
+    """Increments of the memory [..., M]; (G, innovation) [..., O, D + 1] in units of the noise; variances [..., O].
+
+    gains: G [..., O, D]. innovation: s_next - s - f, and noise: its variance s^2, both [..., O]. error: ERROR. mask:
+    [..., 1].
+    """
+    variance = noise + error * gains.square().sum(-1)
+    both = torch.cat([gains, innovation[..., None]], -1) * (mask * variance.rsqrt())[..., None]
+    log_std = mask * variance.log().sum(-1, keepdim=True) / 2
+    return torch.cat([products(both.mT, both).flatten(-2), log_std, mask], -1), both, variance
+
+
+class Evidence(torch.autograd.Function):
+    """`weigh`: the increments [S, B, T, M], and with a gradient their sums over trials [S, B, M].
+
+    What a sum sends back is the same for all steps of a trial: one matrix product a trial, in place of one a step.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *effects: Tensor) -> tuple[Tensor, Tensor]:
+        terms, both, variance = weigh(*effects)
+        gains, _, _, error, mask = effects
+        ctx.mark_non_differentiable(terms)
+        ctx.save_for_backward(gains, error, mask, both, variance)
+        return terms, terms.sum(2)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        gains, error, mask, both, variance = ctx.saved_tensors
+        by_product, by_log_std, _ = grads[1].split([both.shape[-1] ** 2, 1, 1], -1)
+        by_product = by_product.unflatten(-1, (both.shape[-1], -1))
+        by_both = products(both.flatten(2, 3), by_product + by_product.mT).view_as(both)
+        by_variance = (mask * by_log_std[..., None] - (by_both * both).sum(-1)) / (2 * variance)
+        by_both *= (mask * variance.rsqrt())[..., None]
+        by_gains = by_both[..., :-1] + (2 * error * by_variance)[..., None] * gains
+        return by_gains, by_both[..., -1], by_variance, None, None
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.correlated import Correlated
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.latent_model import LatentModel
-from deconfounded.deconf.core.nets import gaussian_log_prob, per_seed
+from deconfounded.deconf.core.nets import per_seed
 
 MEMORIES, PER_TRIAL = 32768, 64  # on which the network is trained, about; at most so many of a trial of exploration
 BATCH, RATE = 1024, 3e-3  # memories an update; learning rate
@@ -36,9 +36,12 @@ class OnlineBelief(nn.Module):
         """Memories [S, ..., M] -> beliefs [S, ..., P]."""
         with torch.no_grad():
             read, mean = model.read(memory)
-        apart = self.gaussian.about(torch.zeros_like(mean), self.net(read))  # from the mean, in units
-        added, *rest = self.gaussian.split(apart)
+        added, *rest = self.gaussian.split(self.apart(read))
         return torch.cat([mean + per_seed(self.unit, mean) * added, *rest], -1)
+
+    def apart(self, read: Tensor) -> Tensor:
+        """Beliefs [S, ..., P] about how far theta_hat is from the mean of the model's belief, in units of its stds."""
+        return self.gaussian.about(read.new_zeros(()), self.net(read))
 
     def mean(self, belief: Tensor) -> Tensor:
         """The mean [..., D] of theta_hat."""
@@ -54,28 +57,19 @@ class OnlineBelief(nn.Module):
         drawn = self.gaussian.sample(torch.cat([torch.zeros_like(mean), *rest], -1), draws)
         return mean + per_seed(self.unit, mean) * drawn
 
-    def uncorrelated(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
-        """(1 + A) (theta_hat - mean) [S, ..., D], in units of its stds: independent, with stds s."""
-        mean, _, lower = self.gaussian.split(belief)
-        apart = ((theta_hat - mean) / per_seed(self.unit, mean))[..., None]
-        return (self.gaussian.triangle(lower) @ apart)[..., 0]
-
-    def log_prob(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
-        """The log density [S, ...] of theta_hat [S, ..., D], in units of its stds."""
-        _, std, _ = self.gaussian.split(belief)
-        return gaussian_log_prob(torch.zeros_like(std), self.uncorrelated(belief, theta_hat), std)
-
     def fit(
         self, model: LatentModel, explored: Batch, updates: int, draws: Draws, latents: Tensor | None = None
     ) -> None:
         """Train on trials [S, B, T] of exploration. latents [S, B, D]: theirs; None: those inferred on whole trials."""
         self.unit.copy_(model.latent_stds())
         memory, theta_hat = memories(model, explored, draws, latents)
+        with torch.no_grad():
+            read, mean = model.read(memory)
+            apart = (theta_hat - mean) / per_seed(self.unit, mean)
         optimizer = Adam([self], RATE, updates)
         for _ in range(updates):
             index = draws.integers(memory.shape[1], BATCH)
-            belief = self(model, take(memory, index))
-            optimizer.step(-self.log_prob(belief, take(theta_hat, index)).mean(-1))
+            optimizer.step(-self.gaussian.log_prob(self.apart(take(read, index)), take(apart, index)).mean(-1))
 
 
 def online_belief(model: LatentModel, draws: Draws) -> OnlineBelief | None:

@@ -42,7 +42,7 @@ class DeconfoundedConfig(Configuration):
     beta: float = 1e-3
     warm_up: float = 0.5  # share of inference updates over which beta rises to its value
     rounds: int = 8
-    inference_updates: int = 500  # a round
+    inference_updates: int = 300  # a round
     inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
     shortest: float = 1 / 16  # least share of these trials that an update reads: see Batch.beginnings
     inference_steps: int | None = 1024  # whose next observation is predicted, of these trials; None: all
@@ -187,7 +187,7 @@ SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
 
 
 @uses(
-    *USES, version=7, cost=4, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
+    *USES, version=8, cost=3, on_control=DeconfoundedConfig(), on_bandit=ON_BANDIT, paper=PAPER, large=large, **SHARED
 )
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1."""

@@ -14,7 +14,11 @@ from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import ON_BANDIT, SHARED, USES, DeconfoundedConfig
 
 BANDIT = replace(ON_BANDIT, model="forgetting")
-AMOUNTS = {"on_control": DeconfoundedConfig(model="forgetting"), "on_bandit": BANDIT, "paper": BANDIT}
+AMOUNTS = {
+    "on_control": DeconfoundedConfig(model="forgetting", inference_updates=500),
+    "on_bandit": BANDIT,
+    "paper": BANDIT,
+}
 
 
 @uses(*USES, version=2, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)

@@ -8,7 +8,7 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import ON_BANDIT, PAPER, SHARED, USES, DeconfoundedConfig
 
-ON_CONTROL, BANDIT = DeconfoundedConfig(model="gru"), replace(ON_BANDIT, model="gru")
+ON_CONTROL, BANDIT = DeconfoundedConfig(model="gru", inference_updates=500), replace(ON_BANDIT, model="gru")
 
 
 @uses(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from deconfounded.deconf.core.adam import Adam
@@ -10,7 +11,7 @@ from deconfounded.deconf.core.correlated import Correlated, posterior_root
 from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.latent_model import final_belief
-from deconfounded.deconf.core.linear_model import ALIKE, ERROR, LinearModel
+from deconfounded.deconf.core.linear_model import ALIKE, ERROR, Evidence, LinearModel, weigh
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.envs.support.errors import InputError
@@ -62,6 +63,53 @@ def test_mean_of_evidence_under_a_belief() -> None:
     likelihood = (drawn @ weighted - ((drawn @ precision) * drawn).sum(-1) / 2).exp()
     exact = gaussian.log_expected(belief, precision[None, None], weighted[None, None]).exp().item()
     assert exact == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
+
+
+def test_gradients_in_closed_form() -> None:
+    """Those of densities, of evidence under a belief and of a trial's likelihood: as torch differentiates them."""
+    generator = torch.Generator().manual_seed(0)
+    gaussian, data = Correlated(3), pushed(4, np.random.default_rng(1))[0]
+    belief, theta_hat, weighted = (torch.randn(5, n, generator=generator).double() for n in (9, 3, 3))
+    belief[:, 3:6] = 0.2 + belief[:, 3:6].abs()
+    belief.requires_grad_()
+    half = torch.randn(5, 7, 3, generator=generator).double()
+    evidence = half.mT @ half
+
+    mean, std, lower = gaussian.split(belief)
+    whitening = gaussian.triangle(lower) / std[..., None]
+    normal = MultivariateNormal(mean, precision_matrix=whitening.mT @ whitening)
+    own = gaussian.log_prob(belief, theta_hat)
+    torch.testing.assert_close(own, normal.log_prob(theta_hat))
+    alike_in(belief, own.square(), normal.log_prob(theta_hat).square())
+
+    after = normal.precision_matrix + evidence  # Bayes: the evidence is the prior times the likelihood by the posterior
+    at = torch.linalg.solve(after, (normal.precision_matrix @ mean[..., None])[..., 0] + weighted)
+    likelihood = (weighted * at).sum(-1) - (evidence @ at[..., None])[..., 0].mul(at).sum(-1) / 2
+    log_expected = likelihood + normal.log_prob(at) - MultivariateNormal(at, precision_matrix=after).log_prob(at)
+    own = gaussian.log_expected(belief, evidence, weighted)
+    torch.testing.assert_close(own.double(), log_expected, rtol=1e-5, atol=1e-5)
+    alike_in(belief, own.double().square(), log_expected.square())
+
+    model = untrained(2, data)
+    effects = [x.detach().requires_grad_() for x in model._effects(data)[:3]]
+    arguments = (*effects, *model._effects(data)[3:])
+    terms, total = Evidence.apply(*arguments)
+    assert not terms.requires_grad
+    alike_in(effects, model.surprise(total), _surprise(model, weigh(*arguments)[0].sum(2)))
+
+
+def alike_in(x: Tensor | list[Tensor], own: Tensor, other: Tensor) -> None:
+    for one, two in zip(*(torch.autograd.grad(y.sum(), x, retain_graph=True) for y in (own, other)), strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-6)
+
+
+def _surprise(model: LinearModel, memory: Tensor) -> Tensor:
+    """`LinearModel.surprise` by determinants, which torch differentiates."""
+    precision, weighted, squares = model._sums(memory)
+    after = precision + torch.eye(model.latent)
+    fitted = (weighted * torch.linalg.solve(after, weighted)).sum(-1)
+    total = (squares - fitted + torch.linalg.slogdet(after).logabsdet) / 2 + memory[..., -2]
+    return total.sum(-1) / memory[..., -1].sum(-1)
 
 
 def test_likelihood_of_the_next_step() -> None:
@@ -242,14 +290,18 @@ def test_evidence_that_is_strong_at_first() -> None:
     """What follows is a difference of large sums: where its rounding exceeds it, training goes on."""
     data, _ = pushed(64, np.random.default_rng(5))
     model = untrained(4, data)
-    terms = model._terms(data).detach()
+    terms = model._terms(data)
     terms[:, :, : STEPS // 2] *= 1e9
     terms[:, :, STEPS // 2 :, :-1] *= 30
     terms[..., -1] = 1
-    model._terms = lambda batch: terms.clone().requires_grad_()  # type: ignore[method-assign]
+    sums = terms.cumsum(2)
+    before, total = sums[:, :, ::3].flatten(1, 2), sums[:, :, -1].requires_grad_()
+    after = (total[:, :, None] - sums[:, :, ::3]).flatten(1, 2).detach()
+    assert (torch.linalg.eigvalsh(model._sums(after)[0]) < -1).any(), "rounding exceeds the prior"
     for _ in range(5):
-        model.loss(data, None, 0.0, streams()).sum().backward()
-    assert all(torch.isfinite(p.grad).all() for p in model.reader.parameters() if p.grad is not None)
+        (model.prediction_loss(before, after) + model.surprise(total)).sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.reader.parameters())
+    assert torch.isfinite(total.grad).all()
 
 
 def test_a_posterior_of_rounded_sums() -> None:
