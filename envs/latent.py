@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr
 
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
@@ -95,6 +94,8 @@ class Latent:
         k = self.features if self.distribution == "categorical" else k
         if not self.drift:
             return np.eye(k)
+        from scipy.special import ndtr  # takes half of what importing the environments would
+
         u, edges = (np.arange(k) + 0.5) / k, np.arange(k + 1) / k
         images = 2.0 * np.arange(-3, 4)[:, None, None]
         ahead = ndtr((edges + images - u[:, None]) / self.drift)

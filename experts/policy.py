@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
-from scipy.special import log_ndtr
 
 from deconfounded.envs import InputError, Task
 from deconfounded.envs.support import outside
@@ -70,6 +69,8 @@ class BoxExpert(Expert):
 
     def log_prob(self, obs: Array, action: Array, theta: Array) -> Array:
         """Log density [N] of a Gaussian censored at the action bounds: density inside, tail mass on -1 and 1."""
+        from scipy.special import log_ndtr  # half a second
+
         sigma = self.task.expert_noise
         z = (action - self.mean(obs, theta)) / sigma
         inside = -0.5 * z**2 - np.log(sigma * np.sqrt(2 * np.pi))

@@ -16,11 +16,12 @@ The authors' version (Vuorio et al., TMLR 2024) has another engine, trials of a 
 reward -|v - theta| - .05 |a|^2, with the same optimum; its indicator starts at -1 and has the opposite sign.
 """
 
+from statistics import NormalDist
+
 import mujoco
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from deconfounded.envs import render
 from deconfounded.envs.physics import Edit, MujocoTask
@@ -76,7 +77,7 @@ class CheetahSpeed(MujocoTask):
         return self.qvel(state, "rootx") - theta[..., 0]
 
     def sense(self, state: Array, theta: Array, noise: Array) -> Array:
-        right = np.where(noise[..., -1] < ndtri(WRONG), -1, 1)
+        right = np.where(noise[..., -1] < NormalDist().inv_cdf(WRONG), -1, 1)
         state[..., -1] = right * np.where(self._off(state, theta) > 0, 1, -1)
         return state
 
