@@ -112,7 +112,11 @@ class LinearModel(LatentModel):
         return self.mean(belief)
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
-        self.stds.copy_(self.mean(belief).std(1, correction=0).clamp(min=0.05))
+        self.scale_to(self.mean(belief))
+
+    def scale_to(self, latents: Tensor) -> None:
+        """Take the stds of latents [S, B, D] for `latent_stds`."""
+        self.stds.copy_(latents.std(1, correction=0).clamp(min=0.05))
 
     def latent_stds(self) -> Tensor:
         return self.stds

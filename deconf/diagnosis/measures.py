@@ -57,7 +57,7 @@ class Amounts:
     rollouts: int = 192
     cloning: MemorylessConfig = field(default_factory=lambda: MemorylessConfig(updates=1500))
     naive: RecurrentConfig = field(default_factory=lambda: RecurrentConfig(updates=1000))
-    offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(online_updates=0))
+    offline: OfflineConfig = field(default_factory=lambda: OfflineConfig(offline_steps=256, online_updates=0))
     exploring: DeconfoundedConfig = field(
         default_factory=lambda: DeconfoundedConfig(inference_updates=2000, shortest=1 / 4)
     )  # with shorter sets the bandit's latent is ignored for too long

@@ -2,9 +2,10 @@
 
 An offline encoder reads whole expert trials, actions included (in training, a random subset of their steps), and a
 decoder of two factors, dynamics and policy, explains both by one latent, Eq. (7). The encoder takes actions for
-evidence, but the dynamics do not: synthetic trials are rolled out in them under actions that are blind to the latent,
-and an online encoder is trained on these, Eq. (6). Since their latents are known, the belief in the course of a trial
-is trained on the latents themselves. The agent is deployed as in Tier 2, by Algorithm 2.
+evidence, but the dynamics do not. They are linear in the latent, so that the evidence of a transition in them is exact
+(footnote 4), as in Tier 2; an online encoder is trained, by Eq. (6), only where observations are 0 or 1. The belief in
+the course of a trial is trained on trials that are rolled out in the learned dynamics under actions that are blind to
+the latent, whose latents are known. The agent is deployed as in Tier 2, by Algorithm 2.
 """
 
 from dataclasses import dataclass
@@ -16,8 +17,10 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import ramp
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, extent, take
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
+from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.latent_model import final_belief
+from deconfounded.deconf.core.linear_model import LinearModel
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -33,17 +36,20 @@ LAST = 512  # least synthetic trials for the belief in the course of a trial
 
 @dataclass(frozen=True)
 class OfflineConfig(Configuration):
-    """Hyperparameters for each seed. Eq. (7) trains first; updates by Eq. (6) do not change its networks."""
+    """Hyperparameters for each seed. Eq. (7) trains first; updates by Eq. (6) do not change its networks.
+
+    beta to synthetic: of Eq. (6), for observations that are 0 or 1.
+    """
 
     width: int = 64
     latent: int = 4
     offline_beta: float = 1.0  # of Eq. (7), whose likelihood is summed over the trial
     offline_updates: int = 2000
     offline_batch: int = 32  # trials
-    offline_steps: int = 256  # random steps of each, on which Eq. (7) is estimated
+    offline_steps: int = 128  # random steps of each, on which Eq. (7) is estimated
     beta: float = 1e-3  # of Eq. (6), a step
     warm_up: float = 0.5  # share of online updates over which this beta rises to its value
-    online_updates: int = 2000
+    online_updates: int = 2000  # of the online encoder; of the belief in the course of a trial
     online_batch: int = 16  # synthetic trials
     shortest: float = 1 / 16  # least share of these trials that an update reads
     online_steps: int = 1024  # whose next observation is predicted, of these trials
@@ -72,7 +78,7 @@ def explain(
     offline, online = VariationalModel("evidence", *sizes), VariationalModel("innovations", *sizes)
     offline.dynamics = online.dynamics
     policy = ActionHead(online.inputs.obs_width + config.latent, config.width, scales, draws)
-    total = config.offline_updates + config.online_updates
+    total = config.offline_updates + (config.online_updates if signature.binary else 0)
     optimizer = Adam([offline, policy], config.learning_rate, config.offline_updates)
     for update in range(config.offline_updates):
         batch = data.draw_trials(config.offline_batch * times, draws)
@@ -99,27 +105,39 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     episodes = trials.mask.shape[1]
     trials, times = (split_episodes(trials), episodes) if config.drifts else (trials, 1)
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
-    offline, online, policy = explain(data, signature, config, draws, monitor, times)
+    offline, encoder, policy = explain(data, signature, config, draws, monitor, times)
     latents = offline.sample(final_belief(offline, data), draws)
-    online.encoder.set_prior(latents)
+    online = encoder if signature.binary else exact(encoder, draws)
     starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
     synthesis = Synthesis(online, policy, latents, data, starts, trials.mask.shape[2], config.random_share, draws)
     in_course = OnlineBelief(online, config.width, draws)
     agent = DeconfoundedAgent(online, policy, in_course)
-    total = config.offline_updates + config.online_updates
-    optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
-    for update in range(config.online_updates):
-        if update % config.refresh == 0:
-            synthetic, _ = synthesis(config.synthetic)
-        batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch * times, draws)
-        warm = ramp(update, config.warm_up * config.online_updates)
-        inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
-        monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
+    if isinstance(online, LinearModel):
+        online.scale_to(latents)
+    else:
+        online.encoder.set_prior(latents)
+        total = config.offline_updates + config.online_updates
+        optimizer = Adam([online.encoder], config.learning_rate, config.online_updates)
+        for update in range(config.online_updates):
+            if update % config.refresh == 0:
+                synthetic, _ = synthesis(config.synthetic)
+            batch = synthetic.beginnings(update, config.shortest).draw_trials(config.online_batch * times, draws)
+            warm = ramp(update, config.warm_up * config.online_updates)
+            inference = online.learn(optimizer, batch, config.online_steps, config.beta * warm, draws)
+            monitor.update(config.offline_updates + update + 1, total, {"inference": inference}, agent)
     synthetic, drawn = synthesis(max(LAST, config.synthetic))
     in_course.fit(online, synthetic, config.online_updates, draws, drawn)
     if config.drifts:
         choose_kept(online, data[:, : 64 * episodes], episodes, draws)
     return agent
+
+
+def exact(model: VariationalModel, draws: Draws) -> LinearModel:
+    """The model with the same dynamics, which are linear in the latent, and exact inference in them."""
+    assert isinstance(model.dynamics, LinearDynamicsHead)
+    linear = LinearModel(model.latent, model.width, model.inputs.scales, draws)
+    linear.dynamics, linear.inputs = model.dynamics, model.inputs
+    return linear
 
 
 @dataclass(frozen=True)
@@ -131,7 +149,7 @@ class Synthesis:
     the expert's observations: the dynamics were not trained there.
     """
 
-    model: VariationalModel
+    model: LinearModel | VariationalModel
     policy: ActionHead
     latents: Tensor
     expert: Batch
@@ -164,8 +182,8 @@ class Synthesis:
 
 @uses(
     "demonstrations",
-    version=4,
-    cost=7,
+    version=5,
+    cost=3,
     on_control=OfflineConfig(),
     on_bandit=OfflineConfig(
         latent=5,

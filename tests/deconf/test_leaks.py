@@ -377,9 +377,10 @@ def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_offline_beta_rises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where observations are 0 or 1; elsewhere inference is exact."""
     betas = watch_betas(monkeypatch)
     preset = tiny_preset().configured("deconfounded_offline", offline_updates=1, online_updates=8, beta=0.1)
-    fit(Context(envs.get(CONTROL), preset, [0]), "deconfounded_offline")
+    fit(Context(envs.get("bandit"), preset, [0]), "deconfounded_offline")
     assert betas == pytest.approx([0, 0.025, 0.05, 0.075, 0.1, 0.1, 0.1, 0.1])
 
 

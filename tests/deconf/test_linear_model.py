@@ -12,8 +12,10 @@ from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.linear_model import ALIKE, ERROR, Evidence, LinearModel, weigh
+from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
+from deconfounded.deconf.methods.deconfounded_offline import exact
 from deconfounded.envs.support.errors import InputError
 from tests.deconf.ball import STEPS, pushed, streams
 
@@ -61,8 +63,8 @@ def test_mean_of_evidence_under_a_belief() -> None:
     weighted = torch.tensor([0.8, -0.4], dtype=torch.float64)
     drawn = gaussian.sample(belief.expand(1, 400_000, -1), draws)[0].double()
     likelihood = (drawn @ weighted - ((drawn @ precision) * drawn).sum(-1) / 2).exp()
-    exact = gaussian.log_expected(belief, precision[None, None], weighted[None, None]).exp().item()
-    assert exact == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
+    closed = gaussian.log_expected(belief, precision[None, None], weighted[None, None]).exp().item()
+    assert closed == pytest.approx(likelihood.mean().item(), abs=5 * likelihood.std().item() / 400_000**0.5)
 
 
 def test_gradients_in_closed_form() -> None:
@@ -133,6 +135,25 @@ def test_likelihood_of_the_next_step() -> None:
             error = 5 * likelihood.std().item() / count**0.5
             assert error < 0.01 * exact[i].item()
             assert exact[i].item() == pytest.approx(likelihood.mean().item(), abs=error)
+
+
+def test_inference_in_dynamics_that_are_given() -> None:
+    """Of transitions drawn from them, with latents from the prior, the posterior holds these: errors are its stds."""
+    data, _ = pushed(600, np.random.default_rng(1))
+    draws = streams()
+    learned = VariationalModel("innovations", 2, 16, Scales.of(Signature(1, 1, 0, False), data), draws)
+    model = exact(learned, draws).eval()
+    model.error.zero_()  # the dynamics have none
+    with torch.no_grad():
+        learned.dynamics.log_std.fill_(-1.5)
+        theta_hat = draws.normal(600, 2)
+        each = theta_hat[:, :, None].expand(-1, -1, STEPS, -1).flatten(1, 2)
+        flat = data.flat()
+        next_obs = learned.dynamics.sample(flat.obs, flat.action, each, draws).view_as(data.obs)
+        posterior = model._posterior(model.final_memory(Batch(data.obs, data.action, next_obs, data.mask)))
+    mean, log_std = posterior[..., :2], posterior[..., 2:4]
+    assert ((mean - theta_hat) / log_std.exp()).square().mean().item() == pytest.approx(1, abs=0.15)
+    assert (mean - theta_hat).square().mean() < 0.6, "and it is narrower than the prior"
 
 
 def test_memory_adds_up() -> None:
