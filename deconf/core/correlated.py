@@ -55,9 +55,13 @@ class Correlated:
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
         """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
         mean, std, lower = self.split(belief)
-        noise = (std * draws.normal(*mean.shape[1:]))[..., None]
+        return mean + self.deviation(std, lower, draws)
+
+    def deviation(self, std: Tensor, lower: Tensor, draws: Draws) -> Tensor:
+        """theta_hat - mean [S, ..., D], drawn; of stds and A."""
+        noise = (std * draws.normal(*std.shape[1:]))[..., None]
         drawn = torch.linalg.solve_triangular(self.triangle(lower), noise, upper=False, unitriangular=True)
-        return mean + drawn[..., 0]
+        return drawn[..., 0]
 
     def log_prob(self, belief: Tensor, theta_hat: Tensor) -> Tensor:
         """The log density [...] of theta_hat [..., D] under beliefs [..., P], differentiable in these."""

@@ -106,7 +106,7 @@ class LinearModel(LatentModel):
 
     def read(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         posterior = self._posterior(memory)
-        return posterior, self.mean(self._belief_of(posterior))
+        return posterior, posterior[..., : self.latent] + self.mean(self.reader(posterior))  # that of `belief`
 
     def for_cloning(self, belief: Tensor, draws: Draws) -> Tensor:
         return self.mean(belief)

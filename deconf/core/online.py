@@ -53,9 +53,8 @@ class OnlineBelief(nn.Module):
 
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
         """theta_hat [S, ..., D] from beliefs [S, ..., P]."""
-        mean, *rest = self.gaussian.split(belief)
-        drawn = self.gaussian.sample(torch.cat([torch.zeros_like(mean), *rest], -1), draws)
-        return mean + per_seed(self.unit, mean) * drawn
+        mean, std, lower = self.gaussian.split(belief)
+        return mean + per_seed(self.unit, mean) * self.gaussian.deviation(std, lower, draws)
 
     def fit(
         self, model: LatentModel, explored: Batch, updates: int, draws: Draws, latents: Tensor | None = None
