@@ -159,10 +159,11 @@ class EvidenceBelief(Belief):
     def update(self, memory: Tensor, step: Batch) -> Tensor:
         return memory + self._terms(step)
 
-    def _rescaled(self, total: Tensor, longest: Tensor | float) -> Tensor:
-        """What is read [..., 2 F + 1] of a sum of evidence and its count [..., F + 1]."""
-        scale = (longest / total[..., -1:]).clamp(max=1) if longest else 1.0
-        evidence, n = total[..., :-1] * scale, 1 + total[..., -1:] * scale
+    def _rescaled(self, total: Tensor, longest: Tensor) -> Tensor:
+        """What is read [..., 2 F + 1] of a sum of evidence and its count [..., F + 1], at most `longest` unless 0."""
+        evidence, n = total.split([self.features, 1], -1)
+        scale = torch.where(longest > 0, longest / n, 1.0).clamp(max=1)
+        evidence, n = evidence * scale, 1 + n * scale
         return torch.cat([evidence / n, evidence / n.sqrt(), n.log() - 2], -1)
 
     def read(self, memory: Tensor) -> Tensor:
@@ -170,7 +171,11 @@ class EvidenceBelief(Belief):
         return self._rescaled(memory, self.longest)
 
     def posterior(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        mean, raw = self.out(self.read(memory)).chunk(2, -1)
+        return self.posterior_of(self.read(memory), memory)
+
+    def posterior_of(self, read: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """`posterior`, given what `read` gives too."""
+        mean, raw = self.out(read).chunk(2, -1)
         std = (F.softplus(raw) + 1e-6).sqrt()
         prior_mean, prior_std = self.prior(mean)
         empty = memory[..., self.features : self.features + 1] == 0
@@ -204,12 +209,15 @@ class ForgettingBelief(InnovationBelief):
     """
 
     KEPT = (31 / 32, 7 / 8)
+    lost: Tensor
 
     def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(latent, width, scales, draws)
         self.sums = 1 + len(self.KEPT)
         self.read_width *= self.sums
         self.out = Mlp(self.read_width, width, 2 * latent, draws)
+        lost = torch.tensor([0.0, *(1 - kept for kept in self.KEPT)], device=draws.device)
+        self.register_buffer("lost", lost[:, None], persistent=False)  # of each sum, at a step
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)
@@ -230,16 +238,12 @@ class ForgettingBelief(InnovationBelief):
         return self.prior_mean.new_zeros(len(self.prior_mean), n, self.sums * (self.features + 1))
 
     def update(self, memory: Tensor, step: Batch) -> Tensor:
-        terms, mask = self._terms(step), step.mask[..., None]
-        whole, *faded = memory.chunk(self.sums, -1)
-        faded = [part * (1 - (1 - kept) * mask) for part, kept in zip(faded, self.KEPT, strict=True)]
-        return torch.cat([part + terms for part in (whole, *faded)], -1)
+        sums, terms, mask = memory.unflatten(-1, (self.sums, -1)), self._terms(step), step.mask[..., None, None]
+        return (sums * (1 - self.lost * mask) + terms[..., None, :]).flatten(-2)
 
     def read(self, memory: Tensor) -> Tensor:
-        whole, *faded = memory.chunk(self.sums, -1)
-        parts = [self._rescaled(whole, self.longest)]
-        parts += [self._rescaled(part, 1 / (1 - kept)) for part, kept in zip(faded, self.KEPT, strict=True)]
-        return torch.cat(parts, -1)
+        longest = torch.cat([self.longest[None, None], 1 / self.lost[1:]])
+        return self._rescaled(memory.unflatten(-1, (self.sums, -1)), longest).flatten(-2)
 
 
 def faded_sum(x: Tensor, kept: float) -> Tensor:

@@ -43,7 +43,7 @@ class Correlated:
     def split(self, belief: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, stds and A."""
         d = self.latent
-        return belief[..., :d], belief[..., d : 2 * d], belief[..., 2 * d :]
+        return belief.split_with_sizes([d, d, self.parameters - 2 * d], -1)  # type: ignore[return-value]
 
     def triangle(self, lower: Tensor) -> Tensor:
         """1 + A [..., D, D]."""

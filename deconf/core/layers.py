@@ -53,7 +53,7 @@ def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
-    if stack_differs(rows, weight):
+    if len(rows) > 1 and stack_differs(rows, weight):
         return torch.cat([*map(torch.baddbmm, bias.split(1), rows.split(1), weight.split(1))])
     return torch.baddbmm(bias, rows, weight)
 
@@ -128,7 +128,7 @@ class Mlp(nn.Sequential):
     def forward(self, x: Tensor) -> Tensor:
         layers = self._modules.values()  # `parameters()` takes several times as long
         parameters = [each for layer in layers if layer for each in layer._parameters.values() if each is not None]
-        rows = x.reshape(len(x), -1, x.shape[-1])
+        rows = x if x.dim() == 3 else x.reshape(len(x), -1, x.shape[-1])
         # A node of the graph costs an agent's step a tenth of its time, for a gradient that nobody asks for.
         out = MlpFunction.apply(rows, *parameters) if torch.is_grad_enabled() else activations(rows, parameters)[-1]
-        return out.reshape(*x.shape[:-1], out.shape[-1])
+        return out if rows is x else out.reshape(*x.shape[:-1], out.shape[-1])

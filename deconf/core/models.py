@@ -110,7 +110,8 @@ class VariationalModel(LatentModel):
 
     def read(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         assert isinstance(self.encoder, InnovationBelief)
-        return self.encoder.read(memory), self.mean(self.belief(memory))
+        read = self.encoder.read(memory)
+        return read, self.encoder.posterior_of(read, memory)[0]
 
     def latent_stds(self) -> Tensor:
         return self.encoder.prior_std

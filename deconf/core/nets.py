@@ -19,9 +19,7 @@ HEAVY = 30.0  # excess kurtosis of labels: a normal distribution has 0, Laplace'
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to broadcast against tensors [S, ..., F]."""
-    for _ in range(like.dim() - 2):
-        statistic = statistic.unsqueeze(1)
-    return statistic
+    return statistic.view(len(statistic), *(1,) * (like.dim() - 2), -1)
 
 
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -85,6 +83,8 @@ class LabelScaler(Scaler):
 
     def inverse(self, x: Tensor) -> Tensor:
         flat = super().inverse(x)
+        if not self.heavy.any():
+            return flat
         raw = per_seed(self.median, x) + per_seed(self.size, x) * torch.sinh(flat)
         return torch.where(per_seed(self.heavy, x), raw, flat)
 

@@ -116,17 +116,17 @@ class DptAgent(TransformerAgent):
         super().reset(rngs)
         if self.forgets:
             for cache in self._caches:
-                cache.count.zero_()
+                cache.clear()
 
     def choose(self, obs: Tensor) -> Tensor:
-        """Act on the query. The next token overwrites it in the cache, since `count` stays."""
+        """Act on the query. The next token overwrites it in the cache, which has not advanced."""
         return self.act_on(self.queries(obs), self.scales.obs(obs))
 
     def remember(self, step: Batch) -> None:
         parts = zip(self.transitions(step), step.mask, self._layers, self._caches, strict=True)
         for transition, mask, layers, cache in parts:
             self.net.write(transition, layers, cache)
-            cache.count += mask.long()
+            cache.advance(mask)
 
     def loss(self, batch: Batch, label: Tensor) -> Tensor:
         """The imitation loss [S] of labels [S, B, T, A] at each step, after all transitions before it."""

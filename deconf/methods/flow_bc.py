@@ -59,6 +59,15 @@ class FlowConfig(Configuration):
     device: str = "cpu"
 
 
+def of_time(tau: Tensor) -> tuple[Tensor, Tensor]:
+    """What the network reads of times tau [..., 1]: the share [..., 1] of a point in the end, and phases [..., PHASES].
+
+    The share is that of chunks of unit size; the network learns what differs from it (Karras et al., 2022).
+    """
+    turns = torch.arange(1, PHASES + 1, device=tau.device) * math.pi
+    return tau / (tau.square() + (1 - tau).square()), (tau * turns).cos()
+
+
 class ChunkFlow(nn.Module):
     """A flow from noise to a chunk of `ahead` actions, given features of a history."""
 
@@ -79,13 +88,9 @@ class ChunkFlow(nn.Module):
             return x.argmax(-1, keepdim=True).float()
         return self.scaler.inverse(x).clamp(-1, 1)
 
-    def end(self, x: Tensor, tau: Tensor, embedded: Tensor) -> Tensor:
-        """The expected end [S, N, chunk] of paths that are at x [S, N, chunk] at times tau [S, N, 1].
-
-        The network learns what differs from the expectation for chunks of unit size (Karras et al., 2022).
-        """
-        phases = [(math.pi * k * tau).cos() for k in range(1, PHASES + 1)]
-        return tau / (tau.square() + (1 - tau).square()) * x + self.net(torch.cat([x, *phases, embedded], -1))
+    def end(self, x: Tensor, share: Tensor, phases: Tensor, embedded: Tensor) -> Tensor:
+        """The expected end [S, N, chunk] of paths that are at x [S, N, chunk] at times of this `share` and `phases`."""
+        return torch.addcmul(self.net(torch.cat([x, phases, embedded], -1)), share, x)
 
     def loss(self, features: Tensor, chunk: Tensor, mask: Tensor, draws: Draws) -> Tensor:
         """The squared error [S] of ends, at random times of random paths to chunks [S, N, ahead, A].
@@ -94,17 +99,18 @@ class ChunkFlow(nn.Module):
         """
         target = self.encode(chunk).flatten(2)
         tau, noise = draws.uniform(target.shape[1], 1), draws.normal(*target.shape[1:])
-        error = self.end(torch.lerp(noise, target, tau), tau, self.embed(features)) - target
+        error = self.end(torch.lerp(noise, target, tau), *of_time(tau), self.embed(features)) - target
         return masked_mean(error.square().mean(-1), mask)
 
     def sample(self, features: Tensor, steps: int, draws: Draws) -> Tensor:
         """Draw chunks [S, N, ahead, A], given features [S, N, F]."""
         x, embedded = draws.normal(features.shape[1], self.chunk), self.embed(features)
-        tau = torch.zeros_like(x[..., :1])
-        for _ in range(steps):
-            middle = x + (self.end(x, tau, embedded) - x) / (1 - tau) / (2 * steps)
-            half = tau + 1 / (2 * steps)
-            x, tau = x + (self.end(middle, half, embedded) - middle) / (1 - half) / steps, tau + 1 / steps
+        tau = torch.arange(2 * steps, device=x.device)[:, None] / (2 * steps)
+        times = [(share, phases.expand(*x.shape[:2], -1)) for share, phases in zip(*of_time(tau), strict=True)]
+        for i in range(steps):  # of the midpoint method: the velocity is (end - x) / (1 - tau)
+            middle = torch.lerp(x, self.end(x, *times[2 * i], embedded), 1 / (2 * steps - 2 * i))
+            end = self.end(middle, *times[2 * i + 1], embedded)
+            x = torch.add(x, end - middle, alpha=2 / (2 * steps - 2 * i - 1))
         return self.decode(x.unflatten(-1, (self.ahead, -1)))
 
 

@@ -44,7 +44,7 @@ class TransformerConfig(Configuration):
 
 def normed(x: Tensor) -> Tensor:
     """Layer normalisation without parameters, since a linear layer follows."""
-    return F.layer_norm(x, x.shape[-1:])
+    return torch.layer_norm(x, x.shape[-1:])
 
 
 def rotation(position: Tensor, width: int) -> tuple[Tensor, Tensor]:
@@ -65,46 +65,73 @@ def rotated(x: Tensor, by: tuple[Tensor, Tensor]) -> Tensor:
 
 
 class Cache:
-    """A ring buffer of keys and values [2, N, H, D, window] of each layer's latest tokens, for N trials of one seed.
+    """A ring buffer of keys and values [2, N H, D, window] of each layer's latest tokens, for N trials of one seed.
 
-    Each seed has its own, since the order of sums depends on how far it is filled.
+    A trial's next token is written to the same place, until `advance` says that it stays. Each seed has its own cache,
+    since the order of sums depends on how far it is filled.
     """
 
     def __init__(self, layers: int, n: int, heads: int, window: int, width: int, device: torch.device) -> None:
-        self.kept = [torch.zeros(2, n, heads, width, window, device=device) for _ in range(layers)]
-        self.window, self.rows = window, torch.arange(n, device=device)
+        self.kept = [torch.zeros(2, n * heads, width, window, device=device) for _ in range(layers)]
+        self.heads, self.window = heads, window
         self.count = torch.zeros(n, dtype=torch.int64, device=device)  # of tokens that stay
+        self.turns = self._turns(window)
+        self._place()
 
-    def begin(self) -> None:
-        """Begin with the next token of each trial: where it is written, and to what it attends."""
-        low, high = self.count.min().item(), self.count.max().item()
-        self.turn = rotation(self.count[:, None, None], self.kept[0].shape[-2])
-        self.filled, self.empty = min(int(high) + 1, self.window), None
-        self.slot: int | Tensor = int(high) % self.window  # of all, where trials have as many steps
-        if low < high:
-            self.slot = self.count % self.window
-            self.empty = (torch.arange(self.filled, device=self.count.device) > self.count[:, None])[:, None, None]
+    def _turns(self, length: int) -> Tensor:
+        """Cosines and sines [length, 2, 3, D] by position, for queries, which are scaled, keys, and values: 1 and 0."""
+        width = self.kept[0].shape[-2]
+        cos, sin = rotation(torch.arange(length, device=self.count.device), width)
+        scale = width**-0.5
+        both = torch.stack([scale * cos, cos, torch.ones_like(cos), scale * sin, sin, torch.zeros_like(sin)], 1)
+        return both.unflatten(1, (2, 3))
+
+    def advance(self, mask: Tensor) -> None:
+        """Keep the next token of each trial where mask [N] is 1."""
+        self.count += mask.long()
+        self._place()
+
+    def clear(self) -> None:
+        """Keep no token."""
+        self.count.zero_()
+        self._place()
+
+    def _place(self) -> None:
+        """Find where the next tokens are written, and to what they attend."""
+        low, high = (int(count) for count in self.count.aminmax())
+        if high >= len(self.turns):
+            self.turns = self._turns(2 * high)
+        self.filled = min(high + 1, self.window)
+        self.slot: int | Tensor = high % self.window
+        self.later: Tensor | None = None
+        if low == high:  # all trials have as many steps
+            cos, sin = self.turns[high, :, :, None].unbind()
+        else:
+            count = self.count.repeat_interleave(self.heads)
+            cos, sin = self.turns[count].permute(1, 2, 0, 3).unbind()
+            self.slot = (count % self.window)[:, None, None].expand(*self.kept[0].shape[:3], 1)
+            self.later = (torch.arange(self.filled, device=count.device) > count[:, None])[:, None]
+        self.turn = cos, sin
 
     def write(self, layer: int, qkv: Tensor) -> Tensor:
-        """Write the key and value of each trial's next token [3, N, H, 1, D]; its query [N, H, 1, D]."""
-        (query, key), value = rotated(qkv[:2], self.turn), qkv[2]
-        for buffer, new in zip(self.kept[layer], (key, value), strict=True):
-            if isinstance(self.slot, int):
-                buffer[..., self.slot] = new[:, :, 0]
-            else:
-                buffer[self.rows, ..., self.slot] = new[:, :, 0]
-        return query
+        """Write the key and value of each trial's next token [N, 3, H, D]; its query [N H, 1, D], scaled."""
+        turned = rotated(qkv.transpose(0, 1).flatten(1, 2), self.turn)
+        if isinstance(self.slot, int):
+            self.kept[layer].select(-1, self.slot).copy_(turned[1:])
+        else:
+            self.kept[layer].scatter_(-1, self.slot, turned[1:, ..., None])
+        return turned[0, :, None]
 
     def attend(self, layer: int, query: Tensor) -> Tensor:
-        """What a query [N, H, 1, D] reads from its trial's tokens, the next one among them: [N, H, D].
+        """What a query [N H, 1, D], scaled, reads from its trial's tokens, the next one among them: [N H, D, 1].
 
         On a CPU, torch's own attention, made for many queries at once, takes up to ten times as long.
         """
-        keys, values = self.kept[layer][..., : self.filled]
-        alike = (keys * (query * query.shape[-1] ** -0.5).mT).sum(-2, keepdim=True)
-        if self.empty is not None:
-            alike.masked_fill_(self.empty, -torch.inf)
-        return (values * alike.softmax(-1)).sum(-1)
+        keys, values = self.kept[layer].narrow(-1, 0, self.filled).unbind()
+        alike = torch.bmm(query, keys)
+        if self.later is not None:
+            alike.masked_fill_(self.later, -torch.inf)
+        return torch.bmm(values, alike.softmax(-1).mT)
 
 
 class Transformer(nn.Module):
@@ -150,18 +177,17 @@ class Transformer(nn.Module):
 
         What that layer reads is left to `step`: a token that only later ones read does not need it.
         """
-        cache.begin()
         x = torch.addmm(layers[0][0], token, layers[0][1])
         for i in range(self.depth):
             bias, weight = layers[1 + 4 * i]
-            qkv = torch.addmm(bias, normed(x), weight).view(len(x), 3, self.heads, 1, -1).transpose(0, 1)
+            qkv = torch.addmm(bias, normed(x), weight).view(len(x), 3, self.heads, -1)
             query = cache.write(i, qkv)
             if i + 1 < self.depth:
                 x = self._read(i, x, query, layers, cache)
         return x, query
 
     def _read(self, i: int, x: Tensor, query: Tensor, layers: list[tuple[Tensor, Tensor]], cache: Cache) -> Tensor:
-        """Outputs [N, W] of a layer, from its inputs [N, W] and queries [N, H, 1, D]."""
+        """Outputs [N, W] of a layer, from its inputs [N, W] and queries [N H, 1, D]."""
         mix, widen, narrow = layers[2 + 4 * i : 5 + 4 * i]
         x = torch.addmm(x, cache.attend(i, query).reshape(x.shape), mix[1]).add_(mix[0])
         return torch.addmm(x, F.gelu(torch.addmm(widen[0], normed(x), widen[1])), narrow[1]).add_(narrow[0])
@@ -234,7 +260,7 @@ class TransformerAgent(LearnedAgent):
 
     def remember(self, step: Batch) -> None:
         for cache, mask in zip(self._caches, step.mask, strict=True):
-            cache.count += mask.long()
+            cache.advance(mask)
         self._before = torch.where(step.mask[..., None] > 0, self.before(step), self._before)
 
     def features(self) -> NDArray[np.float32]:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from deconfounded.deconf.core.data import Draws, Signature
 from deconfounded.deconf.core.nets import Scales
@@ -99,6 +100,23 @@ class TestFlow:
         drawn = agent.act(np.zeros((1000, 2), np.float32)) + (0 if actions else 0.5)
         assert (drawn > 0.5).mean() == pytest.approx(0.3, abs=0.1)
         assert (np.abs(drawn - 0.5) < 0.25).mean() < 0.15
+
+    def test_it_integrates_the_flow(self) -> None:
+        """Given the exact ends of paths to N(m, s^2), noise x ends at m + s x; to .03 in ten steps."""
+        mean, std, steps = 0.4, 0.3, 10
+        signature = Signature(obs=2, action=1, actions=0, binary=False)
+        shape = {"width": 8, "history": 3, "ahead": 4, "executed": 1, "integration": steps}
+        policy = FlowAgent.blank(shape, Scales.plain(signature, 1), streams()).policy
+
+        def end(x: Tensor, share: Tensor, phases: Tensor, embedded: Tensor) -> Tensor:
+            tau = phases[..., :1].acos() / torch.pi
+            return mean + std**2 * tau / (std**2 * tau**2 + (1 - tau) ** 2) * (x - tau * mean)
+
+        policy.end = end  # type: ignore[method-assign]
+        policy.decode = lambda x: x  # type: ignore[method-assign]
+        drawn = policy.sample(torch.zeros(1, 500, 2 + 3 * 4), steps, streams())
+        noise = streams().normal(500, 4)
+        torch.testing.assert_close(drawn.flatten(2), mean + std * noise, rtol=0, atol=0.03)
 
     def test_a_chunk_is_executed_before_the_next_is_drawn(self) -> None:
         """Of four actions two: the second does not depend on what was observed meanwhile, and the third does."""
