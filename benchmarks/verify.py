@@ -63,13 +63,16 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     raise envs.InputError(f"{method} left no {records.named(record)} to compare with")
 
 
-def pick(file: Path, method: str, seed: int) -> records.Record:
-    """The record of a method and seed in a file: of the standard protocol, if the file has any of that.
+def pick(file: Path, method: str, seed: int, protocol: str = protocols.STANDARD) -> records.Record:
+    """The record of a method and seed in a file, of a protocol.
 
     Raises InputError if there is none, or if there are several.
     """
-    every = records.read(file)
-    every = [record for record in every if records.NAME not in record] or every
+    read = records.read(file)
+    every = [record for record in read if record.get(records.NAME, protocols.STANDARD) == protocol]
+    if not every:
+        others = {record.get(records.NAME, protocols.STANDARD): None for record in read}
+        raise envs.InputError(f"{file} has no records of protocol {protocol}; give --protocol, of {', '.join(others)}")
     ours = [record for record in every if records.named(record) == method]
     if not ours:
         raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")
@@ -88,13 +91,15 @@ def main() -> None:
     parser.add_argument("task", help="its name, or path/file.py:Class")
     parser.add_argument("method", help="its name, or path/file.py:fit")
     parser.add_argument("seed", type=int)
+    parser.add_argument("--protocol", default=protocols.STANDARD, help=f"of {', '.join(protocols.PROTOCOLS)}")
     parser.add_argument("--records", type=Path, help="folder or file; default: those that come with the package")
     args = parser.parse_args()
     task = envs.get(args.task)
+    protocols.check(args.protocol, task)
     method = catalogue.add(args.method) if outside.is_outside(args.method) else args.method
     file = args.records or RECORDS
     file = file / records.place(task.name) if file.is_dir() else file
-    record = pick(file, method, args.seed)
+    record = pick(file, method, args.seed, args.protocol)
     if record["method"] not in METHODS:
         raise envs.InputError(f"method {record['method']} is not ours; give it as path/file.py:fit")
     if (task.name, task.version) != (record["task"], record["task_version"]):

@@ -77,7 +77,14 @@ def main() -> None:
         task.name: changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set) for task in tasks
     }
     jobs = [
-        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs", **under)
+        BenchmarkJob(
+            task.reference,
+            settings[task.name].alone(method),
+            method,
+            seeds,
+            folder / task.name / method / "jobs",
+            **under,
+        )
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods

@@ -381,9 +381,11 @@ class TestVerify:
         one, two = kept(job)
         file = tmp_path / "bandit.jsonl"
         records.write(tmp_path, [{**one, "protocol_name": "scarce"}])
-        assert verify.pick(file, "blind_bc", 0)["protocol_name"] == "scarce"  # where there is no other
+        with pytest.raises(envs.InputError, match="no records of protocol standard; give --protocol, of scarce"):
+            verify.pick(file, "blind_bc", 0)
         records.write(tmp_path, [one, two, {**two, "salt": "salt"}])
         assert verify.pick(file, "blind_bc", 0) == one
+        assert verify.pick(file, "blind_bc", 0, "scarce")["protocol_name"] == "scarce"
         for method, seed, says in (
             ("blind", 0, "method 'blind' is unknown; did you mean 'blind_bc'"),
             ("blind_bc", 4, r"seed of blind_bc was 4; .* has 0, 1, 1"),
@@ -443,7 +445,10 @@ def test_broken_pictures_leave_the_numbers(
 def test_table_makes_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """All of it at first; then nothing, but for a record that is gone, or of another version."""
+    """All of it at first; then nothing, but for a record that is gone, or of another version.
+
+    It goes on in its folder after another method has got other settings.
+    """
 
     def table(*more: str) -> str:
         line = ["table", "--tasks", "bandit", "--methods", "random", "--preset", "smoke", "--seeds", "2", *more]
@@ -461,3 +466,8 @@ def test_table_makes_what_is_missing(
     records.write(tmp_path / "records", [made[0], made[2], {**made[3], "method_version": 0}])
     left = [f"bandit, {method}: seeds {i}" for method, i in (("expert", 1), ("random", 1))]
     assert table("--list").splitlines()[:-1] == left
+    other = METHODS["dagger"]
+    config: Any = replace(other.on_bandit, learning_rate=7.0)  # type: ignore[type-var]
+    monkeypatch.setattr(dagger.fit, "method", replace(other, on_bandit=config))
+    assert table().startswith("2 seeds to make")
+    assert table("--list") == "0 seeds are missing or stale\n"
