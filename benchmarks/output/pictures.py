@@ -22,6 +22,7 @@ COLOURS = {
     "deconfounded_gru": "#17becf",
     "deconfounded_forgetting": "#1b9e77",
     "deconfounded_discrete": "#9467bd",
+    "deconfounded_large": "#0b3d91",
     "deconfounded_offline": "#a8a91e",
     "dagger": "#e377c2",
     "naive_rnn": "#ff7f0e",

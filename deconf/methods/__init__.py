@@ -14,6 +14,7 @@ METHODS = {
     "deconfounded_gru": "deconfounded_gru:fit",
     "deconfounded_discrete": "deconfounded_discrete:fit",
     "deconfounded_forgetting": "deconfounded_forgetting:fit",
+    "deconfounded_large": "deconfounded_large:fit",
     "deconfounded_offline": "deconfounded_offline:fit",
     "deconfounded_mean": "deconfounded_mean:fit",
     "dagger": "dagger:fit",

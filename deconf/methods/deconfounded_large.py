@@ -1,0 +1,24 @@
+"""Deconfounded imitation for many latents: twice the dimensions of theta_hat, and twice the units of each network.
+
+The dynamics are linear in theta_hat, so that each latent needs a dimension, or several where its effect is not linear.
+On `patchy_road`, whose six latents show in six places, eight dimensions and networks of 64 units hold a third of what
+the agent's own trials tell of them (docs/baselines.md).
+"""
+
+from dataclasses import replace
+
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
+from deconfounded.deconf.core.sizes import WIDE
+from deconfounded.deconf.given import Given
+from deconfounded.deconf.method import uses
+from deconfounded.deconf.methods import deconfounded
+from deconfounded.deconf.methods.deconfounded import ON_BANDIT, SHARED, USES, DeconfoundedConfig
+
+LATENT = 16  # dimensions of theta_hat
+ON_CONTROL, BANDIT = DeconfoundedConfig(latent=LATENT, width=WIDE), replace(ON_BANDIT, latent=LATENT, width=WIDE)
+
+
+@uses(*USES, cost=5, on_control=ON_CONTROL, on_bandit=BANDIT, paper=BANDIT, large=deconfounded.large, **SHARED)
+def fit(given: Given) -> DeconfoundedAgent:
+    """Train by Algorithm 1 with the larger sizes."""
+    return deconfounded.fit(given)
