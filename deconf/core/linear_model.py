@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.correlated import Correlated, log_expected_of_normal, posterior_root
+from deconfounded.deconf.core.correlated import Correlated, inverse, log_expected_of_normal, posterior_root
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_model import LatentModel
@@ -93,9 +93,9 @@ class LinearModel(LatentModel):
     def _posterior(self, memory: Tensor) -> Tensor:
         """Mean and logarithmic stds of the posterior, and the logarithm of the count."""
         precision, weighted, _ = self._sums(memory)
-        lower = posterior_root(precision)
-        mean = torch.cholesky_solve(weighted[..., None], lower)[..., 0].float()
-        std = torch.cholesky_inverse(lower).diagonal(dim1=-2, dim2=-1).sqrt().float()
+        root = inverse(posterior_root(precision))
+        mean = (root.mT @ (root @ weighted[..., None]))[..., 0].float()
+        std = root.square().sum(-2).sqrt().float()
         return torch.cat([mean, std.log(), (1 + memory[..., -1:]).log() - 2], -1)
 
     def belief(self, memory: Tensor) -> Tensor:
