@@ -71,8 +71,9 @@ def pick(file: Path, method: str, seed: int, protocol: str = protocols.STANDARD)
     read = records.read(file)
     every = [record for record in read if record.get(records.NAME, protocols.STANDARD) == protocol]
     if not every:
-        others = {record.get(records.NAME, protocols.STANDARD): None for record in read}
-        raise envs.InputError(f"{file} has no records of protocol {protocol}; give --protocol, of {', '.join(others)}")
+        others = dict.fromkeys(record.get(records.NAME, protocols.STANDARD) for record in read)
+        there = f"give --protocol, of {', '.join(others)}" if others else "it is empty"
+        raise envs.InputError(f"{file} has no records of protocol {protocol}; {there}")
     ours = [record for record in every if records.named(record) == method]
     if not ours:
         raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")

@@ -25,10 +25,6 @@ class Preset:
     device: str = "cpu"
     configs: dict[str, dict[str, Any]] = field(default_factory=dict, hash=False)  # of methods, by name
 
-    def alone(self, method: str) -> "Preset":
-        """The same without the configurations of other methods."""
-        return replace(self, configs={name: values for name, values in self.configs.items() if name == method})
-
     def configured(self, method: str, **changes: Any) -> "Preset":
         """The same with other values of a method's configuration."""
         return replace(self, configs={**self.configs, method: self.configs[method] | changes})

@@ -6,6 +6,7 @@ and kept as soon as they are done. Stopped, it goes on where it was. The first f
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -77,14 +78,7 @@ def main() -> None:
         task.name: changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set) for task in tasks
     }
     jobs = [
-        BenchmarkJob(
-            task.reference,
-            settings[task.name].alone(method),
-            method,
-            seeds,
-            folder / task.name / method / "jobs",
-            **under,
-        )
+        BenchmarkJob(task.reference, settings[task.name], method, seeds, folder / task.name / "jobs", **under)
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods
@@ -103,5 +97,6 @@ def main() -> None:
     print(f"{sum(map(len, left.values()))} seeds to make, kept one by one: stop when you like")
     options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():
-        made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, **options)
+        base = replace(job.preset, configs={})  # a method's configuration is each job's own affair
+        made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, base=base, **options)
         records.write(kept, made)

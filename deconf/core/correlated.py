@@ -175,7 +175,7 @@ def posterior_moments(factor: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def inverse(factor: Tensor) -> Tensor:
-    """L^-1 of lower triangular L [..., D, D]; for many of them `torch.cholesky_inverse` takes twice as long."""
+    """L^-1 of lower triangular matrices L [..., D, D]: (L L^T)^-1 is its square, and L^-1 b is of use too."""
     unit = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     return torch.linalg.solve_triangular(factor, unit, upper=False)
 

@@ -1,8 +1,8 @@
-"""Deconfounded imitation for many latents: twice the dimensions of theta_hat, and twice the units of each network.
+"""Deconfounded imitation for many latents: theta_hat has 16 dimensions, and networks have 128 units, on all tasks.
 
-The dynamics are linear in theta_hat, so that each latent needs a dimension, or several where its effect is not linear.
-On `patchy_road`, whose six latents show in six places, eight dimensions and networks of 64 units hold a third of what
-the agent's own trials tell of them (docs/baselines.md).
+`deconfounded` has 8 dimensions, and 128 units where observations are large alone. Its dynamics are linear in theta_hat,
+so that each latent needs a dimension, or several where its effect is not linear. On `patchy_road` six latents show in
+six places: docs/baselines.md.
 """
 
 from dataclasses import replace
