@@ -152,7 +152,7 @@ class Batch:
         obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> "Batch":
         """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
-        rows = [torch.as_tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
+        rows = [torch.tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
         action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
         return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
 
