@@ -68,12 +68,13 @@ def pick(file: Path, method: str, seed: int, protocol: str = protocols.STANDARD)
 
     Raises InputError if there is none, or if there are several.
     """
-    read = records.read(file)
-    every = [record for record in read if record.get(records.NAME, protocols.STANDARD) == protocol]
-    if not every:
-        others = dict.fromkeys(record.get(records.NAME, protocols.STANDARD) for record in read)
-        there = f"give --protocol, of {', '.join(others)}" if others else "it is empty"
+    by_protocol: dict[str, list[records.Record]] = {}
+    for record in records.read(file):
+        by_protocol.setdefault(record.get(records.NAME, protocols.STANDARD), []).append(record)
+    if protocol not in by_protocol:
+        there = f"give --protocol, of {', '.join(by_protocol)}" if by_protocol else "it is empty"
         raise envs.InputError(f"{file} has no records of protocol {protocol}; {there}")
+    every = by_protocol[protocol]
     ours = [record for record in every if records.named(record) == method]
     if not ours:
         raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")

@@ -37,9 +37,11 @@ prepare_torch()
 
 def stack_differs(rows: Tensor, weight: Tensor) -> bool:
     """Whether the product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than a seed's alone."""
-    seeds, inputs, outputs = weight.shape
+    if len(rows) == 1:
+        return False
+    _, inputs, outputs = weight.shape
     count = rows.shape[1]
-    return seeds > 1 and (min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL)
+    return min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL
 
 
 def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
@@ -53,7 +55,7 @@ def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
-    if len(rows) > 1 and stack_differs(rows, weight):
+    if stack_differs(rows, weight):
         return torch.cat([*map(torch.baddbmm, bias.split(1), rows.split(1), weight.split(1))])
     return torch.baddbmm(bias, rows, weight)
 

@@ -32,11 +32,12 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, tak
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.sizes import Configuration
+from deconfounded.deconf.core.transformer import Transformer, normed, rotated, rotation
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.dagger import Query, by_round, labelled
-from deconfounded.deconf.methods.naive_transformer import Transformer, TransformerAgent, normed, rotated, rotation
+from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 
 
 @dataclass(frozen=True)
