@@ -174,6 +174,8 @@ class PatchGrid(Grid):
         return self.theta[log_belief.argmax(-1), 0]
 
     def mean(self, log_belief: Array) -> Array:
+        if self.task.latents[0].distribution == "categorical":  # patches have one kind
+            return self.mode(log_belief)
         return np.exp(log_belief) @ self.theta[:, 0]
 
     def features(self, log_belief: Array) -> Array:

@@ -21,6 +21,7 @@ from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Mask, Streams
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.policy import Expert, sample_rows
 from deconfounded.experts.rollout import Agent
 
@@ -29,6 +30,7 @@ GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior 
 SIMULATED = 1.5  # particles for each coefficient of the quadratic
 TOLERANCE, NEAR = 0.1, 10.0  # nats: rms error of the quadratic, over particles so near the likeliest one
 KERNEL = 0.5  # std of the kernel, in units of the particles' own
+IMPOSSIBLE = 50  # nats by which a likelihood of 0 is below the least other one
 HALVINGS = 20  # of the interval, in the search for the power of a stage
 
 
@@ -80,11 +82,20 @@ class Particles:
         self._set(np.arange(self._n), Streams(self._rngs).random(self._flat).reshape(self._shape))
 
     def learn(self, state: Array, obs: Array, action: Array, next_state: Array, alive: Mask) -> None:
-        """Take in a transition of each trial that is `alive` [N]; states [N, S], obs [N, O], action [N, A]."""
+        """Take in a transition of each trial that is `alive` [N]; states [N, S], obs [N, O], action [N, A].
+
+        Raises InputError for likelihoods that are NaN, are all 0, or differ too much.
+        """
         rows, remaining = np.flatnonzero(alive), np.ones(len(alive))
         while rows.size:
             log_prob = self._log_prob(rows, state[rows], obs[rows], action[rows], next_state[rows])
+            if not np.isfinite(log_prob).any(-1).all() or np.isnan(log_prob).any():
+                raise InputError("a step's likelihood was NaN, or 0 under every particle; is the noise too small?")
+            least = np.where(np.isfinite(log_prob), log_prob, np.inf).min(-1, keepdims=True) - IMPOSSIBLE
+            log_prob = np.maximum(log_prob, least)
             power = self._power(self.log_weight[rows], log_prob, remaining[rows])
+            if not power.all():
+                raise InputError("likelihoods of a step differ too much among particles; is the noise too small?")
             weight = self.log_weight[rows] + power[:, None] * log_prob
             self.log_weight[rows] = weight - np.logaddexp.reduce(weight, -1, keepdims=True)
             remaining[rows] -= power

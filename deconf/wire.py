@@ -55,5 +55,5 @@ def unpack(data: bytes) -> Any:
             return {key: whole(item) for key, item in part.items()} if isinstance(part, dict) else part
 
         return whole(json.loads(data[8 : 8 + size]))
-    except (ValueError, TypeError, KeyError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, SyntaxError, RecursionError) as error:
         raise InputError(f"what it sent cannot be read ({error})") from None

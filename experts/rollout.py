@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from deconfounded.experts.policy import Expert
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trials:
     """B trials of E episodes of T steps each, without theta. Arrays are read-only.
 
@@ -261,10 +261,14 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     """Run an agent in N trials of `episodes` episodes each.
 
     seed: of the environments and, independently, of the agent; or a seed for each of equal consecutive groups of
-    trials, each of which is the same, bit for bit, as it is alone. theta [N, L]: None: drawn from p(theta).
+    trials, each of which is the same, bit for bit, as it is alone. Trial i of a group has the seed `seed + i`: groups
+    whose seeds are near each other share trials. theta [N, L]: None: drawn from p(theta). Raises InputError for an
+    agent that reads other environments than `env`.
     """
     task, n = env.task, env.n
     check_number("episodes", episodes)
+    if getattr(agent, "env", env) is not env and isinstance(agent.env, type(env)):  # type: ignore[attr-defined]
+        raise InputError(f"{type(agent).__name__} reads the state or theta of other environments than it was to act in")
     each, seeds = trial_seeds(n, seed), _group_seeds(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)

@@ -99,6 +99,8 @@ class LearnedAgent(Agent):
             raise InputError(
                 f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
             )
+        if not np.isfinite(obs).all():
+            raise InputError("observations held NaN or infinity; a memory would never lose it")
         return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)  # a copy
 
     @abstractmethod
@@ -109,7 +111,17 @@ class LearnedAgent(Agent):
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
-        self.remember(Batch.step(self._tensor(obs), action, next_obs, alive))
+        shapes, signature = (np.shape(action), np.shape(alive)), self.policy.signature
+        if shapes != ((len(obs), signature.action), (len(obs),)):
+            raise InputError(
+                f"actions and alive had shapes {shapes[0]} and {shapes[1]}; they must be"
+                f" ({len(obs)}, {signature.action}) and ({len(obs)},), a row a trial"
+            )
+        valid = (action >= 0) & (action < signature.actions) if signature.actions else np.isfinite(action)
+        if not valid.all():
+            right = f"from 0 to {signature.actions - 1}" if signature.actions else "finite"
+            raise InputError(f"actions held {np.asarray(action)[~valid][0]:g}; they must be {right}")
+        self.remember(Batch.step(self._tensor(obs), action, self._tensor(next_obs), alive))
 
     def remember(self, step: Batch) -> None:
         """Update the memory with a transition of each trial; nothing, for agents without memory."""

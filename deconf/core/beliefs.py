@@ -111,7 +111,7 @@ class EvidenceBelief(Belief):
         self.whiten = Whitener(self.features, draws)
         self.read_width = 2 * self.features + 1
         self.out = Mlp(self.read_width, width, 2 * latent, draws)
-        self.register_buffer("longest", torch.tensor(0.0))
+        self.register_buffer("longest", torch.tensor(0.0, device=draws.device))
 
     def _evidence_network(self, width: int, inputs: int, draws: Draws) -> Mlp:
         """The network whose outputs are summed. inputs: the width of an observation and an action."""
@@ -144,9 +144,9 @@ class EvidenceBelief(Belief):
         return torch.cat([evidence * mask, mask], -1)
 
     def _lengthen(self, batch: Batch) -> None:
-        """Keep, in training, the length of the longest trial so far."""
+        """Keep, in training, the length of the longest trial so far: with padding, as it is the same for all seeds."""
         if self.training and torch.is_grad_enabled():
-            self.longest.fill_(max(float(self.longest), batch.mask.shape[2]))
+            self.longest.clamp_(min=batch.mask.shape[2])
 
     def forward(self, batch: Batch) -> Tensor:
         terms = self._terms(batch)

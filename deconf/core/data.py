@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from deconfounded.envs.streams import Array
+from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.rollout import Trials, of_steps
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""
@@ -85,6 +86,13 @@ class Signature:
         binary = bool(np.isin(trials.obs, (0, 1)).all())
         return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
 
+    def checked(self, explored: Source) -> Trials:
+        """Explored trials. Raises InputError if they are of another kind than demonstrations of this signature."""
+        trials = trials_of(explored)
+        if (found := Signature.of(trials)) != self:
+            raise InputError(f"exploration is {found}, demonstrations are {self}; they must agree")
+        return trials
+
     @property
     def action_features(self) -> int:
         """Width of an action as a network's input: one-hot if discrete."""
@@ -119,6 +127,19 @@ def extent(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return low[:, None], high[:, None]
 
 
+def joined(array: NDArray[Any], mask: Mask, seeds: int, device: str | torch.device = "cpu") -> Tensor:
+    """What arrays [B, E, T, F] say of steps, as `Batch` has these [S, B / S, E T, F]: padding last."""
+    took_place = mask.reshape(len(mask), -1)
+    order = np.argsort(~took_place, axis=1, kind="stable")
+    flat = np.take_along_axis(array.reshape(*took_place.shape, -1), order[..., None], 1).astype(np.float32, copy=False)
+    return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
+
+
+def joined_theta(trials: Trials, theta: Array, seeds: int, device: str | torch.device = "cpu") -> Tensor:
+    """The theta [S, B, T, F] of each step of `Batch.of`, given that of episodes [B, E, F] or of steps [B, E, T, F]."""
+    return joined(of_steps(theta, trials.mask.shape[2]), trials.mask, seeds, device)
+
+
 @dataclass
 class Batch:
     """Trials of S seeds as tensors: the steps that took place, episodes joined end to end and padded at the end.
@@ -137,24 +158,17 @@ class Batch:
         trials = trials_of(trials)
         if len(trials) % seeds:
             raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
-        mask = trials.mask.reshape(len(trials), -1)
-        order = np.argsort(~mask, axis=1, kind="stable")
-
-        def join(array: NDArray[np.float32]) -> Tensor:
-            flat = np.take_along_axis(array.reshape(*mask.shape, -1), order[..., None], 1)
-            return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
-
-        steps = join(mask.astype(np.float32))[..., 0]
-        return Batch(join(trials.obs[:, :, :-1]), join(trials.action), join(trials.obs[:, :, 1:]), steps)
+        obs, action, next_obs, mask = (
+            joined(array, trials.mask, seeds, device)
+            for array in (trials.obs[:, :, :-1], trials.action, trials.obs[:, :, 1:], trials.mask[..., None])
+        )
+        return Batch(obs, action, next_obs, mask[..., 0])
 
     @staticmethod
-    def step(
-        obs: Tensor, action: NDArray[np.float32] | Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
-    ) -> "Batch":
-        """One transition each of S x N trials, without a time axis; obs [S, N, O], the others in rows."""
-        rows = [torch.tensor(x, dtype=torch.float32, device=obs.device) for x in (action, next_obs)]
-        action_, next_ = (row.reshape(*obs.shape[:2], -1) for row in rows)
-        return Batch(obs, action_, next_, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
+    def step(obs: Tensor, action: NDArray[np.float32] | Array, next_obs: Tensor, alive: NDArray[np.bool_]) -> "Batch":
+        """One transition each of S x N trials, without a time axis; obs, next_obs [S, N, O], the others in rows."""
+        rows = torch.tensor(action, dtype=torch.float32, device=obs.device).reshape(*obs.shape[:2], -1)
+        return Batch(obs, rows, next_obs, torch.as_tensor(alive, device=obs.device).reshape(obs.shape[:2]).float())
 
     def flat(self) -> "Batch":
         """All steps [S, B T] without a time axis, padding too."""

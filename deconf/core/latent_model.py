@@ -9,6 +9,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.nets import Inputs
+from deconfounded.envs.support.errors import InputError
 
 
 class LatentModel(nn.Module, ABC):
@@ -86,8 +87,11 @@ class LatentModel(nn.Module, ABC):
         """The loss [S] on trials [S, B, T]. steps: how many of them are predicted; None: all."""
 
     def loss_on_sets(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
-        """The loss [S] where the belief of a random half of a trial's steps predicts the other half."""
-        raise NotImplementedError
+        """The loss [S] where the belief of a random half of a trial's steps predicts the other half.
+
+        Raises InputError for a model that cannot.
+        """
+        raise InputError(f"model {self.kind} has no belief of a set of steps; choose linear, innovations or evidence")
 
     def set_prior(self, belief: Tensor, draws: Draws) -> None:
         """Fit p(theta_hat), or the scale of latents, to beliefs [S, B, P] of whole trials."""

@@ -75,6 +75,8 @@ class VariationalModel(LatentModel):
         return bound + self.innovation_loss(transitions, theta_hat)
 
     def loss_on_sets(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
+        if isinstance(self.encoder, ForgettingBelief):
+            return super().loss_on_sets(batch, steps, beta, draws)
         half = draws.uniform(*batch.mask.shape[1:]) < 0.5
         context, rest = (replace(batch, mask=batch.mask * part) for part in (half, ~half))
         belief = self.belief(self.final_memory(context))

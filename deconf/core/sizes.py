@@ -6,6 +6,8 @@ from typing import Any, get_args, get_type_hints
 from deconfounded.envs.support.errors import InputError
 
 LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
+SHARES = ("shortest", "random_share", "warm_up", "anywhere", "gamma")
+MOST = dict.fromkeys(SHARES, math.nextafter(1, 2)) | {"dropout": 1}  # below which settings of these names must be
 LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker
 
 
@@ -19,14 +21,16 @@ def fits(value: object, kinds: tuple[Any, ...], least: float, most: float = math
 class Configuration:
     """Base of a method's configuration, a dataclass. Raises InputError for a value of another type, or below its least.
 
-    The least is 1, but 0 for numbers that are not whole, for updates and for grids.
+    The least is 1, but 0 for numbers that are not whole, for updates and for grids. Shares are at most 1.
     """
 
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
             value, kinds = getattr(self, name), get_args(kind) or (kind,)
             least = 0 if float in kinds or name.endswith(("updates", "grid")) else 1
-            if not fits(value, kinds, least):
+            most = MOST.get(name, math.inf)
+            if not fits(value, kinds, least, most):
                 right = " or ".join(getattr(kind, "__name__", repr(kind)) for kind in kinds)
                 limit = f", from {least} up" if {int, float} & set(kinds) else ""
+                limit += f", below {most:g}" if most == 1 else ", at most 1" if most < math.inf else ""
                 raise InputError(f"{name} of {type(self).__name__} was {value!r}; it must be {right}{limit}")

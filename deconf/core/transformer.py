@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Draws
 from deconfounded.deconf.core.layers import Linear
+from deconfounded.envs.support.errors import InputError
 
 
 def normed(x: Tensor) -> Tensor:
@@ -107,6 +108,8 @@ class Transformer(nn.Module):
 
     def __init__(self, inputs: int, width: int, layers: int, heads: int, window: int, draws: Draws) -> None:
         super().__init__()
+        if width % (2 * heads):
+            raise InputError(f"a transformer of {heads} heads had width {width}; it must be a multiple of {2 * heads}")
         self.width, self.heads, self.window, self.depth = width, heads, window, layers
         self.embed = Linear(inputs, width, draws)
         self.attend = nn.ModuleList(Linear(width, 3 * width, draws) for _ in range(layers))

@@ -43,7 +43,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     log = given if isinstance(given, Log) else Log.of(given, "Trials")
     steps, part = Steps.of(log), given
     if (total := len(steps.trial)) > MOST:  # evenly spaced trials, for what is fitted
-        index = np.linspace(0, len(log) - 1, max(8, int(len(log) * MOST / total))).astype(int)
+        index = np.linspace(0, len(log) - 1, min(len(log), max(8, int(len(log) * MOST / total)))).astype(int)
         part = Trials(log.obs[index], log.action[index], log.mask[index], log.actions)
     fitted = Steps.of(part)
     remarks = [Remark("size", note) for note in log.notes]
@@ -80,13 +80,15 @@ def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     """Trials whose medians, spreads or lengths are far from those of the others."""
-    count = len(log)
+    present = np.flatnonzero(log.mask.any((1, 2)))
+    count = len(present)
     if count < 8:
         return
-    per_episode = log.mask.sum(2).sum(1) / np.maximum(log.mask.any(2).sum(1), 1)
+    mask = log.mask[present]
+    per_episode = mask.sum(2).sum(1) / mask.any(2).sum(1)
     names, features = ["length of episodes"], [per_episode.astype(float)]
     least = [0.1 * float(per_episode.mean())]
-    rows = [np.flatnonzero(steps.trial == i) for i in range(count)]
+    rows = [np.flatnonzero(steps.trial == i) for i in present]
     columns = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
     for name, column in columns:
         quartiles = np.array([np.quantile(column[index], [0.25, 0.5, 0.75]) for index in rows])
@@ -103,8 +105,8 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     for i in [i for i in np.argsort(-worst) if worst[i] > OUTLYING][:LISTED]:
         j = int(far[i].argmax())
         text = (
-            f"Trial {log.names[i]} is unlike the others: its {names[j]} is {table[i, j]:.4g}, and {centre[j]:.4g} is"
-            f" usual ({worst[i]:.0f} times the usual deviation)."
+            f"Trial {log.names[present[i]]} is unlike the others: its {names[j]} is {table[i, j]:.4g}, and"
+            f" {centre[j]:.4g} is usual ({worst[i]:.0f} times the usual deviation)."
         )
         yield Remark("outlier", text, True)
 

@@ -110,11 +110,6 @@ class DaggerAgent(LearnedAgent):
         inputs = self._inputs(take_steps(batch.obs, index), take(memories, index))
         return imitation_loss(self.policy.log_prob(inputs, take_steps(label, index)), take_steps(batch.mask, index))
 
-    @torch.no_grad()
-    def held_out_loss(self, batch: Batch) -> Tensor:
-        """The imitation loss [S] on the expert's trials."""
-        return self.loss(batch, batch.action, None, self._draws)
-
 
 def labelled(
     query: Query, behaviour: Agent | None, seeds: int, drifts: bool, device: str

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, ramp
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, trials_of
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, Source, as_generators, take, trials_of
 from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent, Explorer
@@ -21,7 +21,6 @@ from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import Agent, Trials
 
 Explore = Callable[[Agent | None], Trials]
@@ -72,10 +71,8 @@ def train(
     seeds = len(rngs)
     unit = split_episodes if config.drifts else lambda trials: trials
     demonstrations, first = unit(trials_of(trials)), trials_of(lambda: explore(None))
-    episodes, first = first.mask.shape[1], unit(first)
     signature = Signature.of(demonstrations)
-    if Signature.of(first) != signature:
-        raise InputError(f"exploration is {Signature.of(first)}, demonstrations are {signature}; they must agree")
+    episodes, first = first.mask.shape[1], unit(signature.checked(first))
     expert, explored = (Batch.of(x, seeds, device) for x in (demonstrations, first))
     draws = Draws(rngs, device)
     scales = Scales.of(signature, expert, explored)
@@ -106,7 +103,7 @@ def train(
     for i in range(begin, config.rounds):
         if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
-            new = Batch.of(unit(explore(explorer)), seeds, device)
+            new = Batch.of(unit(signature.checked(explore(explorer))), seeds, device)
             explored = explored.joined(new) if config.accumulate else new
             if not config.accumulate:
                 expert = Batch.of(unit(trials_of(trials)), seeds, device)
@@ -118,9 +115,12 @@ def train(
             done += 1
             monitor.update(done, total, {"inference": loss}, agent)
         belief = final_belief(model, expert)
-        latents = model.for_cloning(belief, draws)
+        drawn = belief  # of a latent a trial; or one a step, padding too
+        if belief.shape[1] > len(expert):
+            drawn = take(belief, expert.draw_steps(belief.shape[1], draws))
+        latents = model.for_cloning(drawn, draws)
         if config.fit_prior:
-            model.set_prior(belief, draws)
+            model.set_prior(drawn, draws)
         if online is not None:
             online.fit(model, explored, config.inference_updates, draws)
         for _ in range(config.imitation_updates):

@@ -21,7 +21,7 @@ AMOUNTS = {
 }
 
 
-@uses(*USES, version=2, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)
+@uses(*USES, version=3, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the belief that forgets."""
     return deconfounded.fit(given)

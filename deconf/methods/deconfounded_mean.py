@@ -35,7 +35,7 @@ class MeanConfig(Configuration):
     model: Literal["evidence", "gru"] = "gru"
     width: int = 64
     latent: int = 8
-    beta: float = 1.0  # weight of the KL divergence from the previous belief, against the sum of squared errors
+    beta: float = 1.0  # weight of the KL divergence from the previous belief, against the mean squared error of a step
     ahead: int = 10  # transitions that a latent predicts
     rounds: int = 8
     inference_updates: int = 60  # a round
@@ -124,12 +124,14 @@ def running_mean(model: VariationalModel, trials: Batch, part: int = 64) -> Tens
 def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monitor: Monitor | None = None) -> MeanAgent:
     """Train in rounds of exploration, inference and imitation; explore is called once a round.
 
-    trials: of the expert, without theta, in as many equal groups as there are generators in rng..
+    trials: of the expert, without theta, in as many equal groups as there are generators in rng. Raises InputError if
+    exploration and trials do not fit each other.
     """
     rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
-    first, draws = explore(None), Draws(rngs, device)
-    expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, first))
-    scales = Scales.of(Signature.of(trials), expert, explored)
+    signature = Signature.of(trials)
+    expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, signature.checked(explore(None))))
+    draws = Draws(rngs, device)
+    scales = Scales.of(signature, expert, explored)
     agent = MeanAgent.new(config.model, config.latent, config.width, scales, draws)
     model, policy = agent.model, agent.policy
     assert isinstance(model, VariationalModel)
@@ -156,7 +158,7 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
 
     for i in range(begin, config.rounds):
         if i > 0:
-            explored = explored.joined(Batch.of(explore(agent), len(rngs), device))
+            explored = explored.joined(Batch.of(signature.checked(explore(agent)), len(rngs), device))
         for j in range(config.inference_updates):
             beginnings = explored.beginnings(i * config.inference_updates + j, config.shortest)
             loss = inference_loss(model, beginnings.draw_trials(config.inference_batch, draws), config, draws)

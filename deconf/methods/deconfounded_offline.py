@@ -10,7 +10,9 @@ the latent, whose latents are known. The agent is deployed as in Tier 2, by Algo
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deconfounded.deconf.core.adam import Adam
@@ -108,7 +110,7 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     offline, encoder, policy = explain(data, signature, config, draws, monitor, times)
     latents = offline.sample(final_belief(offline, data), draws)
     online = encoder if signature.binary else exact(encoder, draws)
-    starts = torch.tensor(trials.obs[:, :, 0], device=config.device).reshape(len(rngs), -1, signature.obs)
+    starts = torch.tensor(starts_of(trials), device=config.device).reshape(len(rngs), -1, signature.obs)
     synthesis = Synthesis(online, policy, latents, data, starts, trials.mask.shape[2], config.random_share, draws)
     in_course = OnlineBelief(online, config.width, draws)
     agent = DeconfoundedAgent(online, policy, in_course)
@@ -130,6 +132,13 @@ def train(trials: Trials, config: OfflineConfig, rng: Rngs, monitor: Monitor | N
     if config.drifts:
         choose_kept(online, data[:, : 64 * episodes], episodes, draws)
     return agent
+
+
+def starts_of(trials: Trials) -> NDArray[np.float32]:
+    """First observations [B, E, O]; of an episode that did not take place, those of one of its trial that did."""
+    took_place = trials.mask.any(2)
+    index = np.where(took_place, np.arange(took_place.shape[1]), took_place.argmax(1)[:, None])
+    return np.take_along_axis(trials.obs[:, :, 0], index[..., None], 1)
 
 
 def exact(model: VariationalModel, draws: Draws) -> LinearModel:

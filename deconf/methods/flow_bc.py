@@ -39,6 +39,7 @@ from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.sequence_bc import train_sequence
+from deconfounded.envs.support.errors import InputError
 
 PHASES = 4  # cosines of tau that the network reads
 
@@ -57,6 +58,11 @@ class FlowConfig(Configuration):
     steps: int = 512
     learning_rate: float = 2e-3
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.executed > self.ahead:
+            raise InputError(f"executed of FlowConfig was {self.executed}; it must be at most ahead, {self.ahead}")
 
 
 def of_time(tau: Tensor) -> tuple[Tensor, Tensor]:
@@ -178,11 +184,6 @@ class FlowAgent(LearnedAgent):
         then = (index[..., None] + ahead).minimum(end[..., None]).clamp(min=0)  # the last action is repeated
         chunk = take_steps(label, then.flatten(1)).unflatten(1, then.shape[1:])
         return self.policy.loss(features, chunk, take_steps(episodes.mask, index), draws)
-
-    @torch.no_grad()
-    def held_out_loss(self, batch: Batch) -> Tensor:
-        """The loss [S] on the expert's episodes."""
-        return self.loss(batch, batch.action, None, self._draws)
 
 
 class FlowTrainer:

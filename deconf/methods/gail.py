@@ -212,6 +212,8 @@ def train(
     named = {f"player{i}": state for i, state in enumerate(states)}
     checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
     begin = (checkpoint.load() or {"round": 0})["round"]
+    for i, state in enumerate(states):
+        agent.load_policy(i, state.ppo.policy)
     for done in range(begin, config.rounds):
         own = []
         for i, state in enumerate(states):

@@ -9,14 +9,14 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, joined_theta, take_steps
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials, of_steps
+from deconfounded.experts.rollout import Trials
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,7 @@ def train(
     scales = Scales.of(signature, data)
     features = scales.obs(data.obs)
     if theta is not None:
-        by_step = torch.as_tensor(of_steps(theta, trials.mask.shape[2])).to(features)
-        features = torch.cat([features, by_step.reshape(*features.shape[:-1], -1)], -1)
+        features = torch.cat([features, joined_theta(trials, theta, len(rngs), config.device)], -1)
     policy = ActionHead(features.shape[-1], config.width, scales, draws)
     agent = MemorylessAgent(policy, scales, side)
     optimizer = Adam([policy], config.learning_rate, config.updates)

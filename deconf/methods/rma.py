@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joined_theta, take
 from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
@@ -28,7 +28,7 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, Trials, of_steps
+from deconfounded.experts.rollout import Agent, Trials
 
 Explore = Callable[[Agent | None], tuple[Trials, Array]]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.
@@ -128,7 +128,7 @@ def train(
         begin, data, targets = before["round"], Batch(*before["data"]), before["told"]
     for i in range(begin, config.rounds):
         own, thetas = explore(agent if i > 0 else None)
-        new, target = Batch.of(own, len(rngs), config.device), per_step(own, thetas, len(rngs), config.device)
+        new, target = Batch.of(own, len(rngs), config.device), joined_theta(own, thetas, len(rngs), config.device)
         data, targets = (new, target) if data is None else (data.joined(new), torch.cat([targets, target], 1))
         for j in range(passes[i]):
             index = draws.integers(len(data), config.batch)
@@ -153,12 +153,6 @@ def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: 
         optimizer.step(error)
         errors.append(error.mean().item())
     return sum(errors) / len(errors)
-
-
-def per_step(trials: Trials, theta: Array, seeds: int, device: str) -> Tensor:
-    """theta [B, E, F] of episodes, or [B, E, T, F] -> [S, B, T, F], at each step as `Batch.of` joins them."""
-    repeated = of_steps(theta, trials.mask.shape[2]).astype(np.float32)
-    return Batch.of(Trials(trials.obs, repeated, trials.mask), seeds, device).action
 
 
 @uses(

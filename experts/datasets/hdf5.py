@@ -20,7 +20,7 @@ def read_hdf5(file: Path) -> Table:
         with h5py.File(file) as opened:
             if "data" in opened and isinstance(opened["data"], h5py.Group):
                 return _robomimic(file, opened["data"])
-            if {"observations", "actions"} <= set(opened):
+            if all(isinstance(opened.get(name), h5py.Dataset) for name in ("observations", "actions")):
                 return _d4rl(file, opened)
             hint = "; give the folder of the Minari data set" if "episode_0" in opened else ""
             raise InputError(
@@ -73,8 +73,9 @@ def _robomimic(file: Path, data: Any) -> Table:
         where, demo = f"{name} of {file}", data[name]
         if not isinstance(demo, Mapping) or not {"actions", "obs"} <= set(demo):
             raise InputError(f"{where} must hold `actions` and `obs`")
-        arrays = _arrays(demo)
-        n = len(arrays["actions"])
+        arrays = {key: array for key, array in _arrays(demo).items() if array.ndim}
+        if not (n := len(arrays.get("actions", ()))):
+            raise InputError(f"{where} must hold `actions` [N, A] of at least one step")
         if short := [key for key, array in arrays.items() if key.startswith("obs/") and array.shape[:1] != (n,)]:
             raise InputError(f"{short[0]} of {where} has {len(arrays[short[0]])} rows; its actions have {n}")
         columns = _rows(where, arrays, n)
@@ -99,6 +100,8 @@ def _robomimic(file: Path, data: Any) -> Table:
 def _d4rl(file: Path, opened: Any) -> Table:
     """`observations`, `actions` [N, ...], `terminals` and `timeouts` [N], perhaps `next_observations`, `infos/...`."""
     arrays = {name: array for name, array in _arrays(opened).items() if array.ndim}
+    if strange := {"observations", "actions"} - set(arrays):
+        raise InputError(f"{min(strange)} of {file} is a single number; it must have a row a step")
     n = len(arrays["actions"])
     if len(arrays["observations"]) != n:
         raise InputError(f"{file} has {len(arrays['observations'])} observations and {n} actions; they must be as many")

@@ -18,10 +18,12 @@ def read_lerobot(folder: Path) -> Table:
 
     Raises InputError if files are missing, or are of another version.
     """
-    info = _json(folder / "meta" / "info.json", (folder / "meta" / "info.json").read_text(encoding="utf-8"))
+    info = _json(folder / "meta" / "info.json", _text(folder / "meta" / "info.json"))
     version, features = str(info.get("codebase_version")), info.get("features")
     if not version.startswith(("v2", "v3")) or not isinstance(features, dict):
         raise InputError(f"{folder} is a LeRobot data set of version {version}; it must be v2 or v3")
+    if strange := [name for name, feature in features.items() if not isinstance(feature, dict)]:
+        raise InputError(f"feature {strange[0]} of {folder}/meta/info.json is no dictionary")
     files = sorted((folder / "data").rglob("*.parquet"))
     if not files:
         raise InputError(f"{folder} has no data/chunk-*/*.parquet")
@@ -64,7 +66,7 @@ def _episodes(folder: Path) -> list[dict[str, Any]]:
     """What is said of each episode: meta/episodes.jsonl of version 2, meta/episodes/**/*.parquet of version 3."""
     lines = folder / "meta" / "episodes.jsonl"
     if lines.is_file():
-        return [_json(lines, line) for line in lines.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return [_json(lines, line) for line in _text(lines).splitlines() if line.strip()]
     entries: list[dict[str, Any]] = []
     for file in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         columns = parquet_columns(file)
@@ -73,6 +75,13 @@ def _episodes(folder: Path) -> list[dict[str, Any]]:
             entry = {name: column[i] for name, column in columns.items() if name not in tasks}
             entries.append(entry | ({"tasks": [columns[name][i] for name in tasks]} if tasks else {}))
     return entries
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is not in UTF-8: {error}") from None
 
 
 def _json(file: Path, text: str) -> dict[str, Any]:

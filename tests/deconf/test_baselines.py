@@ -18,12 +18,12 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import Provider, Vector, fit
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Signature, joined_theta
 from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.given import Environments
-from deconfounded.deconf.methods import deconfounded_mean, gail, rma
+from deconfounded.deconf.methods import deconfounded_mean, gail, memoryless_bc, rma
 from deconfounded.deconf.methods.dadp import DadpAgent, contexts
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.dml_il import DmlAgent, moment_loss, sources
@@ -380,7 +380,20 @@ class TestRma:
         mask = np.array([[[1, 0, 0], [1, 1, 0]]], bool)
         theta = np.array([[[0.1], [0.2]]])
         trials = Trials(np.zeros((1, 2, 4, 1)), np.zeros((1, 2, 3, 1)), mask)
-        assert rma.per_step(trials, theta, 1, "cpu")[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
+        assert joined_theta(trials, theta, 1)[0, 0, :3, 0].tolist() == pytest.approx([0.1, 0.2, 0.2])
+
+    def test_an_oracle_is_cloned_by_the_theta_of_each_step(self) -> None:
+        """Theta differs from step to step, is the expert's action, and episodes end early."""
+        rng = np.random.default_rng(0)
+        theta = rng.uniform(-1, 1, (64, 2, 8, 1))
+        mask = np.arange(8) < rng.integers(1, 9, (64, 2, 1))
+        trials = Trials(np.zeros((64, 2, 9, 1)), theta * mask[..., None], mask)
+        shown = rng.uniform(-0.9, 0.9, (50, 1))
+        config = memoryless_bc.MemorylessConfig(width=32, updates=300, batch=256)
+        oracle = memoryless_bc.train(trials, config, rng, theta, lambda: shown)
+        oracle.begin(50)
+        oracle.reset([rng])
+        np.testing.assert_allclose(oracle.act(np.zeros((50, 1), np.float32)), shown, atol=0.15)
 
     def test_the_student_sees_no_theta(self) -> None:
         """In deployment it acts alike after the same history under every theta."""
@@ -541,42 +554,36 @@ def test_no_rounds_is_one_line(method: str) -> None:
         fit(Context(envs.get("bandit"), settings, [0]), method)
 
 
-class Unplugged(Monitor):
-    """Keeps a checkpoint; the first training is interrupted when it has been saved `lasts` times."""
+class Interrupted(Monitor):
+    """Keeps every checkpoint; a training that is given one goes on from there."""
 
-    def __init__(self, lasts: int) -> None:
+    def __init__(self, before: Training | None = None) -> None:
         super().__init__()
-        self.lasts, self.kept = lasts, None
-        self.kept: Training | None
+        self.before, self.saved = before, list[Training]()
 
     def save(self, state: Callable[[], Training]) -> None:
-        self.lasts -= 1
-        if self.lasts == 0:
-            self.kept = copy.deepcopy(state())
-            raise KeyboardInterrupt
+        self.saved.append(copy.deepcopy(state()))
 
     def load(self) -> Training | None:
-        return self.kept
+        return self.before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", NEW)
 def test_interrupted_training_resumes(method: str) -> None:
     """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one."""
-    monitor, task = Unplugged(1), envs.get("bandit")
-    with pytest.raises(KeyboardInterrupt):
-        made(method, "bandit", monitor=monitor)
-    actions: list[Array] = []
-    whole = made(method, "bandit")
+    monitor, task = Interrupted(), envs.get("bandit")
+    whole = made(method, "bandit", monitor=monitor)
     assert isinstance(whole, LearnedAgent)
-    resumed = made(method, "bandit", monitor=monitor)
-    assert isinstance(resumed, LearnedAgent)
-    for agent in (whole, resumed, type(whole).from_state(*whole.state())):
+    agents = [whole, type(whole).from_state(*whole.state())]
+    agents += [made(method, "bandit", monitor=Interrupted(monitor.saved[i])) for i in (0, -1)]  # the last is of a whole
+    actions: list[Array] = []
+    for agent in agents:
         for key, array in whole.state()[1].items():  # few updates may leave all actions as they were
             np.testing.assert_array_equal(agent.state()[1][key], array, err_msg=key)
         actions.append(run_trials(envs.BatchEnv(task, 4), agent, 2, 1).trials.action)
-    np.testing.assert_array_equal(actions[1], actions[0])
-    np.testing.assert_array_equal(actions[2], actions[0])
+    for others in actions[1:]:
+        np.testing.assert_array_equal(others, actions[0])
 
 
 @pytest.mark.slow

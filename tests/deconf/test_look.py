@@ -56,6 +56,16 @@ def changed(trials: Trials, **arrays: Any) -> Trials:
     return Trials(**{"obs": trials.obs, "action": trials.action, "mask": trials.mask, "actions": 0} | arrays)
 
 
+def test_trials_without_a_step() -> None:
+    """They are left out, and others keep their numbers."""
+    trials = driven()
+    mask, obs = trials.mask.copy(), trials.obs.copy()
+    mask[0] = False
+    obs[5] += 1000
+    remarks = look(changed(trials, obs=obs, mask=mask))
+    assert any(remark.kind == "outlier" and "Trial 5 is unlike" in remark.text for remark in remarks)
+
+
 def odd(remarks: list[Remark]) -> list[str]:
     return [remark.kind for remark in remarks if remark.odd]
 

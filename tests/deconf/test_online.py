@@ -8,12 +8,16 @@ from torch import Tensor
 from deconfounded.deconf.core import online
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief, InnovationBelief
-from deconfounded.deconf.core.data import Batch, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
+from deconfounded.deconf.methods import deconfounded
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.experts.rollout import Trials
 from tests.deconf.ball import STEPS, pushed, streams
+from tests.tools import tiny_preset
 
 
 @pytest.fixture(scope="module")
@@ -146,3 +150,21 @@ def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.Monkey
     monkeypatch.setattr(made.encoder, "hindsight", lambda batch, memories: batch.obs)  # a latent for every step
     memory, latent = online.memories(made, data, streams())
     assert torch.equal(memory, latent)
+
+
+def test_no_latent_of_padding_enters_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where each step has a latent, p(theta_hat) is fitted to those of steps that took place."""
+    rng, mask, checked = np.random.default_rng(0), np.arange(12) < np.array([3, 12, 5, 2])[:, None], []
+    trials = Trials(rng.random((4, 1, 13, 2)), rng.uniform(-1, 1, (4, 1, 12, 1)), mask[:, None])
+    data = Batch.of(trials, 1)
+
+    def check(model: VariationalModel, belief: Tensor, draws: Draws) -> None:
+        real, padding = (final_belief(model, data)[data.mask.flatten(1) == taken] for taken in (1, 0))
+        checked.append(len(belief[0]))
+        assert (belief[0][:, None] == real).all(-1).any(1).all()
+        assert not (belief[0][:, None] == padding).all(-1).any()
+
+    monkeypatch.setattr(VariationalModel, "set_prior", check)
+    config = DeconfoundedConfig(**tiny_preset().configs["deconfounded_forgetting"])
+    deconfounded.train(trials, lambda agent: trials, config, rng)
+    assert checked == [48, 48]

@@ -426,6 +426,15 @@ class TestBadInput:
                 "obs/x of demo_0",
             ),
             ("none", {"data/demo_0/states": np.zeros((4, 2))}, "must hold `actions` and `obs`"),
+            ("number", {"data/demo_0/obs/x": np.zeros((4, 2)), "data/demo_0/actions": 1.0}, "of at least one step"),
+            ("empty", {"data/demo_0/obs/x": np.zeros((0, 2)), "data/demo_0/actions": np.zeros((0, 1))}, "at least one"),
+            ("folder", {"data/demo_0/obs/x": np.zeros((4, 2)), "data/demo_0/actions/x": np.zeros(4)}, "at least one"),
+            (
+                "flat_folder",
+                {"observations": np.zeros((4, 2)), "actions/x": np.zeros(4)},
+                "holds actions, observations",
+            ),
+            ("flat_number", {"observations": np.zeros((4, 2)), "actions": 1.0}, "is a single number"),
         ):
             with h5py.File(tmp_path / f"{name}.hdf5", "w") as file:
                 for key, array in content.items():
@@ -440,6 +449,19 @@ class TestBadInput:
             datasets.read(tmp_path / "set")
         (tmp_path / "set" / "meta" / "info.json").write_text('{"codebase_version": "v1.6", "features": {}}')
         with pytest.raises(envs.InputError, match=r"of version v1.6; it must be v2 or v3"):
+            datasets.read(tmp_path / "set")
+
+    @pytest.mark.parametrize(
+        ("content", "says"),
+        [
+            (b"\xff\xfe", "info.json is not in UTF-8"),
+            (b'{"codebase_version": "v3.0", "features": {"action": 1}}', "feature action of .* is no dictionary"),
+        ],
+    )
+    def test_lerobot_of_others(self, tmp_path: Path, content: bytes, says: str) -> None:
+        of_lerobot(tmp_path)
+        (tmp_path / "set" / "meta" / "info.json").write_bytes(content)
+        with pytest.raises(envs.InputError, match=says):
             datasets.read(tmp_path / "set")
 
     def test_a_trial_that_ends_within_an_episode(self, tmp_path: Path) -> None:

@@ -1,0 +1,179 @@
+"""What learned agents, configurations, roll-outs and exact policies refuse: one line says what would be right."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.provider import fit
+from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.models import new_model
+from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.methods import deconfounded, deconfounded_mean
+from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
+from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
+from deconfounded.deconf.methods.deconfounded_offline import starts_of
+from deconfounded.deconf.methods.flow_bc import FlowConfig
+from deconfounded.deconf.methods.naive_dropout import DropoutConfig
+from deconfounded.deconf.particles import Particles
+from deconfounded.envs.streams import Streams
+from deconfounded.experts.rollout import Agent, ExpertAgent, Trials, run_trials
+from tests.deconf.test_particles import Three, expert
+from tests.tools import tiny_preset
+
+CONTROL = "tilted_cartpole"
+
+
+@pytest.fixture(scope="module")
+def agents() -> dict[str, Agent]:
+    """An agent of continuous actions, and one of three arms or more, two trials each."""
+    made = {}
+    for task in (CONTROL, "bandit"):
+        agent = made[task] = fit(Context(envs.get(task), tiny_preset(), [0]), "naive_rnn")
+        agent.begin(2)
+        agent.reset([np.random.default_rng(0)])
+    return made
+
+
+def step(task: str, **changed: Any) -> list[Any]:
+    obs = np.zeros((2, len(envs.get(task).observation)), np.float32)
+    parts = {"obs": obs, "action": np.zeros((2, 1)), "next_obs": obs, "alive": np.ones(2, bool)}
+    return list((parts | changed).values())
+
+
+@pytest.mark.parametrize(
+    ("task", "changed", "says"),
+    [
+        (CONTROL, {"next_obs": np.full((2, 5), np.nan, np.float32)}, "observations held NaN"),
+        (CONTROL, {"next_obs": np.zeros((2, 4), np.float32)}, r"had shape \(2, 4\); they must be \(2, 5\)"),
+        (CONTROL, {"action": np.zeros(2)}, r"had shapes \(2,\) and \(2,\); they must be \(2, 1\) and \(2,\)"),
+        (CONTROL, {"action": np.full((2, 1), np.inf)}, "actions held inf; they must be finite"),
+        (CONTROL, {"alive": np.ones((2, 1), bool)}, r"and \(2, 1\); they must be"),
+        ("bandit", {"action": np.array([[0], [5]])}, "actions held 5; they must be from 0 to 4"),
+        ("bandit", {"action": np.array([[np.nan], [0]])}, "actions held nan; they must be from 0 to 4"),
+    ],
+)
+def test_steps_that_an_agent_refuses(agents: dict[str, Agent], task: str, changed: Any, says: str) -> None:
+    """Nothing of them enters its memory."""
+    width = len(envs.get(task).observation)
+    if width != 5 and task == CONTROL:  # the shapes above are of five numbers
+        pytest.fail(f"{CONTROL} has {width} numbers")
+    agent = agents[task]
+    before = agent.features()
+    with pytest.raises(envs.InputError, match=says):
+        agent.observe(*step(task, **changed))
+    np.testing.assert_array_equal(agent.features(), before)
+    agent.observe(*step(task))
+    assert (agent.features() != before).any()
+
+
+@pytest.mark.parametrize(
+    ("config", "values", "says"),
+    [
+        (FlowConfig, {"executed": 9}, "executed of FlowConfig was 9; it must be at most ahead, 8"),
+        (DropoutConfig, {"dropout": 1.0}, "it must be float, from 0 up, below 1"),
+        (DeconfoundedConfig, {"shortest": 3.0}, "it must be float, from 0 up, at most 1"),
+    ],
+)
+def test_settings_that_do_not_fit(config: Any, values: Any, says: str) -> None:
+    with pytest.raises(envs.InputError, match=says):
+        config(**values)
+
+
+def test_shares_of_one() -> None:
+    assert DeconfoundedConfig(shortest=1.0, random_share=1).shortest == 1
+
+
+def test_heads_that_do_not_divide_the_width() -> None:
+    preset = tiny_preset().configured("naive_transformer", width=20, heads=4)
+    with pytest.raises(envs.InputError, match="a transformer of 4 heads had width 20; it must be a multiple of 8"):
+        fit(Context(envs.get("bandit"), preset, [0]), "naive_transformer")
+
+
+@pytest.mark.parametrize("wrong_round", [0, 1])
+@pytest.mark.parametrize("method", ["deconfounded", "deconfounded_mean"])
+def test_exploration_of_another_kind(method: str, wrong_round: int) -> None:
+    """In any of the rounds."""
+    rng, rounds = np.random.default_rng(0), []
+    trials, other = (Trials(rng.random((4, 1, 9, o)), rng.random((4, 1, 8, 1)), np.ones((4, 1, 8))) for o in (2, 3))
+
+    def explore(agent: Agent | None) -> Trials:
+        rounds.append(agent)
+        return other if len(rounds) == wrong_round + 1 else trials
+
+    tiny = tiny_preset().configs[method]
+    module, config = {
+        "deconfounded": (deconfounded, DeconfoundedConfig),
+        "deconfounded_mean": (deconfounded_mean, MeanConfig),
+    }[method]
+    with pytest.raises(envs.InputError, match=r"exploration is Signature\(obs=3, .* they must agree"):
+        module.train(trials, explore, config(**tiny), rng)  # type: ignore[operator]
+    assert len(rounds) == wrong_round + 1
+
+
+def test_the_expert_of_other_environments() -> None:
+    task = envs.get(CONTROL)
+    env, other = envs.BatchEnv(task, 2), envs.BatchEnv(task, 2)
+    agent = ExpertAgent(other, expert(task))
+    with pytest.raises(envs.InputError, match="ExpertAgent reads the state or theta of other environments"):
+        run_trials(env, agent, 1, 0)
+
+
+class TestLikelihoods:
+    def particles(self, monkeypatch: pytest.MonkeyPatch, likelihood: Any) -> Particles:
+        """A belief that has taken in one step, whose log-likelihoods [N, K] are a function of its thetas' first."""
+        task = Three()
+        env = envs.BatchEnv(task, 3)
+        env.reset(0)
+        belief = Particles(env, expert(task), False)
+        belief.begin(3)
+        belief.reset(Streams([np.random.default_rng(0)]))
+        monkeypatch.setattr(belief, "_log_prob", lambda *_: likelihood(belief.theta[..., 0]))
+        belief.learn(env.state, env.state, np.zeros((3, 1)), env.state, np.ones(3, bool))
+        return belief
+
+    def test_a_bounded_sensor(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Thetas whose likelihood is 0 lose all weight; the others keep theirs, to a part in a million."""
+        belief = self.particles(monkeypatch, lambda x: np.where(x > 0.5, 0.0, -np.inf))
+        weight = np.exp(belief.log_weight)
+        assert (weight * (belief.theta[..., 0] > 0.5)).sum(-1) == pytest.approx(1, abs=1e-6)
+        assert (weight * belief.theta[..., 0]).sum(-1) == pytest.approx(0.75, abs=0.05)
+
+    @pytest.mark.parametrize("value", [-np.inf, np.nan])
+    def test_no_likelihood(self, monkeypatch: pytest.MonkeyPatch, value: float) -> None:
+        with pytest.raises(envs.InputError, match="a step's likelihood was NaN, or 0 under every particle"):
+            self.particles(monkeypatch, lambda x: np.full_like(x, value))
+
+    def test_likelihoods_too_far_apart(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        with pytest.raises(envs.InputError, match="likelihoods of a step differ too much"):
+            self.particles(monkeypatch, lambda x: -1e12 * x)
+
+
+@pytest.mark.parametrize("kind", ["forgetting", "discrete"])
+def test_models_without_beliefs_of_sets(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    trials = Trials(rng.random((4, 1, 9, 2)), rng.random((4, 1, 8, 1)), np.ones((4, 1, 8)))
+    data, draws = Batch.of(trials, 1), Draws([rng], "cpu")
+    model = new_model(kind, 2, 8, Scales.of(Signature.of(trials), data), draws)
+    with pytest.raises(envs.InputError, match=f"model {kind} has no belief of a set of steps"):
+        model.loss_on_sets(data, None, 1.0, draws)
+
+
+def test_starts_of_episodes_that_did_not_take_place() -> None:
+    """They are those of an episode of the same trial that did."""
+    obs = np.arange(2 * 3 * 3, dtype=np.float32).reshape(2, 3, 3, 1)
+    mask = np.ones((2, 3, 2), bool)
+    mask[0, 1:] = mask[1, 0] = False
+    trials = Trials(obs, np.zeros((2, 3, 2, 1)), mask)
+    assert starts_of(trials)[..., 0].tolist() == [[0, 0, 0], [12, 12, 15]]
+
+
+def test_trials_can_be_compared_and_hashed() -> None:
+    """By identity, as arrays have no single truth value."""
+    trials = Trials(np.zeros((1, 1, 3, 1)), np.zeros((1, 1, 2, 1)), np.ones((1, 1, 2)))
+    assert trials == trials
+    assert trials != replace(trials)
+    assert len({trials, replace(trials)}) == 2
