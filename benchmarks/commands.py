@@ -12,7 +12,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
-from deconfounded.benchmarks.engine.protocols import STANDARD, amounts
+from deconfounded.benchmarks.engine.protocols import STANDARD, amounts, check_methods
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import check_folder
 
@@ -47,6 +47,7 @@ def check(args: argparse.Namespace, allowed: Sequence[str], default: Sequence[st
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
         allowed = [*allowed, *METHODS.outside]
     catalogue.check(args.preset, methods, args.seeds, allowed)
+    check_methods(args.protocol, methods)
     if args.cluster is None:
         check_device(args.device)
     elif args.device not in ("cpu", "cuda"):

@@ -39,5 +39,8 @@ def main() -> None:
     print(comparison.write(scores, methods, against, args.out))
     if presets := sorted({record["preset"] for record in every} - {"default"}):
         print(f"note: runs of preset {', '.join(presets)}; the records that come with the package are of default")
+    for key in ("set", "salt"):
+        if changed := sorted({str(record[key]) for record in every if record[key]}):
+            print(f"note: runs of {key} {', '.join(changed)}; the records that come with the package have none")
     for line in comparison.outdated(every, against):
         print(f"note: {line}")

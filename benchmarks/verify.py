@@ -42,13 +42,13 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
     """The same seed, made again in a folder that goes away."""
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.local import Local
-    from deconfounded.benchmarks.engine.presets import changed, preset
+    from deconfounded.benchmarks.engine.presets import changed, preset, whose
     from deconfounded.benchmarks.engine.scheduler import run_all
 
     protocol = record.get("protocol_name", protocols.STANDARD)
     task = protocols.applied(protocol, task)
     settings = protocols.amounts(protocol, preset(record["preset"], task, device, [method]))
-    settings = changed(settings, record["set"])
+    settings = changed(settings, [change for change in record["set"] if whose(change) in ("", method)])
     guest, salts = catalogue.guest(method), tuple(record["salts"]) if "salts" in record else None
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "jobs"

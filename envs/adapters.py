@@ -104,8 +104,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
 
     A finished environment is reset by the next step, or with AutoresetMode.SAME_STEP by the step that finished it, and
     info then has `final_obs`: under the same theta until its trial has had `episodes` episodes, then under a new theta.
-    `reset` takes the options of GymEnv.reset; keep_theta may be a mask
-    [N]: where True, the next episode of the trial starts, elsewhere the first episode of a new trial.
+    `reset` does so too, if it is given neither seed nor options. It takes the options of GymEnv.reset; keep_theta may
+    be a mask [N]: where True, the next episode of the trial starts, elsewhere the first episode of a new trial.
     """
 
     def __init__(
@@ -131,6 +131,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         self.action_space = batch_space(task.action_space, n)
 
     def reset(self, *, seed: Seed = None, options: Info | None = None) -> tuple[Obs, Info]:
+        if seed is None and not options and (going_on := (self._episode > 0) & (self._episode < self.episodes)).any():
+            options = {"keep_theta": going_on}
         obs = self.batch.reset(seed, options)
         super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
         self._episode = np.where((options or {}).get("keep_theta", False), self._episode + 1, 1)

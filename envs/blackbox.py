@@ -5,7 +5,7 @@ A *world* makes such an environment for a theta (envs/world.py); `task_of` turns
 
 import inspect
 import re
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium
 import numpy as np
@@ -77,6 +77,19 @@ class GymSimulator(Simulator):
         return np.append(row, (reward, over))
 
 
+Value = TypeVar("Value")
+
+
+class Fact(Generic[Value]):
+    """An attribute of a task that is read from its `facts`, unless the instance has its own (`Task.changed`)."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get__(self, task: "BlackBox", owner: type | None = None) -> Value:
+        return getattr(task.facts, self.name) if task is not None else self  # type: ignore[return-value]
+
+
 class BlackBox(Task):
     """The task of a world. The state [S] is the observation, the step's reward, and whether the episode ended early."""
 
@@ -89,17 +102,9 @@ class BlackBox(Task):
         """What is known of the world from its attributes, draws of theta, and one environment."""
         return facts(self.world)
 
-    @property
-    def horizon(self) -> int:  # type: ignore[override]
-        return self.facts.steps
-
-    @property
-    def episodes(self) -> int:  # type: ignore[override]
-        return self.facts.episodes
-
-    @property
-    def latents(self) -> tuple[Latent, ...]:  # type: ignore[override]
-        return self.facts.latents
+    horizon = Fact[int]("steps")  # type: ignore[assignment]
+    episodes = Fact[int]("episodes")  # type: ignore[assignment]
+    latents = Fact[tuple[Latent, ...]]("latents")  # type: ignore[assignment]
 
     @property
     def observation(self) -> dict[str, tuple[float, float]]:  # type: ignore[override]

@@ -2,6 +2,7 @@
 
 import contextlib
 import secrets
+import shutil
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -145,6 +146,8 @@ class BenchmarkJob(Job):
             folder = self.folder.parent / "agents" / f"{name}-{seed}"
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
             try:
+                if folder.exists():  # the agent of results that are no longer there
+                    shutil.rmtree(folder)
                 if isinstance(agent, Guest):
                     note = agent.keep(folder, about)
                 elif isinstance(agent, LearnedAgent):

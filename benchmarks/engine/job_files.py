@@ -65,7 +65,10 @@ def know_guests(folder: Path) -> None:
 
 
 def left_in(folder: Path) -> Finished:
-    """What jobs left in a folder, whatever code made it: each file is what it says it is."""
+    """What jobs left in a folder, whatever code made it: each file is what it says it is.
+
+    Of files for which the text of a task or a method from outside differed, it is those of the latest text.
+    """
     finished = []
     for file in sorted(folder.glob("*-*.npz")):
         if (data := read(file)) is None or "agents" not in (meta := data["meta"]):
@@ -76,7 +79,16 @@ def left_in(folder: Path) -> Finished:
             print(f"{file.name} is left out: it is of {name}")
         else:
             finished.append((meta["identity"]["method"], meta["seed"], data))
-    return finished
+    latest = sorted(finished, key=lambda job: max(end for _, end in job[2]["meta"]["spans"]))
+    texts = {method: data["meta"]["identity"]["outside"] for method, _, data in latest}
+    task = latest[-1][2]["meta"]["identity"]["outside"].get("task") if latest else None
+    kept = []
+    for method, seed, data in finished:
+        if (text := data["meta"]["identity"]["outside"]) == texts[method] and text.get("task") == task:
+            kept.append((method, seed, data))
+        else:
+            print(f"{method}-{seed}.npz is left out: its task or method had another text; run it again with --resume")
+    return kept
 
 
 def by_method(finished: Finished) -> dict[str, list[dict[str, Any]]]:

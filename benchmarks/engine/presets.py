@@ -10,6 +10,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.deconf.core.sizes import fits
 
 MOST = 1e9  # of any amount
+FEWEST = 4  # trials of evaluation: of half of them, theta_r2 needs the variance
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,11 @@ def preset(name: str, task: envs.Task, device: str, methods: Sequence[str] | Non
     return replace(amounts, device=device, configs={method: values for method, values in configs.items() if values})
 
 
+def whose(change: str) -> str:
+    """The method whose setting a change is of: `naive_rnn.updates=500`; empty for an amount of all methods."""
+    return change.partition("=")[0].rpartition(".")[0]
+
+
 def changed(settings: Preset, changes: Sequence[str]) -> Preset:
     """The same with other amounts: `seeds=10`, or `naive_rnn.updates=500` for a method's.
 
@@ -60,7 +66,7 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
     """
     for change in changes:
         key, _, value = change.partition("=")
-        method, _, name = key.rpartition(".")
+        method, name = whose(change), key.rpartition(".")[2]
         if method in METHODS and method not in settings.configs:
             raise envs.InputError(f"--set had {key}, and method {method!r} has no config; it sets fields of one")
         if method not in ("", *settings.configs):
@@ -82,6 +88,7 @@ def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
     except ValueError:
         value = text
     least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
+    least = FEWEST if key == "eval_trials" else least
     if not fits(value, kinds, least, MOST):
-        raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
+        raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}, and at least {least}")
     return value

@@ -3,6 +3,7 @@
 A record names its protocol unless that is STANDARD. Versions of seeding and roll-outs are `identity.PROTOCOL`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ PROTOCOLS = {
 }
 LESS = 16
 AMOUNTS = ("expert_trials", "explore_trials", "query_trials")
+STEPWISE = ("gail",)  # methods that explore as many steps as their own settings say
 EDGE = 0.25  # of the probability, at either end of a latent's distribution: thetas that training does not see
 
 
@@ -38,8 +40,8 @@ def why_not(protocol: str, task: envs.Task) -> str:
     """Why a task cannot be under a protocol of PROTOCOLS; empty if it can."""
     if protocol != "unseen":
         return ""
-    if not task.has_likelihood:
-        return "it draws theta by its own sample_theta alone"
+    if not task.has_likelihood or type(task).sample_theta is not envs.Task.sample_theta:
+        return "it draws theta by its own sample_theta"
     if task.drifts or task.switches:
         return "its theta moves, and would leave the middle"
     categories = [lat.name for lat in task.latents if lat.distribution == "categorical"]
@@ -54,11 +56,17 @@ def check(protocol: str, task: envs.Task) -> None:
         raise envs.InputError(f"--protocol {protocol} is not for {task.name}: {why}")
 
 
+def check_methods(protocol: str, methods: Sequence[str]) -> None:
+    """Raises InputError for a method to which a protocol's amounts of data would not apply."""
+    if protocol == "scarce" and (strange := [name for name in methods if name in STEPWISE]):
+        raise envs.InputError(f"--protocol scarce is not for {strange[0]}: its own settings say how much it explores")
+
+
 def amounts(protocol: str, preset: "Preset") -> "Preset":
     """The preset's amounts under a protocol."""
     if protocol != "scarce":
         return preset
-    return replace(preset, **{name: max(1, getattr(preset, name) // LESS) for name in AMOUNTS})
+    return replace(preset, fresh=0, **{name: max(1, getattr(preset, name) // LESS) for name in AMOUNTS})
 
 
 def applied(protocol: str, task: envs.Task, evaluation: bool = False) -> envs.Task:

@@ -94,8 +94,9 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
     ]
     run_jobs(first, label, engine.run)
     run_jobs(parts, label, engine.run, folder.parent / "errors")
-    for stale in folder.glob(".*.pt"):  # of groups that this command made otherwise
-        stale.unlink()
+    for job in every:
+        for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
+            stale.unlink()
     done = written(every[0], folder)
     finished = [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
     return finished, len(finished) - sum(map(len, left))

@@ -49,6 +49,9 @@ def _references(records: Sequence[Record]) -> tuple[float, float]:
     if missing := [name for name in REFERENCES if not returns[name]]:
         raise InputError(f"records are without those of {missing[0]}, which scores need")
     random, expert = (float(np.mean(returns[name])) for name in REFERENCES)
+    if not expert > random:
+        says = f"the expert returns {expert:.4g} an episode, random actions {random:.4g}"
+        raise InputError(f"{records[0]['task']}: {says}; scores need an expert that is better")
     return random, expert
 
 
@@ -63,6 +66,7 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
             if record.get(key) != first.get(key):
                 both = " and ".join(str(one.get(key, STANDARD)) for one in (first, record))
                 raise InputError(f"records with {key} {both} do not belong in one table")
+    one_text(records)
     by_method, by_agent = grouped(records, lambda record: record["method"]), grouped(records, named)
     for method, of in by_method.items():
         if any(record[key] != of[0][key] for record in of for key in ("method_version", "outside")):
@@ -82,6 +86,14 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
             {name: by_agent[name] for name in names}, first["episodes"], references(first, records)
         ),
     }
+
+
+def one_text(records: Sequence[Record]) -> None:
+    """Raises InputError for records of a task from outside that were made with several texts of its file."""
+    texts = {record["task"]: record["outside"].get("task") for record in records}
+    for record in records:
+        if record["outside"].get("task") != texts[record["task"]]:
+            raise InputError(f"records of {record['task']} are of two texts of its file; make them again with one")
 
 
 def _versions(records: Sequence[Record]) -> dict[str, str]:

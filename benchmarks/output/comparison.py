@@ -68,6 +68,7 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
         zero, one = aggregation.references(record, every)
         of[record["seed"]] = scoring.normalise(np.array(record["returns"][: record["episodes"]]), zero, one)
 
+    aggregation.one_text(every)
     for record in every:
         if records.named(record) not in REFERENCES:
             add(record)

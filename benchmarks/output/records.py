@@ -182,8 +182,8 @@ def write(folder: Path, records: Sequence[Record]) -> None:
     """Add records to the files of their tasks in a folder, each file atomically.
 
     A record takes the place of the one in its slot. One that was made of something else is kept in the folder
-    `superseded`, and so are those of an older version, of all seeds, which no table shows any more. Raises InputError
-    for what is no record, before anything is written.
+    `superseded`, and so are those of an older version or of another text from outside, of all seeds, which no table
+    shows any more. Raises InputError for what is no record, before anything is written.
     """
     from filelock import FileLock
 
@@ -200,12 +200,25 @@ def write(folder: Path, records: Sequence[Record]) -> None:
                 if before is not None and stale(before, record):
                     superseded.append(before)
                 kept[_slot(record)] = record
-            today = _newest(list(kept.values()))
+            today = _of_one_text(_newest(list(kept.values())), new)
             slots = set(map(_slot, today))
             superseded += [record for slot, record in kept.items() if slot not in slots]
             if superseded:
                 _append(folder / "superseded" / place(task), superseded)
             write_atomically(file, "".join(map(_line, today)))
+
+
+def _of_one_text(records: Sequence[Record], new: Sequence[Record]) -> list[Record]:
+    """Without those for which the task or the method from outside had another text than for new ones beside them."""
+    task = {_slot(record, APART): record["outside"].get("task") for record in new}
+    method = {_slot(record, ("method", *APART)): record["outside"] for record in new}
+
+    def same(record: Record) -> bool:
+        text = record["outside"]
+        by_task, by_method = _slot(record, APART), _slot(record, ("method", *APART))
+        return text.get("task") == task.get(by_task, text.get("task")) and text == method.get(by_method, text)
+
+    return [record for record in records if same(record)]
 
 
 def _append(file: Path, records: Sequence[Record]) -> None:

@@ -14,6 +14,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
+from deconfounded.benchmarks.engine.protocols import STEPWISE
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import runs
@@ -31,14 +32,15 @@ TASKS = ("slippery_cartpole", "curling")
 ENDS = ("first", "last")
 TICKS = (8, 32, 128, 512)  # trials
 
+Key = tuple[str, str, int]
 Point = dict[str, Any]
 """The task, the method, its version, n of SHARES, explored trials of a seed; scores of ENDS by seed; made where."""
 
 
 def explorers() -> list[str]:
-    """The methods whose exploration or queries the preset's amounts set: `gail` counts steps of its own."""
+    """The methods whose exploration or queries the preset's amounts set."""
     kinds = {"exploration", "queries"}
-    return [name for name, method in METHODS.items() if kinds & {*method.uses} and name != "gail"]
+    return [name for name, method in METHODS.items() if kinds & {*method.uses} and name not in STEPWISE]
 
 
 def fewer(settings: "Preset", share: int) -> list[str]:
@@ -128,6 +130,17 @@ def measured(made: "list[Record]", method: str, share: int) -> Point:
     }
 
 
+def added(file: Path, point: Point) -> dict[Key, Point]:
+    """The points of a file, with one more or in place of the one before; other programs may add to it, too."""
+    from filelock import FileLock
+
+    with FileLock(file.with_suffix(".lock")):
+        every = [*json.loads(file.read_bytes()), point] if file.is_file() else [point]
+        points = {(p["task"], p["method"], p["share"]): p for p in every}
+        write_json(file, [points[key] for key in sorted(points)])
+    return points
+
+
 def main() -> None:
     parser = commands.parser(__doc__, "some of those that explore or query; default: all of them", seeds=1)
     several = f"names, or {', '.join(published.GROUPS)}; default: {' '.join(TASKS)}"
@@ -141,9 +154,7 @@ def main() -> None:
 
     folder = args.out or Path("results") / "exploration"
     check_folder(folder)
-    file, points = folder / "exploration.json", dict[tuple[str, str, int], Point]()
-    if file.is_file():
-        points = {(p["task"], p["method"], p["share"]): p for p in json.loads(file.read_bytes())}
+    file, points = folder / "exploration.json", dict[Key, Point]()
     for task in tasks:
         whole = changed(preset(args.preset, task, args.device), args.set)
         for share in args.shares:
@@ -153,8 +164,7 @@ def main() -> None:
             for method in methods:
                 made = [] if changes or args.preset != "default" else recorded(task, settings, method, args.seeds)
                 made = made or runs.run(task, settings, (*REFERENCES, method), range(args.seeds), own, **options)
-                points[task.name, method, share] = point = measured(made, method, share)
-                write_json(file, [points[key] for key in sorted(points)])
+                points = added(file, point := measured(made, method, share))
                 ends = ", ".join(two_decimals(float(np.mean(point[end]))) for end in ENDS)
                 print(f"{task.name}, {method}, {point['explored']} trials: {ends} in the first and the last episode")
     picture(list(points.values()), folder / "exploration.png")

@@ -12,7 +12,7 @@ from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.headroom import ENDS
-from deconfounded.benchmarks.studies.results import with_interval
+from deconfounded.benchmarks.studies.results import of_versions, with_interval
 
 SHOWN = (
     *("deconfounded", "deconfounded_mode", "deconfounded_offline", "dagger", "rma", "naive_rnn", "oracle_bc"),
@@ -28,8 +28,9 @@ def page(standard: index.Found, by_protocol: Mapping[str, index.Found]) -> str:
 A protocol changes the amounts of data, the trial, or the thetas of a task, alike for all methods (`--protocol`). Made
 by `deconf publish` from the [records](records) alone. Scores: 0 = random actions, 1 = the expert that sees theta; five
 seeds, with 95% intervals of a percentile bootstrap over seeds. A method's tier is in brackets. `deconfounded_mode` is
-`deconfounded`, acting on the likeliest latent. The last two rows are interquartile means over the tasks where all
-agents of the table have records under both protocols. [Headroom](headroom.md) says what is left to gain under each."""
+`deconfounded`, acting on the likeliest latent. Interquartile means are over the tasks where all agents of the table
+have records under both protocols; that of the standard one is left out where its records are of other versions of the
+method. The last row has the versions. [Headroom](headroom.md) says what is left to gain under each."""
     parts = [_part(name, standard, by_protocol.get(name, ())) for name in PROTOCOLS if name != STANDARD]
     return "\n\n".join([head, *parts]) + "\n"
 
@@ -40,7 +41,7 @@ def _part(protocol: str, standard: index.Found, found: index.Found) -> str:
     for end, said in ends.items() if found else ():
         head = (said.removeprefix("the "), *(f"{name} ({_tier(name)})" for name in SHOWN))
         rows = [(task.name, *_cells(of["methods"], end)) for task, of in found]
-        parts.append(markdown_table(head, [*rows, *_means(standard, found, end)]))
+        parts.append(markdown_table(head, [*rows, *_means(standard, found, end), ("version", *_versions(found))]))
     tasks = published.tasks(["suite", "hard"])
     unfit = {task.name: why for task in tasks if (why := protocols.why_not(protocol, task))}
     missing = [name for task in tasks if (name := task.name) not in {*unfit, *(made.name for made, _ in found)}]
@@ -68,8 +69,19 @@ def _means(standard: index.Found, found: index.Found, end: str) -> list[tuple[st
     tasks = [task for task in runs[0] if all(set(SHOWN) <= set(of.get(task, ())) for of in runs)]
     if not tasks:
         return []
-    rows = []
+    rows, shared = [], [[(task, of) for task, of in both if task.name in tasks] for both in (found, standard)]
+    under, others = (_versions(both) for both in shared)
     for said, by_task in zip(("interquartile mean", f"the same, {STANDARD}"), runs, strict=True):
         scores = ([np.array([*by_task[task][name].values()]) for task in tasks] for name in SHOWN)
-        rows.append((said, *(two_decimals(float(statistics.iqm(of))) for of in scores)))
+        cells = [two_decimals(float(statistics.iqm(of))) for of in scores]
+        if by_task is runs[1]:
+            cells = [cell if was == now else "" for cell, was, now in zip(cells, others, under, strict=True)]
+        rows.append((said, *cells))
     return rows
+
+
+def _versions(found: index.Found) -> list[str]:
+    """Of the records of each of SHOWN."""
+    entries = [[of["methods"][name] for _, of in found if name in of["methods"]] for name in SHOWN]
+    pairs = zip(SHOWN, entries, strict=True)
+    return [of_versions(name.removesuffix("_mode"), {entry["version"] for entry in of}) for name, of in pairs]

@@ -180,6 +180,12 @@ both cores."""
     return f"## Last episode, by task\n\n{table}\n\n{text}{older * any(outdated(*of) for of in found)}"
 
 
+def of_versions(method: str, versions: set[int]) -> str:
+    """Versions of a method's records, and today's if these are of another one: `v1 (now v2)`."""
+    now = "" if versions <= {METHODS[method].version} else f" (now v{METHODS[method].version})"
+    return ", ".join(f"v{version}" for version in sorted(versions)) + now
+
+
 def summary(found: index.Found, certified: dict[str, Any]) -> str:
     """README's table: some methods, over the certified tasks where all of them were run; first and last episode."""
     first, last = (index.certified(found, certified, measure) for measure in ("first", "last"))
@@ -189,11 +195,9 @@ def summary(found: index.Found, certified: dict[str, Any]) -> str:
         runs = ({task: np.array([*of[task][name].values()]) for task in tasks} for of in (first, last))
         figures = [index.as_json(statistics.over_tasks(statistics.iqm, of)) for of in runs]
         versions = {results["methods"][name]["version"] for task, results in found if task.name in tasks}
-        now = "" if versions <= {METHODS[name].version} else f" (now v{METHODS[name].version})"
         link = f"[{name}](deconf/methods/{registry.METHODS[name].partition(':')[0]}.py)"
         rank[link] = figures[1]["value"] if figures[1] else 0.0
-        made_of = ", ".join(f"v{version}" for version in sorted(versions)) + now
-        rows.append((link, what, METHODS[name].tier, *map(with_interval, figures), made_of))
+        rows.append((link, what, METHODS[name].tier, *map(with_interval, figures), of_versions(name, versions)))
     rows.sort(key=lambda row: -rank[row[0]])
     table = markdown_table(("method", "what it is", "tier", "first episode", "last episode", "version"), rows)
     return f"Interquartile means over {len(tasks)} tasks, and 95% intervals:\n\n{table}"

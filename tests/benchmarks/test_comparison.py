@@ -179,6 +179,14 @@ class TestScores:
         assert scoring.interval([0.311, 0.422], 3) == "0.31 to 0.42 (75%)"
         assert scoring.interval(None, 1) == "-"
 
+    def test_intervals_of_many_values(self) -> None:
+        """Of a normal: 1.96 standard errors to each side, to a tenth; in memory that does not grow with them."""
+        values = np.random.default_rng(0).standard_normal(scoring.MANY * 3)
+        ends = scoring.bootstrap(values)
+        assert ends is not None
+        assert np.ptp(ends) == pytest.approx(2 * 1.96 * values.std() / len(values) ** 0.5, rel=0.1)
+        assert scoring.coverage(len(values)) == pytest.approx(0.95)
+
     def test_a_table_fits_into_the_terminal(self, monkeypatch: pytest.MonkeyPatch) -> None:
         head, rows = ("method", "data", "last"), [("one", "d" * 70, "0.10"), ("two", "d", "0.20")]
         monkeypatch.setenv("COLUMNS", "80")

@@ -49,6 +49,14 @@ def test_share_of_the_preset(share: int) -> None:
     assert less.expert_trials == whole.expert_trials
 
 
+def test_two_programs_add_to_a_file(tmp_path: Path) -> None:
+    """Neither loses a point of the other; a point made again takes the place of the one before."""
+    file = tmp_path / "exploration.json"
+    for task, last in (("curling", 0.5), ("windy_drone", 0.6), ("curling", 0.7)):
+        points = exploration.added(file, point(task, "rma", 4, [last]))
+    assert {key[0]: of["last"] for key, of in points.items()} == {"curling": [0.7], "windy_drone": [0.6]}
+
+
 def test_table(points: list[dict[str, Any]]) -> None:
     """First and last score, a mean over seeds, of each share, and nothing where it was not run."""
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in exploration.table(points).splitlines()[2:]]

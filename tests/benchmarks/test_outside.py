@@ -638,6 +638,17 @@ class TestSaved:
                     again = run_trials(env, agent, expected.shape[1], stream(EVALUATION, seed)).returns
                     np.testing.assert_array_equal(again, expected)
 
+    def test_no_agent_of_former_results_stays(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Where that of the new ones cannot be kept."""
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        (tmp_path / "jobs").mkdir()
+        job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), tmp_path / "jobs")
+        job.run()
+        assert (tmp_path / "agents" / "blind_bc-0").is_dir()
+        monkeypatch.setattr(LearnedAgent, "of_seed", lambda *_: 1 / 0)
+        assert "its agent is not kept" in job.run()
+        assert not (tmp_path / "agents" / "blind_bc-0").exists()
+
     @pytest.mark.slow
     @pytest.mark.parametrize("task", ["bandit", CONTROL])
     def test_in_another_process(self, task: str, tmp_path: Path) -> None:

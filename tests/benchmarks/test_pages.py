@@ -324,7 +324,7 @@ class TestProtocols:
 
     def test_page(self) -> None:
         """The scores of both episodes, each with its own interval; what is missing, and what cannot be."""
-        mine = {**self.ALL, "dagger": scored("dagger", 0.25, 0.5)}
+        mine = {**self.ALL, "dagger": {**scored("dagger", 0.25, 0.5), "version": 7}}
         dagger_alone = {name: mine[name] for name in ("random", "expert", "dagger")}
         standard = [(envs.get(name), {"methods": self.ALL}) for name in ("curling", "icy_road")]
         under = [(envs.get("curling"), {"methods": mine}), (envs.get("icy_road"), {"methods": dagger_alone})]
@@ -342,7 +342,8 @@ class TestProtocols:
         assert cells(last, "curling")[1] == "0.75 (0.65 to 0.85)"
         assert "| icy_road |  |  |  | 0.50 (0.40 to 0.60) |" in last
         means = [cells(last, row)[dagger] for row in ("interquartile mean", "the same, standard")]
-        assert means == ["0.50", "0.75"]  # over curling alone, where both have all
+        assert means == ["0.50", ""]  # over curling alone, where both have all; records of another version of dagger
+        assert [cells(last, "the same, standard")[1], cells(last, "version")[dagger]] == ["0.75", "v7 (now v2)"]
         missing = last.partition("Not yet made: ")[2].partition(".")[0].split(", ")
         assert "weak_thruster" in missing
         assert not {"curling", "icy_road", "bandit"} & {*missing}

@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import aggregation, comparison, records
 from deconfounded.benchmarks.studies import table
-from deconfounded.envs.streams import Array
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.rollout import RandomAgent
 from tests import toys
 from tests.tools import tiny_preset
@@ -48,6 +48,21 @@ def test_scarce_amounts() -> None:
     assert protocols.amounts("once", plain) == plain
 
 
+def test_scarce_is_scarce_for_every_method() -> None:
+    """Demonstrations are not drawn anew; and a method that says itself how much it explores is refused."""
+    bandit = preset("paper", envs.get("bandit"), "cpu")
+    assert bandit.fresh
+    assert protocols.amounts("scarce", bandit).fresh == 0
+    with pytest.raises(envs.InputError, match="--protocol scarce is not for gail: its own settings say how much"):
+        protocols.check_methods("scarce", ["dagger", "gail"])
+    protocols.check_methods("once", ["dagger", "gail"])
+
+
+class OwnThetas(toys.Push):
+    def sample_theta(self, rng: Streams) -> Array:
+        return super().sample_theta(rng) ** 3
+
+
 def test_unseen_thetas() -> None:
     """All that training sees is of the middle half, all that is scored of the rest, on both sides."""
     made = context(PUSH, "unseen", expert_trials=32, explore_trials=16, query_trials=16, eval_trials=32)
@@ -71,6 +86,8 @@ def test_unseen_thetas() -> None:
 def test_tasks_without_unseen_thetas(name: str, says: str) -> None:
     with pytest.raises(envs.InputError, match=f"--protocol unseen is not for {name}: .*{says}"):
         protocols.applied("unseen", envs.get(name))
+    with pytest.raises(envs.InputError, match="it draws theta by its own sample_theta"):
+        protocols.applied("unseen", OwnThetas())
     assert [task.name for task in table.fitting("unseen", [envs.get(name), PUSH])] == ["push"]
     with pytest.raises(envs.InputError, match="protocol 'onec' is unknown; did you mean 'once'"):
         protocols.applied("onec", envs.get(name))

@@ -279,6 +279,27 @@ class TestRecords:
         assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two, {**one, "cpu_s": 9.0}]
         assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
 
+    @pytest.mark.parametrize("kind", ["task", "method"])
+    def test_texts_from_outside_are_never_mixed(self, job: BenchmarkJob, tmp_path: Path, kind: str) -> None:
+        """An edited task supersedes all records of before; an edited method, those of its own."""
+        one, two = ({**record, "outside": {kind: "a" * 64}} for record in kept(job))
+        other = {**one, "method": "naive_rnn", "outside": {"task": "a" * 64} if kind == "task" else {}}
+        records.write(tmp_path, [one, two, other])
+        edited = {**two, "outside": {kind: "b" * 64}}
+        records.write(tmp_path, [edited])
+        assert records.read(tmp_path / "bandit.jsonl") == ([edited] if kind == "task" else [other, edited])
+        superseded = records.read(tmp_path / "superseded" / "bandit.jsonl")
+        assert superseded == ([two, one, other] if kind == "task" else [two, one])
+        says = "of two texts of its file" if kind == "task" else "of two versions of blind_bc"
+        with pytest.raises(envs.InputError, match=says):
+            aggregation.gather([edited, one])
+
+    def test_an_expert_that_is_no_better_than_random(self, job: BenchmarkJob) -> None:
+        record = {**kept(job)[0], "expert": "mine"}
+        beside = [{**record, "method": name, "returns": [0.5]} for name in ("random", "expert")]
+        with pytest.raises(envs.InputError, match=r"bandit: the expert returns 0\.5 an episode, random actions 0\.5;"):
+            aggregation.references(record, beside)
+
     def test_nothing_is_written_of_what_is_none(self, job: BenchmarkJob, tmp_path: Path) -> None:
         one, two = kept(job)
         records.write(tmp_path, [one])
@@ -356,7 +377,7 @@ class TestVerify:
     ) -> None:
         """A seed run again, alone in another process, under its salt, has the same bits; a record that lies, others."""
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-        small = ["eval_trials=4", "expert_trials=4", "blind_bc.updates=3"]
+        small = ["eval_trials=4", "expert_trials=4", "blind_bc.updates=3", "oracle_bc.updates=3"]
         from deconfounded.benchmarks.engine.presets import changed, preset
 
         settings = changed(preset("smoke", envs.get("bandit"), "cpu"), small)
@@ -418,6 +439,38 @@ def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.Mon
     assert set(results["methods"]) == {"random", "expert", "blind_bc"}
     for file in ("rows.csv", "report.html", "adaptation.png", "records/bandit.jsonl"):
         assert (tmp_path / file).stat().st_size > 0
+
+
+def test_jobs_of_another_text_are_left_out(job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those before the latest: of the task, or of the same method."""
+    other = replace(job, method="random", seeds=(0,))
+    other.run()
+    for made, seed, text in ((other, 0, {"method": "c"}), (job, 0, {"method": "a"}), (job, 1, {"method": "b"})):
+        data = job_files.read(made.file(seed))
+        assert data is not None
+        meta = data.pop("meta")
+        meta["identity"]["outside"], meta["spans"] = text, [[0, 1 + seed]]
+        np.savez(made.file(seed), meta=np.array(json.dumps(meta)), **data)
+    left = [(method, seed) for method, seed, _ in job_files.left_in(job.folder)]
+    assert left == [("blind_bc", 1), ("random", 0)]
+    assert "blind_bc-0.npz is left out: its task or method had another text" in capsys.readouterr().out
+
+
+def test_a_result_that_could_not_be_read_is_not_written(job: BenchmarkJob, monkeypatch: pytest.MonkeyPatch) -> None:
+    for file in job.folder.glob("*.npz"):
+        file.unlink()
+    monkeypatch.setattr(job_files, "broken", lambda data: "it holds NaN")
+    with pytest.raises(envs.InputError, match="blind_bc with seed 0 left no result that can be kept: it holds NaN"):
+        job.run()
+    assert not [*job.folder.glob("blind_bc-*.npz")]
+
+
+def test_checkpoints_of_other_methods_stay(job: BenchmarkJob) -> None:
+    for name in ("blind_bc-0", "dagger-0"):
+        (job.folder / f".{name}.pt").touch()
+    with Here() as engine:
+        scheduler.run_all([job], "cpu", "", engine)
+    assert [file.name for file in job.folder.glob(".*.pt")] == [".dagger-0.pt"]
 
 
 def test_broken_pictures_leave_the_numbers(

@@ -10,6 +10,7 @@ import pytest
 from gymnasium import spaces
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import protocols
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.deconf.learned_reference import LearnedGrid, learn
 from deconfounded.envs.batch import BatchEnv
@@ -17,7 +18,7 @@ from deconfounded.envs.blackbox import BlackBox, task_of
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, run_trials
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
 EXAMPLES = ("context_pendulum.py:ContextPendulum", "reversed_cart.py:ReversedCart")
@@ -61,6 +62,16 @@ class Sliding:
 def task_with(**parts: Any) -> BlackBox:
     """The task of Sliding with other parts."""
     return task_of(type("Sliding", (Sliding,), parts))()
+
+
+def test_a_changed_task_has_what_it_was_given() -> None:
+    """Not what the world says; protocol `once` changes the episodes."""
+    task = task_with()
+    changed = task.changed(episodes=1)
+    assert (task.episodes, changed.episodes, changed.horizon) == (2, 1, 12)
+    once = protocols.applied("once", task)
+    trials = run_trials(envs.BatchEnv(once, 2), RandomAgent(task.action_space), once.episodes, 0).trials
+    assert trials.mask.shape == (2, 1, 12)
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ class Bench:
     def measure(self, name: str) -> str:
         """Measure the mean return of each episode of an agent, and keep it; returns the last one, to print."""
         returns, versions = self.made["returns"], self.made["method_versions"]
-        if name not in returns:
+        if name not in returns or (name in METHODS and versions.get(name) != METHODS[name].version):
             agent = (AGENTS | LATER)[name](self)
             if agent is None:
                 return "none"
@@ -70,8 +70,8 @@ class Bench:
             if name in METHODS:
                 versions[name] = METHODS[name].version
             write_json(self.file, self.made)
-        if {"random", "expert", "told another"} <= returns.keys():
-            write(self.case, scores=scores(returns), **self.made)
+            if {"random", "expert", "told another"} <= returns.keys():
+                write(self.case, scores=scores(returns), **self.made)
         return f"{returns[name][-1]:.4g}"
 
 
