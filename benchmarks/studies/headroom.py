@@ -16,6 +16,8 @@ from deconfounded.envs.streams import Array
 
 EXACT = "interventional"
 NEAR = 0.03  # of the ceiling: then a task is solved
+REACHED = """**That is so now.** To compare strong methods, use the first episode, `--protocol scarce`, or the
+[hard tasks](hard.md)."""
 SHARE = 0.5  # of the tasks, solved in the last episode without queries: then the suite is to be made harder
 BEST = 5  # methods, whose spread is shown
 ENDS = {"first": "the first episode", "last": "the last episode"}
@@ -70,20 +72,21 @@ def page(found: index.Found, certified: dict[str, Any], others: Mapping[str, ind
     """docs/headroom.md; others: found under other protocols, by name."""
     head = f"""# Headroom
 
-What is left to gain, and when the suite is to be made harder. Made by `deconf publish` from the [records](records)
+What is left to gain on the tasks of the suite. Made by `deconf publish` from the [records](records)
 alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
 deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
 best method without theta in training (its tier in brackets), chosen after the fact, task by task; the *fifth* tells
 how far the five best lie apart, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
 the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief.
 
-The suite is to be made harder when {SHARE:.0%} of its tasks are solved in the last episode, without queries."""
+The rule of this suite: where {SHARE:.0%} of its tasks are solved in the last episode without queries, it no longer
+separates the best methods, and is to be made harder."""
     parts = [head, *_measured(found, certified)]
     if len(parts) > 1:
         older = any(outdated(*of) for of in found)
         note = " Some records are of older versions than today's; [results](results.md) says which." if older else ""
         solved = np.mean([one.solved for one in of_tasks(found, certified, "last", "12").values()])
-        parts[2:2] = [("**It is time.**" if solved >= SHARE else "It is not yet time, by this rule.") + note, PICTURE]
+        parts[2:2] = [(REACHED if solved >= SHARE else "That is not so yet.") + note, PICTURE]
     else:
         parts.append("No task has the records for it.")
     parts.append(deployments(found, certified))

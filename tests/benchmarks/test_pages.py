@@ -284,9 +284,9 @@ class TestHeadroom:
         text = headroom.page(published, certified, {})
         assert "- 1 of 2 tasks are solved (50%) in the last episode, of those without queries." in text
         assert "- 2 of 2 tasks are solved (100%) in the last episode, of all theta-blind methods." in text
-        assert "**It is time.**" in text
+        assert "**That is so now.** To compare strong methods, use" in text
         page = headroom.page(published[:1], certified, {"once": published[1:2]})
-        assert "It is not yet time" in page
+        assert "That is not so yet." in page
         own = page.partition("## Protocol once\n\nTrials of one episode.\n\n")[2]
         assert "- 1 of 1 tasks are solved (100%) in the last episode, of those without queries." in own
         assert "| curling |" not in own
