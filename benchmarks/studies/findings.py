@@ -52,18 +52,30 @@ def _outdated(rows: list[dict[str, Any]]) -> str:
 
 
 def validated() -> str:
-    """The table of docs/diagnose.md: what `deconf validate` measured where the truth is known."""
+    """The table of docs/diagnose_accuracy.md: what `deconf validate` measured where the truth is known."""
     rows = kept(validate.KEPT)
     parts = [f"{validate.summary(rows)}{_outdated(rows)} ({_origins(rows)})", validate.table(rows)]
     return "\n\n".join([*parts, "![predicted and measured gap](diagnose/validation.png)"])
 
 
 def foreign() -> str:
-    """The second table of docs/diagnose.md: what `deconf foreign` measured on simulators of others."""
+    """The second table of docs/diagnose_accuracy.md: what `deconf foreign` measured on simulators of others."""
     rows = kept(report.KEPT)
     if not rows:
         return "These worlds have not been measured with the present versions of methods and diagnosis."
     return f"{report.summary(rows)}{_outdated(rows)} ({_origins(rows)})\n\n{report.table(rows)}".lstrip()
+
+
+def right() -> str:
+    """The sentence of docs/diagnose.md on how often verdicts are right, of the cases of both tables."""
+    own = [(row["right"] is True, validate.unseen(row)) for row in kept(validate.KEPT)]
+    foreign = [(row["right"] is True, row["unseen"]) for row in kept(report.KEPT) if "verdict" in row]
+    parts = []
+    for cases, what in ((own, "cases on tasks of this suite"), (foreign, "worlds on simulators of others")):
+        judged = [is_right for is_right, unseen in cases if unseen]
+        shares = f"{sum(is_right for is_right, _ in cases)} of {len(cases)} {what}"
+        parts.append(f"{shares} ({sum(judged)} of the {len(judged)} by which no threshold was set)")
+    return f"Verdicts are right in {' and in '.join(parts)}: [how often the diagnosis is right](diagnose_accuracy.md)."
 
 
 def noises() -> str:

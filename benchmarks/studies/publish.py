@@ -131,7 +131,8 @@ def texts(found: index.Found) -> dict[Path, str]:
     certified = cards.certified()
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
     tables = {
-        DOCS / "diagnose.md": {"validation": findings.validated(), "foreign": findings.foreign()},
+        DOCS / "diagnose.md": {"right": findings.right()},
+        DOCS / "diagnose_accuracy.md": {"validation": findings.validated(), "foreign": findings.foreign()},
         DOCS / "baselines.md": {"fared": results.fared(found, certified), "tuning": findings.tuning()},
         DOCS / "spectrum.md": {"noises": findings.noises()},
         DOCS / "exploration.md": {"exploration": findings.explored()},

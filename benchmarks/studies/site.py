@@ -34,6 +34,7 @@ CONTENTS: dict[
     "How to": {
         **{"environments": "docs/environments.md", "own_task": "docs/own_task.md", "own_method": "docs/own_method.md"},
         **{"worlds": "docs/worlds.md", "core": "docs/core.md", "diagnose": "docs/diagnose.md"},
+        **{"diagnose_accuracy": "docs/diagnose_accuracy.md"},
         **{"deploy": "docs/deploy.md", "sharing": "docs/sharing.md"},
         **{"cluster": "docs/cluster.md", "submit": "docs/submit.md"},
     },

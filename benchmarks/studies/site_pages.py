@@ -188,7 +188,7 @@ def method_page(name: str, found: index.Found) -> str:
     parts += [f"```bash\ndeconf run --task slippery_cartpole{asked}\n```", "## Results", _scores(name, found)]
     items = [item for item in _bullets(baselines, name) if item.startswith(f"- `{name}`")]
     if behind := _behind(name, found):
-        parts += ["## Where it fails", behind, "\n".join(items)]
+        parts += ["## Strengths and failures", behind, "\n".join(items)]
     parts += ["## Amounts", _amounts(name)]
     parts += ["## Source", f"{{py:mod}}`{module.__name__}`"]
     return "\n\n".join(filter(None, parts)) + "\n"

@@ -124,7 +124,7 @@ def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     return made is not None and bool(made["verdict"] == "passed")
 
 
-def _unseen(row: dict[str, Any]) -> bool:
+def unseen(row: dict[str, Any]) -> bool:
     """Whether the thresholds were set without looking at it."""
     return hasattr(noise, row["case"])
 
@@ -132,8 +132,8 @@ def _unseen(row: dict[str, Any]) -> bool:
 def summary(rows: list[dict[str, Any]]) -> str:
     """How many are right, and Spearman's correlation of the predicted and the measured gap."""
     sentences = []
-    for what, unseen in (("by which thresholds were set", False), ("added later", True)):
-        of = [row for row in rows if _unseen(row) is unseen]
+    for what, later in (("by which thresholds were set", False), ("added later", True)):
+        of = [row for row in rows if unseen(row) is later]
         if len(of) > 2:
             share = f"{sum(row['right'] for row in of)} of {len(of)} verdicts are right"
             gaps = [(row["predicted"], row["measured"], row["right"] or row["verdict"] != "cannot tell") for row in of]
@@ -168,7 +168,7 @@ def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
     points = []
     for row in rows:
         name = row["task"].replace("_process_", " x").replace("x0_", "x.").replace("0_", ".")
-        style = "tab:red" if row["certified"] else "tab:green", "none" if _unseen(row) else "full"
+        style = "tab:red" if row["certified"] else "tab:green", "none" if unseen(row) else "full"
         points.append((name, row["predicted"], row["measured"], *style))
     gap.picture(points, file, "the diagnosis", mark)
 

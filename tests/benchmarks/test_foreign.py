@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from deconfounded.benchmarks.studies import findings, validate
 from deconfounded.benchmarks.studies.foreign import report, world
 from deconfounded.benchmarks.studies.foreign.cases import CASES, Case
 from deconfounded.benchmarks.studies.foreign.measure import scores
@@ -87,6 +88,17 @@ def test_report() -> None:
     assert lines[2].endswith("| confounded, Tier 3 | 2 of 3 | wrong |")
     assert lines[4].endswith("| cannot tell |  | cannot tell |")
     assert lines[5].endswith("|  |  |  |")
+
+
+def test_how_often_verdicts_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of all cases, and of those by which no threshold was set; what was not diagnosed does not count."""
+    own = [{"case": "bandit", "right": True}, {"case": "IcyRoadProcess2", "right": False}]
+    judged = [{"verdict": "", "unseen": True, "right": right} for right in (True, None, True)]
+    worlds = [*judged, {"verdict": "", "unseen": False, "right": False}, {"unseen": True, "right": None}]
+    monkeypatch.setattr(findings, "kept", {validate.KEPT: own, report.KEPT: worlds}.__getitem__)
+    said = findings.right()
+    assert said.startswith("Verdicts are right in 1 of 2 cases on tasks of this suite (0 of the 1 by which no")
+    assert "and in 2 of 4 worlds on simulators of others (2 of the 3 by which no" in said
 
 
 def test_report_says_of_which_version_scores_are() -> None:

@@ -1,4 +1,4 @@
-"""What `deconf foreign` found, in words and as a table of docs/diagnose.md."""
+"""What `deconf foreign` found, in words and as a table of docs/diagnose_accuracy.md."""
 
 from typing import Any
 
