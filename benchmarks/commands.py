@@ -116,8 +116,8 @@ def run(
     methods: Sequence[str],
     folder: Path,
     where: "Engine",
-) -> "tuple[Finished, dict[str, Any]]":
-    """Run what is not finished in the folder; returns all that is, and what the folder is for."""
+) -> "tuple[Finished, dict[str, Any], list[Exception]]":
+    """Run what is not finished in the folder; returns all that is, what the folder is for, and errors of jobs."""
     from deconfounded.benchmarks.engine.job_files import know_guests, prepare
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
@@ -141,8 +141,8 @@ def run(
             )
             for name in methods
         ]
-        finished, resumed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
-    return finished, {**described, "resumed": resumed}
+        finished, resumed, failed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
+    return finished, {**described, "resumed": resumed}, failed
 
 
 @contextmanager

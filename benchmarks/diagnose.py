@@ -112,7 +112,8 @@ def run(
         for log, file in zip((trials, explore), files, strict=True):
             if log is not None and file is not None:
                 log.save(file)
-        run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run)
+        if failed := run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run):
+            raise failed[0]
     found = [findings for refit in refits if (findings := refit.findings()) is not None]
     diagnosis = judge(found, None if explore is None else len(explore))
     about |= {"columns": columns, "units": asdict(trials.units), "look": [remark._asdict() for remark in remarks]}

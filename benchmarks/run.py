@@ -78,7 +78,10 @@ def main() -> None:
 
 
 def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[str], folders: dict[str, Path]) -> None:
-    """Run the methods on each task; where one fails, the others go on. Raises InputError in the end if one failed."""
+    """Run the methods on each task; where one fails, the others go on. Raises InputError in the end if one failed.
+
+    Each task has its report, if random actions and the expert, which scores need, did not fail.
+    """
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.output import run_report  # it takes seconds; bad input is refused at once
 
@@ -88,8 +91,14 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
     failed: dict[str, Exception] = {}
     with commands.engine(args.cluster, args.debug) as where:
         for task in tasks:
+            folder = folders[task.name]
             try:
-                finished, about = commands.run(BenchmarkJob, task, args, methods, folders[task.name], where)
+                finished, about, errors = commands.run(BenchmarkJob, task, args, methods, folder, where)
+                if not errors or {name for name, *_ in finished} >= set(REFERENCES):
+                    text = run_report.write(task, about, finished, folder)
+                    print(text if args.debug else f"{text} -> {folder / 'report.html'}")  # --debug keeps none
+                if errors:
+                    raise errors[0]
             except envs.InputError as error:
                 if args.debug:
                     traceback.print_exc()
@@ -97,9 +106,6 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
                     raise
                 failed[task.name] = error
                 print(f"{task.name} failed: {error}")
-                continue
-            text = run_report.write(task, about, finished, folders[task.name])
-            print(text if args.debug else f"{text} -> {folders[task.name] / 'report.html'}")  # --debug keeps none
     if failed:
         name, reason = next(iter(failed.items()))
         raise envs.InputError(f"{len(failed)} of {len(tasks)} tasks failed; {name}: {reason}")

@@ -56,7 +56,9 @@ def rerun(record: records.Record, task: envs.Task, method: str, expert: str | No
         what, of = (task.reference, settings, method, (record["seed"],)), (expert, record["salt"], guest)
         job = BenchmarkJob(*what, folder, *of, salts=salts, protocol=protocol)
         with Local() as engine:
-            finished, _ = run_all([job], device, f"{task.name}, {method}", engine)
+            finished, _, failed = run_all([job], device, f"{task.name}, {method}", engine)
+        if failed:
+            raise failed[0]
         for again in records.of_run(finished, record["preset"], record["set"], task.episodes):
             if again["deployment"] == record["deployment"]:
                 return again

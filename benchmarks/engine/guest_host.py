@@ -139,6 +139,7 @@ class Guest(Agent):
         return said[1]
 
     def begin(self, n: int) -> None:
+        self.n = n
         self._do("begin", n)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
@@ -165,9 +166,12 @@ class Guest(Agent):
 
     def features(self) -> NDArray[np.float32] | None:
         features = self._do("features")
-        fits = isinstance(features, np.ndarray) and features.ndim == 2 and bool(np.isfinite(features).all())
-        if features is not None and not fits:
-            raise envs.InputError(f"method {self.name}: features must be None, or finite [N, F]")
+        shape: tuple[int, ...] = getattr(features, "shape", ())
+        fits = len(shape) == 2 and shape[0] == self.n and shape[1] > 0
+        if features is not None and not (fits and np.isfinite(features).all()):
+            what = "NaN or infinity" if fits else f"shape {shape}"
+            right = f"None, or finite, of shape ({self.n}, F), F from 1 up"
+            raise envs.InputError(f"method {self.name} gave features of {what}; they must be {right}")
         return features
 
     def keep(self, folder: Path, about: dict[str, Any]) -> str:

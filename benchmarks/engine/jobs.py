@@ -24,6 +24,7 @@ from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.envs.support.files import write_atomically
+from deconfounded.envs.support.outside import is_outside
 from deconfounded.experts.rollout import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
@@ -56,6 +57,11 @@ class Job(ABC):
         """The data and environments of its seeds; salt: of its training, whose data is then kept nowhere."""
         folder = None if salt else self.folder
         return Context(envs.get(self.task), self.preset, self.seeds, monitor, folder, self.expert, salt, self.protocol)
+
+    @property
+    def from_outside(self) -> list[str]:
+        """The references of its task and its method, where these are from outside."""
+        return [name for name in (self.task, self.about.reference) if is_outside(name)]
 
     @abstractmethod
     def run(self) -> str:

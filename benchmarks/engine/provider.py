@@ -71,6 +71,9 @@ class Provider:
                 return context.query(agent, self.rngs, _number(*what))
             case "environments":
                 seed, n = what
+                if not isinstance(seed, int) or not 0 <= seed < len(self.rngs):
+                    right = f"it has {len(self.rngs)}, numbered from 0"
+                    raise envs.InputError(f"it asked for environments of seed {seed!r}; {right}")
                 self._vectors.append(Vector(context, seed, n, int(self.rngs[seed].integers(2**31))))
                 return len(self._vectors) - 1
             case "reset":

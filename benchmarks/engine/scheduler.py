@@ -1,6 +1,7 @@
 """Jobs side by side on an engine: those whose files are missing or stale, longest first."""
 
 import re
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.job_files import Finished, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
+from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import check_folder, write_atomically
 
@@ -34,11 +36,23 @@ Some = TypeVar("Some", bound=Work)
 
 
 def run_job(job: Work) -> str:
-    """The job's line. Raises InputError where code from outside raises SystemExit, which would end the process."""
+    """The job's line. Raises InputError for SystemExit, which would end the process.
+
+    Of a task or method from outside, any other error is an InputError too, with the traceback as its note.
+    """
     try:
         return job.run()
+    except InputError:
+        raise
     except SystemExit as error:
         raise InputError(f"the job was ended by {error_line(error)}") from None
+    except Exception as error:
+        if not (theirs := job.from_outside if isinstance(job, Job) else []):
+            raise
+        folders = [file.parent for name in theirs if (file := outside.file(name))]
+        failure = InputError(f"{' and '.join(theirs)}: {error_line(error, *folders)}")
+        failure.add_note("".join(traceback.format_exception(error)))
+        raise failure from None
 
 
 Run = Callable[[list[Some], Callable[[int], None], Callable[[Some, str | Exception], None]], None]
@@ -67,8 +81,8 @@ class Engine(ABC):
         """
 
 
-def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tuple[Finished, int]:
-    """Run what has no file yet; returns all that is in the folder now, and how many files were there before.
+def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tuple[Finished, int, list[Exception]]:
+    """Run what has no file yet; returns all that is in the folder now, how many files were there before, and failures.
 
     every: a job for each method, with all seeds, in one folder.
     """
@@ -92,14 +106,14 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         for seed, job in sorted(imitated.items())
         if not job.context().has_demonstrations(seed)
     ]
-    run_jobs(first, label, engine.run)
-    run_jobs(parts, label, engine.run, folder.parent / "errors")
-    for job in every:
+    failed = [error for jobs in (first, parts) for error in run_jobs(jobs, label, engine.run, folder.parent / "errors")]
+    for job in () if failed else every:
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
     done = written(every[0], folder)
     finished = [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
-    return finished, len(finished) - sum(map(len, left))
+    made = {(job.method, seed) for job, missing in zip(every, left, strict=True) for seed in missing}
+    return finished, sum((method, seed) not in made for method, seed, _ in finished), failed
 
 
 def written(like: Job, folder: Path) -> list[Job]:
@@ -118,13 +132,13 @@ def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]
     return [tuple(part.tolist()) for part in np.array_split(left, n)] if left else []
 
 
-def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None = None) -> None:
-    """Run jobs side by side, longest first. Raises InputError in the end if one failed: a guest, say.
+def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None = None) -> list[Exception]:
+    """Run jobs side by side, longest first; returns the errors of those that failed.
 
-    errors: a folder that keeps the tracebacks of methods from outside that failed, until they do not.
+    errors: a folder that keeps the tracebacks of code from outside that failed, until it does not.
     """
     if not jobs:
-        return
+        return []
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
     def say(job: Some, outcome: str | Exception) -> None:
@@ -142,8 +156,7 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
 
     run(jobs, progress.update, say)
     progress.close()
-    if failed:
-        raise failed[0]
+    return failed
 
 
 def listed(seeds: tuple[int, ...]) -> str:

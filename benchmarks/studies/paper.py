@@ -257,5 +257,7 @@ def main() -> None:
     task = envs.get("bandit")
     folder = args.out or Path("results") / f"paper-{args.preset}"
     with commands.engine(args.cluster) as where:
-        finished, about = commands.run(FigureJob, task, args, methods, folder, where)
+        finished, about, failed = commands.run(FigureJob, task, args, methods, folder, where)
+    if failed:
+        raise failed[0]
     print(write(task, about, finished, exact(task), folder))

@@ -52,7 +52,9 @@ def run(
     with commands.locked(folder), commands.engine(cluster) as engine:
         about = commands.about(BenchmarkJob, task, preset, base or settings, changes, expert, "", protocol)
         prepare(folder, about, resume=True)
-        finished, _ = run_all(jobs, settings.device, label, engine)
+        finished, _, failed = run_all(jobs, settings.device, label, engine)
+    if failed:
+        raise failed[0]
     asked = [entry for entry in finished if entry[0] in wanted and entry[1] in own]
     return records.of_run(asked, preset, changes, task.episodes)
 

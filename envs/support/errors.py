@@ -14,10 +14,10 @@ class InputError(ValueError):
         return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
-def error_line(error: BaseException, folder: Path | None = None) -> str:
+def error_line(error: BaseException, *folders: Path | None) -> str:
     """An error in one line: its message, its type and its place in the source; of an InputError the message alone.
 
-    folder: of code from outside. The place is the innermost line of a file in it, if there is one.
+    folders: of code from outside. The place is the innermost line of a file in them, if there is one.
     """
     text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
     if isinstance(error, InputError):
@@ -25,7 +25,7 @@ def error_line(error: BaseException, folder: Path | None = None) -> str:
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if folder and _is_in(Path(frame.filename), folder)]
+    own = [frame for frame in frames if any(folder and _is_in(Path(frame.filename), folder) for folder in folders)]
     frame = (own or frames)[-1]
     return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
 

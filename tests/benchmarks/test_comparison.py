@@ -77,7 +77,7 @@ class TestSeveralTasks:
 
     @pytest.mark.slow
     def test_a_run_goes_on_behind_a_failure(self, mine: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
-        """Both tasks are tried; the line is that of the user's file, and the traceback is kept."""
+        """Both tasks are tried, and have reports of the rest; the line is of the user's file; the traceback is kept."""
         monkeypatch.chdir(mine.parent)
         small = ["--preset", "smoke", "--set", "eval_trials=4", "expert_trials=4"]
         command = ["deconf", "run", "--tasks", "bandit", "weak_thruster", "--methods", "mine.py:bad", *small]
@@ -90,6 +90,7 @@ class TestSeveralTasks:
             r"error: 2 of 2 tasks failed; bandit: method mine_bad: .*\(RuntimeError, mine.py:28\)", said.err
         )
         for task in ("bandit", "weak_thruster"):
+            assert (mine.parent / "results" / f"{task}-smoke" / "report.html").is_file()
             trace = (mine.parent / "results" / f"{task}-smoke" / "errors" / "mine_bad-0.txt").read_text()
             assert trace.startswith("Traceback")
             assert "torch.zeros(3) @ torch.zeros(4)" in trace
@@ -125,8 +126,8 @@ def test_tracebacks_are_kept_until_it_works(tmp_path: Path, monkeypatch: pytest.
     job = BenchmarkJob("bandit", tiny_preset(), "random", (0,), tmp_path / "jobs")
     failure = InputError("no")
     failure.add_note("Traceback ...")
-    with pytest.raises(InputError):
-        scheduler.run_jobs([job], "one", lambda jobs, tick, say: say(jobs[0], failure), tmp_path / "errors")
+    run: Callable[..., None] = lambda jobs, tick, say: say(jobs[0], failure)  # noqa: E731
+    assert scheduler.run_jobs([job], "one", run, tmp_path / "errors") == [failure]
     assert (tmp_path / "errors" / "random-0.txt").read_text() == "Traceback ..."
     scheduler.run_jobs([job], "one", lambda jobs, tick, say: say(jobs[0], "well"), tmp_path / "errors")
     assert not list((tmp_path / "errors").iterdir())

@@ -14,7 +14,8 @@ from deconfounded.benchmarks import certify
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, progress, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
-from deconfounded.benchmarks.engine.local import Local
+from deconfounded.benchmarks.engine.local import Here, Local
+from deconfounded.envs import registry
 from tests.tools import tiny_preset
 
 
@@ -74,7 +75,7 @@ def test_a_checkpoint_is_of_its_own_job_alone(tmp_path: Path, monkeypatch: pytes
 
 
 def test_a_failed_job_is_an_error_when_others_are_done(tmp_path: Path) -> None:
-    """They are told of, and then it is raised."""
+    """All are told of."""
     said: list[str] = []
     made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in ("random", "expert")]
 
@@ -83,6 +84,55 @@ def test_a_failed_job_is_an_error_when_others_are_done(tmp_path: Path) -> None:
             say(job, became)
             said.append(job.method)
 
-    with pytest.raises(envs.InputError, match="it broke"):
-        scheduler.run_jobs(made, "two", run)
+    assert [str(error) for error in scheduler.run_jobs(made, "two", run)] == ["it broke"]
     assert said == ["random", "expert"]
+
+
+class Told(Here):
+    """As in processes of their own: what fails is told, and the others go on."""
+
+    def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
+        for job in jobs:
+            try:
+                say(job, scheduler.run_job(job))
+            except envs.InputError as error:
+                say(job, error)
+
+
+RARE = """
+from tests.toys import Push
+
+class Rare(Push):
+    name = "rare"
+
+    def reward(self, state, action, next_state, theta):
+        return {4: super().reward}[len(theta)](state, action, next_state, theta)
+
+    def terminated(self, state):
+        return state[:, 0] > 1e9
+"""
+
+
+def test_an_error_of_a_task_from_outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is a line that names the task, with the traceback aside; jobs that do not meet it are done all the same."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    (tmp_path / "own.py").write_text(RARE)
+    (tmp_path / "jobs").mkdir()
+    reference, preset = f"{tmp_path}/own.py:Rare", replace(tiny_preset(), expert_trials=3)
+    made = [
+        BenchmarkJob(envs.get(reference).reference, preset, name, (0,), tmp_path / "jobs", "tests.toys:control")
+        for name in ("blind_bc", "random")
+    ]
+    finished, before, failed = scheduler.run_all(made, "cpu", "rare", Told())
+    assert [method for method, *_ in finished] == ["random"]
+    assert before == 0
+    assert [str(error) for error in failed] == [f"{reference}: 3 (KeyError, own.py:8)"] * 2
+    for name in ("demonstrations", "blind_bc"):
+        assert (tmp_path / "errors" / f"{name}-0.txt").read_text().startswith("Traceback")
+
+
+def test_an_error_of_ours_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BenchmarkJob, "run", lambda self: {}["gone"])
+    with pytest.raises(KeyError):
+        scheduler.run_job(BenchmarkJob("bandit", tiny_preset(), "random", (0,), tmp_path))

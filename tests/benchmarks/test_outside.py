@@ -319,7 +319,12 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
         ("    def act(self, obs): return np.full((len(obs), 1), np.nan)", "actions of NaN or infinity"),
         ("    def act(self, obs): return [[1], [1, 2]]", r"actions of shape \(0,\)|inhomogeneous|what it sent|it gave"),
         ("    def act(self, obs): return Thief()", "it gave Thief; it must be numbers, or arrays of them"),
-        ("    def features(self): return np.full((4, 2), np.nan)", "features must be None, or finite"),
+        ("    def features(self): return np.full((4, 2), np.nan)", "gave features of NaN or infinity"),
+        (
+            "    def features(self): return np.zeros((1, 2))",
+            r"of shape \(1, 2\); .* of shape \(4, F\), F from 1 up",
+        ),
+        ("    def features(self): return np.zeros((4, 0))", r"gave features of shape \(4, 0\)"),
         ("    def begin(self, n): raise ValueError('no')", r"no \(ValueError, mine.py:\d+\)"),
     ],
 )
@@ -596,6 +601,14 @@ def test_ours_get_what_they_declare() -> None:
                 provider(*asked)
     trials, theta = Provider(context, ["exploration", "theta"], context.rngs)("exploration with theta", None)
     assert len(trials) == len(theta) == 4
+
+
+@pytest.mark.parametrize("seed", [1, -1, "a", 0.0])
+def test_environments_of_no_seed(seed: Any) -> None:
+    """Nor are they made, as their use would not be counted."""
+    provider = Provider(Context(envs.get(CONTROL), tiny_preset(), [7]), ["exploration"], [np.random.default_rng(0)])
+    with pytest.raises(envs.InputError, match=f"asked for environments of seed {seed!r}; it has 1, numbered from 0"):
+        provider("environments", seed, 4)
 
 
 class TestSaved:
