@@ -1,7 +1,8 @@
 """A method's declaration: the data that it uses, its version, and its configuration by kind of task and preset."""
 
+import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
@@ -90,20 +91,50 @@ Fit = TypeVar("Fit", bound="Callable[[Given], Agent]")
 def uses(*kinds: str, **declared: Any) -> Callable[[Fit], Fit]:
     """Declare a method: `@uses("demonstrations")` above `def fit(given: Given) -> Agent`.
 
-    kinds: of USES. declared: further fields of Method, which becomes `fit.method`. Raises InputError for others.
+    kinds: of USES. declared: further fields of Method, which becomes `fit.method`. Raises InputError for others, and
+    for values that no run could use.
     """
     check_uses(kinds)
     try:
         method = Method(kinds, **declared)
     except TypeError:
-        fields = ", ".join(name for name in Method.__dataclass_fields__ if name != "uses")
-        raise InputError(f"a method declares {', '.join(declared)}; it may declare {fields}") from None
+        may = ", ".join(name for name in Method.__dataclass_fields__ if name != "uses")
+        raise InputError(f"a method declares {', '.join(declared)}; it may declare {may}") from None
+    check_values(method)
 
     def declare(fit: Fit) -> Fit:
         fit.method = method  # type: ignore[attr-defined]
         return fit
 
     return declare
+
+
+def check_values(method: Method) -> None:
+    """Raises InputError for a version, cost or configuration that no run could use."""
+    for name in ("version", "cost"):
+        if type(value := getattr(method, name)) is not int or value < 1:
+            raise InputError(f"a method declares {name}={value!r}; it must be a whole number from 1 up")
+    for name in ("on_control", "on_bandit", "paper"):
+        if (config := getattr(method, name)) is None:
+            continue
+        if not is_dataclass(config) or type(config) is not type(method.on_control) or isinstance(config, type):
+            right = "an object of a dataclass, and all of the same"
+            raise InputError(f"a method declares {name}={config!r}; configurations must be {right}")
+        _check_json(name, config)
+    for name, config in (("smoke", method.on_control), ("smoke_bandit", method.on_bandit or method.on_control)):
+        changes, known = getattr(method, name), [] if config is None else [each.name for each in fields(config)]
+        if not isinstance(changes, Mapping) or not set(changes) <= set(known):
+            right = f"a dictionary of fields of its configuration, {', '.join(known) or 'which has none'}"
+            raise InputError(f"a method declares {name}={changes!r}; it must be {right}")
+        _check_json(name, changes)
+
+
+def _check_json(name: str, given: Any) -> None:
+    try:
+        json.dumps(asdict(given) if is_dataclass(given) else dict(given))  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        right = f"numbers, texts, lists and the like, as json has them ({error})"
+        raise InputError(f"a method declares {name}={given!r}; its values must be {right}") from None
 
 
 def check_uses(kinds: Iterable[str]) -> None:

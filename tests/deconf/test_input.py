@@ -1,6 +1,7 @@
 """What learned agents, configurations, roll-outs and exact policies refuse: one line says what would be right."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded, deconfounded_mean
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
@@ -81,6 +83,35 @@ def test_steps_that_an_agent_refuses(agents: dict[str, Agent], task: str, change
 def test_settings_that_do_not_fit(config: Any, values: Any, says: str) -> None:
     with pytest.raises(envs.InputError, match=says):
         config(**values)
+
+
+@dataclass(frozen=True)
+class Plain:
+    updates: int = 3
+    folder: Any = None
+
+
+@pytest.mark.parametrize(
+    ("declared", "says"),
+    [
+        ({"on_control": {"updates": 3}}, r"on_control={'updates': 3}; configurations must be an object of a dataclass"),
+        ({"on_control": Plain}, "on_control=<class .*; configurations must be an object"),
+        ({"on_control": Plain(), "on_bandit": FlowConfig()}, "on_bandit=FlowConfig.*, and all of the same"),
+        ({"on_bandit": Plain()}, "on_bandit=Plain.*, and all of the same"),
+        ({"on_control": Plain(folder=Path())}, "on_control=Plain.*, as json has them .*PosixPath is not JSON"),
+        ({"on_control": Plain(), "smoke": {"nope": 1}}, "smoke={'nope': 1}; .* of its configuration, updates, folder"),
+        ({"on_control": Plain(), "smoke": {"folder": Path()}}, "smoke={.*, as json has them"),
+        ({"on_control": Plain(), "smoke_bandit": 5}, "smoke_bandit=5; it must be a dictionary"),
+        ({"smoke": {"updates": 1}}, "smoke={'updates': 1}; .* fields of its configuration, which has none"),
+        ({"cost": "a"}, "cost='a'; it must be a whole number from 1 up"),
+        ({"version": "x"}, "version='x'; it must be a whole number from 1 up"),
+        ({"version": 0}, "version=0; it must be"),
+        ({"cost": True}, "cost=True; it must be"),
+    ],
+)
+def test_declarations_that_no_run_could_use(declared: dict[str, Any], says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"^a method declares {says}"):
+        uses("demonstrations", **declared)
 
 
 def test_shares_of_one() -> None:
