@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from deconfounded.envs import blackbox
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
+from deconfounded.envs.latent import Latent
 from deconfounded.envs.support import outside
 from deconfounded.envs.task import InputError, Task
 
@@ -29,6 +30,7 @@ def register(cls: type[Task]) -> type[Task]:
     for part in ("latents", "horizon", "action_space", "observation"):
         if not hasattr(cls, part):
             raise InputError(f"task {name} of {where} does not state its {part}")
+    _check_latents(cls())
     if TASKS.get(name, cls) is not cls:
         raise InputError(f"task name {name!r} of {where} is taken by {_where(TASKS[name])}; give it another name")
     if "reference" not in vars(cls):
@@ -42,6 +44,15 @@ def register(cls: type[Task]) -> type[Task]:
     one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}
     gymnasium.register(gym_id, one, max_episode_steps=steps, vector_entry_point=many, kwargs=arguments)
     return cls
+
+
+def _check_latents(task: Task) -> None:
+    given = task.latents
+    if not isinstance(given, tuple) or not given or not all(isinstance(latent, Latent) for latent in given):
+        raise InputError(f"latents of {task.name} were {given!r}; they must be a tuple of Latent, at least one")
+    names = [str(latent.name) for latent in given]
+    if len(set(names)) < len(names):
+        raise InputError(f"latents of {task.name} were called {', '.join(names)}; each must have a name of its own")
 
 
 def _parts(task: Task) -> tuple[Any, ...]:

@@ -5,7 +5,7 @@ A record names its protocol unless that is STANDARD. Versions of seeding and rol
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from deconfounded import envs
 from deconfounded.envs.streams import Array
@@ -72,8 +72,8 @@ def amounts(protocol: str, preset: "Preset") -> "Preset":
 def applied(protocol: str, task: envs.Task, evaluation: bool = False) -> envs.Task:
     """The task under a protocol: of training, or of evaluation. It never changes what p(theta) is to exact policies."""
     check(protocol, task)
-    every: dict[str, dict[str, Any]] = {
-        "unseen": {"quantile": edges if evaluation else middle},
-        "once": {"episodes": 1, "latents": tuple(replace(latent, drift=0.0) for latent in task.latents)},
-    }
-    return task.changed(**every[protocol]) if protocol in every else task
+    if protocol == "unseen":
+        return task.changed(quantile=edges if evaluation else middle)
+    if protocol == "once":
+        return task.changed(episodes=1, latents=tuple(replace(latent, drift=0.0) for latent in task.latents))
+    return task

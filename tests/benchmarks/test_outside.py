@@ -184,6 +184,9 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert result["return_expert"] > 2 * result["return_random"]
 
 
+TOY = "from tests.toys import Push\nclass Task(Push):\n    name = 'mine'\n"
+
+
 @pytest.mark.parametrize(
     ("text", "name", "says"),
     [
@@ -210,6 +213,14 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
             "Task",
             "'tilted_cartpole' of .* is taken by .*; give it another name",
         ),
+        (
+            f"{TOY}    latents = ('force',)",
+            "Task",
+            r"latents of mine were \('force',\); they must be a tuple of Latent",
+        ),
+        (f"{TOY}    latents = ()", "Task", r"latents of mine were \(\); they must be a tuple of Latent"),
+        (f"{TOY}    latents = list(Push.latents)", "Task", r"latents of mine were \[Latent.*; they must be a tuple"),
+        (f"{TOY}    latents = Push.latents * 2", "Task", "latents of mine were called force, force; each must"),
     ],
 )
 def test_a_bad_file_is_one_line(tmp_path: Path, text: str, name: str, says: str) -> None:

@@ -101,6 +101,12 @@ def test_trials_of_one_episode() -> None:
     assert envs.get("rolling_deck").episodes == protocols.applied("scarce", envs.get("rolling_deck")).episodes == 5
 
 
+def test_no_other_protocol_is_asked_of_a_task() -> None:
+    """Not even what would not do under it."""
+    odd = PUSH.changed(latents=("force",))
+    assert protocols.applied("standard", odd) is odd
+
+
 def test_a_job_s_record_names_its_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And that of the standard protocol is as it was."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
