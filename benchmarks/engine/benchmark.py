@@ -46,8 +46,14 @@ class Recorder(AgentWrapper):
         self.clip: dict[str, list[Any]] = {}
 
     def note(self) -> None:
-        """Keep what the agent knows now that an episode is over."""
-        if (features := self.agent.features()) is not None:
+        """Keep what the agent knows now that an episode is over. Raises InputError if only some episodes have that."""
+        features = self.agent.features()
+        if self.episode > 1 and (features is None) == bool(self.features_after):
+            now, before = ("None", "an array") if features is None else ("an array", "None")
+            who = f"method {self.agent.name}" if isinstance(self.agent, Guest) else type(self.agent).__name__
+            what = f"features of {who} were {now} after episode {self.episode}, and {before} before"
+            raise envs.InputError(f"{what}; they must be an array after each episode, or None after each")
+        if features is not None:
             self.features_after.append(features.copy())
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
