@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-from deconfounded.envs import InputError, Task
+from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS, Array, Streams
@@ -151,8 +151,8 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         expert = CallableExpert(task, outside.find("expert", source), source)
         if not callable(expert.call):
             raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")
-        lat = np.tile([latent.grid(1)[0] for latent in task.latents], (2, 1))
-        expert.mean(np.zeros((2, len(task.observation)), np.float32), lat)
+        env = BatchEnv(task, 2)
+        expert.mean(env.reset(0), env.theta)  # not of zeros, which it may never see
         return expert
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")

@@ -263,6 +263,13 @@ def test_experts_get_copies_seed_by_seed(tmp_path: Path) -> None:
     assert expert.call.__globals__["seen"][-2:] == [3, 3]  # type: ignore[attr-defined]
 
 
+def test_an_expert_need_not_know_zeros(tmp_path: Path) -> None:
+    """It is tried where an episode starts: sines and cosines of one angle, say, are never both 0."""
+    code = "import numpy as np\ndef control(obs, theta):\n    unit = obs / np.square(obs).sum(-1, keepdims=True)\n"
+    (tmp_path / "mine.py").write_text(f"{code}    return unit[:, :1]\n")
+    policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
+
+
 @pytest.mark.parametrize(
     ("code", "says"),
     [
