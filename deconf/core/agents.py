@@ -99,8 +99,6 @@ class LearnedAgent(Agent):
             raise InputError(
                 f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
             )
-        if not np.isfinite(obs).all():
-            raise InputError("observations held NaN or infinity; a memory would never lose it")
         return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)  # a copy
 
     @abstractmethod
@@ -117,11 +115,12 @@ class LearnedAgent(Agent):
                 f"actions and alive had shapes {shapes[0]} and {shapes[1]}; they must be"
                 f" ({len(obs)}, {signature.action}) and ({len(obs)},), a row a trial"
             )
-        valid = (action >= 0) & (action < signature.actions) if signature.actions else np.isfinite(action)
-        if not valid.all():
-            right = f"from 0 to {signature.actions - 1}" if signature.actions else "finite"
-            raise InputError(f"actions held {np.asarray(action)[~valid][0]:g}; they must be {right}")
-        self.remember(Batch.step(self._tensor(obs), action, self._tensor(next_obs), alive))
+        before, after = self._tensor(obs), self._tensor(next_obs)
+        if not np.isfinite(np.concatenate([obs, action, next_obs], 1)).all():
+            raise InputError("observations or actions held NaN or infinity, which a memory would never lose")
+        if signature.actions and (action.min() < 0 or action.max() >= signature.actions):
+            raise InputError(f"an action was none of 0 to {signature.actions - 1}")
+        self.remember(Batch.step(before, action, after, alive))
 
     def remember(self, step: Batch) -> None:
         """Update the memory with a transition of each trial; nothing, for agents without memory."""

@@ -49,13 +49,13 @@ def step(task: str, **changed: Any) -> list[Any]:
 @pytest.mark.parametrize(
     ("task", "changed", "says"),
     [
-        (CONTROL, {"next_obs": np.full((2, 5), np.nan, np.float32)}, "observations held NaN"),
+        (CONTROL, {"next_obs": np.full((2, 5), np.nan, np.float32)}, "observations or actions held NaN or infinity"),
         (CONTROL, {"next_obs": np.zeros((2, 4), np.float32)}, r"had shape \(2, 4\); they must be \(2, 5\)"),
         (CONTROL, {"action": np.zeros(2)}, r"had shapes \(2,\) and \(2,\); they must be \(2, 1\) and \(2,\)"),
-        (CONTROL, {"action": np.full((2, 1), np.inf)}, "actions held inf; they must be finite"),
+        (CONTROL, {"action": np.full((2, 1), np.inf)}, "observations or actions held NaN or infinity"),
         (CONTROL, {"alive": np.ones((2, 1), bool)}, r"and \(2, 1\); they must be"),
-        ("bandit", {"action": np.array([[0], [5]])}, "actions held 5; they must be from 0 to 4"),
-        ("bandit", {"action": np.array([[np.nan], [0]])}, "actions held nan; they must be from 0 to 4"),
+        ("bandit", {"action": np.array([[0], [5]])}, "an action was none of 0 to 4"),
+        ("bandit", {"action": np.array([[np.nan], [0]])}, "observations or actions held NaN or infinity"),
     ],
 )
 def test_steps_that_an_agent_refuses(agents: dict[str, Agent], task: str, changed: Any, says: str) -> None:
