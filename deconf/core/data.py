@@ -23,9 +23,9 @@ Source = Trials | Callable[[], Trials]
 
 
 def as_generators(rng: Rngs) -> list[np.random.Generator]:
-    """The list of generators, one a seed. Raises InputError for anything else, such as a number."""
+    """The list of generators, one a seed. Raises InputError for anything else, such as a number, and for none."""
     rngs = [rng] if isinstance(rng, np.random.Generator) else rng
-    if not isinstance(rngs, Sequence) or not all(isinstance(item, np.random.Generator) for item in rngs):
+    if not isinstance(rngs, Sequence) or not rngs or not all(isinstance(item, np.random.Generator) for item in rngs):
         raise InputError(f"random numbers were to come from {rng!r}; give np.random.default_rng(0), or a list of such")
     return list(rngs)
 

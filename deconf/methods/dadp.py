@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, trials_of
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.monitor import Monitor
@@ -119,7 +119,7 @@ def contexts(memories: Tensor, draws: Draws) -> Tensor:
 
 def train(trials: Trials, config: DadpConfig, rng: Rngs, monitor: Monitor | None = None) -> DadpAgent:
     """Train the encoder, then the policy, on expert trials, in as many equal groups as there are generators in rng."""
-    rngs, monitor = as_generators(rng), monitor or Monitor()
+    rngs, monitor, trials = as_generators(rng), monitor or Monitor(), trials_of(trials)
     each, steps = trials.mask.shape[1:]  # episodes of a trial, steps of an episode
     data, draws = Batch.of(split_episodes(trials), len(rngs), config.device), Draws(rngs, config.device)
     scales = Scales.of(Signature.of(trials), data)

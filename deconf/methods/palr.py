@@ -56,9 +56,7 @@ class PalrAgent(RecurrentAgent):
         self.config = config
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        states = self.memory(batch, state)
-        features = torch.cat([states[:, :, :-1], self.memory.inputs.scales.obs(batch.obs)], -1)
-        log_policy = self.policy.log_prob(features, label)
+        log_policy, states = self._log_policy(batch, label, state)
         loss = imitation_loss(log_policy.flatten(1), batch.mask.flatten(1))
         if self.config is not None:
             loss = loss + self.config.penalty * self.leakage(states[:, :, :-1], batch, label)

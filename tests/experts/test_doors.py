@@ -23,7 +23,8 @@ from deconfounded.deconf import methods
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Draws
 from deconfounded.deconf.core.layers import Linear
-from deconfounded.deconf.methods import deconfounded, deconfounded_mean, memoryless_bc, naive_rnn
+from deconfounded.deconf.methods import dadp, deconfounded, deconfounded_mean, memoryless_bc, naive_rnn
+from deconfounded.deconf.methods.dadp import DadpConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
@@ -365,9 +366,14 @@ class TestTraining:
             lambda: deconfounded_mean.train(trials, lambda agent: None, MeanConfig(), rng),  # type: ignore[arg-type,return-value]
             lambda: naive_rnn.train(lambda: None, RecurrentConfig(), rng),  # type: ignore[arg-type,return-value]
             lambda: memoryless_bc.train(None, MemorylessConfig(), rng),  # type: ignore[arg-type]
+            lambda: dadp.train(None, DadpConfig(), rng),  # type: ignore[arg-type]
         ):
             with pytest.raises(envs.InputError, match="trials were None; they must be Trials"):
                 call()
+
+    def test_no_generators(self) -> None:
+        with pytest.raises(envs.InputError, match=r"random numbers were to come from \[\]; give np.random.default_rng"):
+            memoryless_bc.train(Trials(OBS, ACTION, MASK), MemorylessConfig(), [])
 
     def test_a_loss_that_is_not_finite(self) -> None:
         """Training ends there, in a line that names the loss and the update: no agent of NaN comes of it."""
