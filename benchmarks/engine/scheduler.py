@@ -106,7 +106,9 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         for seed, job in sorted(imitated.items())
         if not job.context().has_demonstrations(seed)
     ]
-    failed = [error for jobs in (first, parts) for error in run_jobs(jobs, label, engine.run, folder.parent / "errors")]
+    failed, errors = list[Exception](), folder.parent / "errors"
+    for jobs, what in ((first, f"{label}, demonstrations"), (parts, label)):
+        failed += run_jobs(jobs, what, engine.run, errors)
     for job in () if failed else every:
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
