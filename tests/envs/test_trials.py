@@ -60,8 +60,9 @@ def test_vectors_are_gymnasium_s(mode: AutoresetMode) -> None:
             for x, y in zip(info["final_obs"], expected["final_obs"], strict=True):
                 same([x if x is not None else 0], [y if y is not None else 0])
     assert bool(ended) == (mode == AutoresetMode.SAME_STEP)
-    for _ in range(3):  # whole trials are begun, or gone on with
+    for _ in range(3):  # a trial is gone on with, or another one begun, whose theta shows in steps
         same(ours.reset()[:1], theirs.reset()[:1])
+        same(ours.step(action)[:4], theirs.step(action)[:4])
     with pytest.raises(envs.InputError, match=r"it must be AutoresetMode\.NEXT_STEP or SAME_STEP"):
         envs.make_vec(NAME, 3, autoreset_mode=AutoresetMode.DISABLED)
 
