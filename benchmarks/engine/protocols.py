@@ -20,6 +20,10 @@ PROTOCOLS = {
     "unseen": "theta from the middle half of each latent's distribution in training, from the rest in evaluation",
     "once": "trials of one episode",
 }
+COMPARED = (
+    *("deconfounded", "deconfounded_offline", "dagger", "rma", "naive_rnn", "oracle_bc"),
+    *("conditional", "interventional"),
+)  # methods whose scores are compared under each protocol
 LESS = 16
 AMOUNTS = ("expert_trials", "explore_trials", "query_trials")
 STEPWISE = ("gail",)  # methods that explore as many steps as their own settings say

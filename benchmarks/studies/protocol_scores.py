@@ -7,17 +7,14 @@ import numpy as np
 
 from deconfounded.benchmarks.engine import protocols, published
 from deconfounded.benchmarks.engine.catalogue import METHODS
-from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD
+from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD
 from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.headroom import ENDS
 from deconfounded.benchmarks.studies.results import of_versions, with_interval
 
-SHOWN = (
-    *("deconfounded", "deconfounded_mode", "deconfounded_offline", "dagger", "rma", "naive_rnn", "oracle_bc"),
-    *("conditional", "interventional"),
-)  # agents in the tables
+SHOWN = (COMPARED[0], "deconfounded_mode", *COMPARED[1:])  # agents in the tables
 INTERVALS = {"first": "ci95_first", "last": "ci95"}  # of an entry of results.json, by episode
 
 

@@ -1,8 +1,9 @@
 """Make the records that are missing, method by method and task by task: `deconf table`
 
 Every method on every task of the suite: ten seeds of those that a default run makes, the paper's comparison and the
-exact policies, and five of all others. A record of today's versions, settings and expert stays; the others are made,
-and kept as soon as they are done. Stopped, it goes on where it was. The first five seeds of everything come first.
+exact policies, and five of all others. Under another `--protocol`, five seeds of the methods that docs/protocols.md
+compares. A record of today's versions, settings and expert stays; the others are made, and kept as soon as they are
+done. Stopped, it goes on where it was. The first five seeds of everything come first.
 """
 
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.identity import named
-from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD, amounts, applied
+from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD, amounts, applied
 from deconfounded.benchmarks.studies import runs
 
 if TYPE_CHECKING:
@@ -25,9 +26,10 @@ if TYPE_CHECKING:
 SEEDS, FEWER = 10, 5
 
 
-def seeds_of(method: str, least: int, most: int) -> tuple[int, ...]:
+def seeds_of(method: str, least: int, most: int, protocol: str = STANDARD) -> tuple[int, ...]:
     """The seeds of a method that belong in the table, from `least` up to `most`."""
-    return tuple(range(least, most if method in (*DEFAULT, *REFERENCES) else min(most, FEWER)))
+    many = protocol == STANDARD and method in (*DEFAULT, *REFERENCES)
+    return tuple(range(least, most if many else min(most, FEWER)))
 
 
 def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...]:
@@ -57,14 +59,15 @@ def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
 
 
 def main() -> None:
-    parser = commands.parser(__doc__, "default: all that there are", seeds=SEEDS)
+    parser = commands.parser(__doc__, "default: all that the table has", seeds=SEEDS)
     several = f"names, or {', '.join(published.GROUPS)}; default: suite"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=list(envs.SUITE), help=several)
     parser.add_argument("--protocol", default=STANDARD, help=f"of {', '.join(PROTOCOLS)}")
     parser.add_argument("--list", action="store_true", help="print what is missing or stale, and stop")
     args = parser.parse_args()
     tasks = fitting(args.protocol, published.tasks(args.tasks))
-    asked = {*commands.check(args, list(METHODS), list(METHODS)), *REFERENCES}
+    default = METHODS if args.protocol == STANDARD else COMPARED
+    asked = {*commands.check(args, list(METHODS), list(default)), *REFERENCES}
     methods = [name for name in METHODS if name in asked]
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.presets import changed, preset
@@ -82,7 +85,7 @@ def main() -> None:
         for least, most in ((0, min(FEWER, args.seeds)), (FEWER, args.seeds))
         for task in tasks
         for method in methods
-        if (seeds := seeds_of(method, least, most))
+        if (seeds := seeds_of(method, least, most, args.protocol))
     ]
     there = {task.reference: records.held(kept / records.place(task.name)) for task in tasks}
     left = {job: seeds for job in jobs if (seeds := missing(job, args.preset, there[job.task]))}

@@ -22,7 +22,7 @@ from deconfounded.benchmarks.studies import table
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.rollout import RandomAgent
 from tests import toys
-from tests.tools import tiny_preset
+from tests.tools import deconf, tiny_preset
 
 PUSH = toys.Push()
 
@@ -167,6 +167,17 @@ class TestTables:
         assert table.missing(replace(job, protocol="once"), "default", fresh) == (0, 1)
         way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
         assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
+
+
+@pytest.mark.parametrize("protocol", ["scarce", "unseen", "once"])
+def test_a_table_is_of_the_methods_that_are_compared(protocol: str, tmp_path: Path) -> None:
+    """Five seeds of each, where there are no records yet."""
+    listed = deconf(tmp_path, "table", "--protocol", protocol, "--tasks", "curling", "--set", "eval_trials=8", "--list")
+    *lines, total = listed.stdout.splitlines()
+    missing = dict(line.removeprefix("curling, ").split(": seeds ") for line in lines)
+    assert {*missing} == {*protocols.COMPARED, "random", "expert"}
+    assert {*missing.values()} == {"0 1 2 3 4"}
+    assert total == f"{5 * len(missing)} seeds are missing or stale"
 
 
 def test_quantiles() -> None:
