@@ -38,7 +38,9 @@ def _part(protocol: str, standard: index.Found, found: index.Found) -> str:
     for end, said in ends.items() if found else ():
         head = (said.removeprefix("the "), *(f"{name} ({_tier(name)})" for name in SHOWN))
         rows = [(task.name, *_cells(of["methods"], end)) for task, of in found]
-        parts.append(markdown_table(head, [*rows, *_means(standard, found, end), ("version", *_versions(found))]))
+        beside = ("first", f"{STANDARD}, first episode") if protocol == "once" else (end, STANDARD)
+        means = _means(standard, found, end, *beside)
+        parts.append(markdown_table(head, [*rows, *means, ("version", *_versions(found))]))
     tasks = published.tasks(["suite", "hard"])
     unfit = {task.name: why for task in tasks if (why := protocols.why_not(protocol, task))}
     missing = [name for task in tasks if (name := task.name) not in {*unfit, *(made.name for made, _ in found)}]
@@ -60,15 +62,19 @@ def _cells(methods: dict[str, Any], end: str) -> list[str]:
     ]
 
 
-def _means(standard: index.Found, found: index.Found, end: str) -> list[tuple[str, ...]]:
-    """Rows of interquartile means, of found and of the standard protocol; none where no task has all of both."""
-    runs = [{task.name: index.measured(of["methods"], end) for task, of in both} for both in (found, standard)]
+def _means(standard: index.Found, found: index.Found, end: str, theirs: str, called: str) -> list[tuple[str, ...]]:
+    """Rows of interquartile means, of found and of the standard protocol; none where no task has all of both.
+
+    theirs: the episode of the standard protocol that is beside `end`; called: the row's name.
+    """
+    pairs = ((found, end), (standard, theirs))
+    runs = [{task.name: index.measured(of["methods"], each) for task, of in both} for both, each in pairs]
     tasks = [task for task in runs[0] if all(set(SHOWN) <= set(of.get(task, ())) for of in runs)]
     if not tasks:
         return []
     rows, shared = [], [[(task, of) for task, of in both if task.name in tasks] for both in (found, standard)]
     under, others = (_versions(both) for both in shared)
-    for said, by_task in zip(("interquartile mean", f"the same, {STANDARD}"), runs, strict=True):
+    for said, by_task in zip(("interquartile mean", f"the same, {called}"), runs, strict=True):
         scores = ([np.array([*by_task[task][name].values()]) for task in tasks] for name in SHOWN)
         cells = [two_decimals(float(statistics.iqm(of))) for of in scores]
         if by_task is runs[1]:

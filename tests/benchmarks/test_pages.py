@@ -351,11 +351,14 @@ class TestProtocols:
         assert "Not for" not in page.partition("## once")[2]
 
     def test_once(self) -> None:
-        """A trial of one episode has one table."""
+        """A trial of one episode has one table; beside it is the first episode of longer trials."""
         curling = [(envs.get("curling"), {"methods": self.ALL})]
         once = protocol_scores.page([], {"once": curling}).partition("## once")[2]
         assert once.count("| curling |") == 1
         assert "interquartile mean" not in once
+        both = protocol_scores.page(curling, {"once": curling}).partition("## once")[2]
+        assert "| interquartile mean | 0.75 |" in both
+        assert "| the same, standard, first episode | 0.50 |" in both
 
     def test_table_in_the_making(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A task appears with its references, without which it has no scores; pages can be made before that."""
