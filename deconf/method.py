@@ -122,9 +122,9 @@ def check_values(method: Method) -> None:
             raise InputError(f"a method declares {name}={config!r}; configurations must be {right}")
         _check_json(name, config)
     for name, config in (("smoke", method.on_control), ("smoke_bandit", method.on_bandit or method.on_control)):
-        changes, known = getattr(method, name), [] if config is None else [each.name for each in fields(config)]
-        if not isinstance(changes, Mapping) or not set(changes) <= set(known):
-            right = f"a dictionary of fields of its configuration, {', '.join(known) or 'which has none'}"
+        changes, settings = getattr(method, name), [] if config is None else [each.name for each in fields(config)]
+        if not isinstance(changes, Mapping) or not set(changes) <= set(settings):
+            right = f"a dictionary of fields of its configuration, {', '.join(settings) or 'which has none'}"
             raise InputError(f"a method declares {name}={changes!r}; it must be {right}")
         _check_json(name, changes)
 

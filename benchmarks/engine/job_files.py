@@ -79,12 +79,17 @@ def left_in(folder: Path) -> Finished:
             print(f"{file.name} is left out: it is of {name}")
         else:
             finished.append((meta["identity"]["method"], meta["seed"], data))
-    latest = sorted(finished, key=lambda job: max(end for _, end in job[2]["meta"]["spans"]))
-    texts = {method: data["meta"]["identity"]["outside"] for method, _, data in latest}
-    task = latest[-1][2]["meta"]["identity"]["outside"].get("task") if latest else None
-    kept = []
+    return _of_latest_text(finished)
+
+
+def _of_latest_text(finished: Finished) -> Finished:
+    """Those for which the task had the text of the latest job, and the method that of its latest; a line on others."""
+    texts, task, kept = dict[str, dict[str, str]](), None, list[tuple[str, int, dict[str, Any]]]()
+    for method, _, data in sorted(finished, key=lambda job: max(end for _, end in job[2]["meta"]["spans"])):
+        texts[method] = data["meta"]["identity"]["outside"]
+        task = texts[method].get("task")
     for method, seed, data in finished:
-        if (text := data["meta"]["identity"]["outside"]) == texts[method] and text.get("task") == task:
+        if data["meta"]["identity"]["outside"] == texts[method] and texts[method].get("task") == task:
             kept.append((method, seed, data))
         else:
             print(f"{method}-{seed}.npz is left out: its task or method had another text; run it again with --resume")

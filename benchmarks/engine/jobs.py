@@ -100,9 +100,10 @@ class Job(ABC):
         origin = {"identity": monitor.identity, "seed": seed, "commit": version, "machine": machine(monitor.device)}
         origin |= {"package": __version__, "reference": self.about.reference, "arrays": list(arrays)}
         whole = {**meta, **origin, "budget": budget, "spans": monitor.spans(), "cpu_s": cpu}
-        if why := job_files.broken({"meta": json.loads(json.dumps(whole)), **arrays}):
+        text = json.dumps(whole)
+        if why := job_files.broken({"meta": json.loads(text), **arrays}):
             raise envs.InputError(f"{self.method} with seed {seed} left no result that can be kept: {why}")
-        np.savez_compressed(buffer, meta=np.array(json.dumps(whole)), **arrays)
+        np.savez_compressed(buffer, meta=np.array(text), **arrays)
         write_atomically(self.file(seed), buffer.getvalue())
 
     def load(self, seed: int) -> dict[str, Any] | None:

@@ -44,10 +44,9 @@ def bootstrap(values: Array) -> Array | None:
         return None
     from scipy import stats  # takes a second
 
-    options: dict[str, Any] = {"method": "percentile", "n_resamples": 5000, "rng": 0}
-    batch = {"batch": max(1, 10**7 // values.size)} if values.size > MANY else {}  # resamples at once, for memory
-    interval = stats.bootstrap((values,), np.mean, **options, **batch).confidence_interval
-    return np.stack([interval.low, interval.high], -1)
+    batch = max(1, 10**7 // values.size) if values.size > MANY else None  # resamples at once, for memory; None: all
+    made = stats.bootstrap((values,), np.mean, method="percentile", n_resamples=5000, rng=0, batch=batch)
+    return np.stack([made.confidence_interval.low, made.confidence_interval.high], -1)
 
 
 @cache

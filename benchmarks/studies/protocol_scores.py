@@ -73,12 +73,14 @@ def _means(standard: index.Found, found: index.Found, end: str, theirs: str, cal
     if not tasks:
         return []
     rows, shared = [], [[(task, of) for task, of in both if task.name in tasks] for both in (found, standard)]
-    under, others = (_versions(both) for both in shared)
+    versions, standard_versions = (_versions(both) for both in shared)
     for said, by_task in zip(("interquartile mean", f"the same, {called}"), runs, strict=True):
         scores = ([np.array([*by_task[task][name].values()]) for task in tasks] for name in SHOWN)
         cells = [two_decimals(float(statistics.iqm(of))) for of in scores]
         if by_task is runs[1]:
-            cells = [cell if was == now else "" for cell, was, now in zip(cells, others, under, strict=True)]
+            cells = [
+                cell if was == now else "" for cell, was, now in zip(cells, standard_versions, versions, strict=True)
+            ]
         rows.append((said, *cells))
     return rows
 

@@ -89,8 +89,8 @@ class Signature:
     def checked(self, explored: Source) -> Trials:
         """Explored trials. Raises InputError if they are of another kind than demonstrations of this signature."""
         trials = trials_of(explored)
-        if (found := Signature.of(trials)) != self:
-            raise InputError(f"exploration is {found}, demonstrations are {self}; they must agree")
+        if (signature := Signature.of(trials)) != self:
+            raise InputError(f"exploration is {signature}, demonstrations are {self}; they must agree")
         return trials
 
     @property

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent, Stateful
 from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators
 from deconfounded.deconf.core.layers import Linear, Mlp
 from deconfounded.deconf.core.monitor import Monitor
@@ -209,11 +209,10 @@ def train(
         return TrialVecEnv(environments(i, config.envs), space, mean[i], std[i], reward)
 
     states = [PpoState(new_ppo(vector(i), config, int(rngs[i].integers(2**31)))) for i in range(seeds)]
-    named = {f"player{i}": state for i, state in enumerate(states)}
+    named: dict[str, Stateful] = {f"player{i}": state for i, state in enumerate(states)}
+    named |= agent.parts()
     checkpoint = Checkpoint(monitor, rngs, discriminator=discriminator, optimizer=optimizer, draws=draws, **named)
     begin = (checkpoint.load() or {"round": 0})["round"]
-    for i, state in enumerate(states):
-        agent.load_policy(i, state.ppo.policy)
     for done in range(begin, config.rounds):
         own = []
         for i, state in enumerate(states):

@@ -333,8 +333,8 @@ def test_features_are_kept_as_they_were_when_overwritten(monkeypatch: pytest.Mon
 @pytest.mark.parametrize(("first", "says"), [(0, "None after episode 3"), (1, "an array after episode 2")])
 def test_features_are_of_every_episode_or_none(first: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of some would be taken for the first episodes'."""
-    told = iter([first == 0, True, False])
-    monkeypatch.setattr(Remembering, "features", lambda self: self.memory if next(told) else None)
+    has_features = iter([first == 0, True, False])
+    monkeypatch.setattr(Remembering, "features", lambda self: self.memory if next(has_features) else None)
     context = Context(PUSH, tiny_preset(), [0], expert="tests.toys:control")
     with pytest.raises(envs.InputError, match=f"features of Remembering were {says}, and .*; they must"):
         evaluate(context, Remembering(PUSH.action_space), True)

@@ -388,12 +388,12 @@ class TestRma:
         theta = rng.uniform(-1, 1, (64, 2, 8, 1))
         mask = np.arange(8) < rng.integers(1, 9, (64, 2, 1))
         trials = Trials(np.zeros((64, 2, 9, 1)), theta * mask[..., None], mask)
-        shown = rng.uniform(-0.9, 0.9, (50, 1))
+        acting_theta = rng.uniform(-0.9, 0.9, (50, 1))
         config = memoryless_bc.MemorylessConfig(width=32, updates=300, batch=256)
-        oracle = memoryless_bc.train(trials, config, rng, theta, lambda: shown)
+        oracle = memoryless_bc.train(trials, config, rng, theta, lambda: acting_theta)
         oracle.begin(50)
         oracle.reset([rng])
-        np.testing.assert_allclose(oracle.act(np.zeros((50, 1), np.float32)), shown, atol=0.15)
+        np.testing.assert_allclose(oracle.act(np.zeros((50, 1), np.float32)), acting_theta, atol=0.15)
 
     def test_the_student_sees_no_theta(self) -> None:
         """In deployment it acts alike after the same history under every theta."""
