@@ -231,8 +231,12 @@ def picture(result: dict[str, Any], file: Path) -> None:
         for (i, j), value in np.ndenumerate(score):
             hue = "white" if value < 0.6 else "black"
             left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=size)
-        ticks = ["\n".join(f"{x:.3g}" for x in level) for level in legible]
-        left.set(xlabel="theta given", ylabel="true theta", title="score of an expert given a wrong theta")
+        alike = len(levels[0]) > 1 and all(len(set(level)) == 1 for level in levels)  # of patches
+        ticks = ["\n".join(f"{x:.3g}" for x in (level[:1] if alike else level)) for level in legible]
+        each = ", of each patch" * alike
+        left.set(
+            xlabel=f"theta given{each}", ylabel=f"true theta{each}", title="score of an expert given a wrong theta"
+        )
         left.set_xticks(range(len(ticks)), ticks)
         left.set_yticks(range(len(ticks)), ticks)
         left.figure.colorbar(left.imshow(score, vmin=0, vmax=1, cmap="viridis"), ax=left)

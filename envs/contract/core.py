@@ -31,7 +31,7 @@ from deconfounded.envs.contract.probe import (
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.task import Array, Task
 
-STARTS = 12
+STARTS = 32
 
 
 def no_leak(task: Task) -> None:

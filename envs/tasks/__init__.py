@@ -13,7 +13,7 @@ SUITE = (
     *("curling", "swapped_lander", "windy_drone"),
 )
 # Where the exact policy succeeds, and learners without theta less: docs/hard.md; some certificates are yet to be made.
-HARD = ("gusty_drone", "patchy_road", "loaded_arm", "loaded_drone", "lame_ant")
+HARD = ("gusty_drone", "patchy_road", "loaded_arm", "loaded_drone", "lame_ant", "drifting_raft")
 
 for _name in (*SUITE, *HARD):  # a task's class has its file's name, in camel case
     register(getattr(importlib.import_module(f"{__name__}.{_name}"), _name.title().replace("_", "")))
