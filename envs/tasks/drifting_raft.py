@@ -6,10 +6,10 @@ it, too. What was found out in a square has to be remembered until the mark come
 one, from another side.
 
 Latents: current_0 to current_8, m/s along y, uniform and independent, of nine squares of 2 m; the bay repeats itself
-every 6 m, in both directions. The square under the middle of the raft acts on it; the expert heeds that in which the
-mark's speed would take it within the thrusters' lag. The raft weighs 1 kg, and water drags on it by 1 N for each m/s
-between it and the current. Noise a step: std .02 m and .08 m/s along each axis; none of the mark, which theta does not
-touch.
+every 6 m, in both directions. The square under the middle of the raft acts on it; the expert heeds the square into
+which the mark's speed takes the raft within the thrusters' lag. The raft weighs 1 kg, and water drags on it by 1 N for
+each m/s between it and the current. Noise a step: std .02 m and .08 m/s along each axis; none of the mark, which theta
+does not touch.
 
 Action: thrust along x and y, in units of 4 N, which the thrusters approach with a lag (time constant) of .8 s. The
 expert, in closed form, asks for what the mark's speed and the current need, and .5 N more for each m off the mark and
