@@ -31,7 +31,7 @@ from deconfounded.envs.contract.probe import (
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.task import Array, Task
 
-STARTS = 32
+STARTS = 12
 
 
 def no_leak(task: Task) -> None:
