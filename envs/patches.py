@@ -63,8 +63,12 @@ class PatchedTask(MujocoTask):
     def acting_theta(self, theta: Array, state: Array) -> Array:
         return np.take_along_axis(theta, self.patch(state)[:, None], -1)
 
+    def heeded_theta(self, obs: Array, theta: Array) -> Array:
+        """The value [N], of latents [N, L], by which the expert acts at observations [N, O]."""
+        return np.take_along_axis(theta, self.heeded(obs)[:, None], -1)[:, 0]
+
     def seen_theta(self, obs: Array, theta: Array) -> Array:
-        return self.latents[0].encode(np.take_along_axis(theta, self.heeded(obs)[:, None], -1)[:, 0])
+        return self.latents[0].encode(self.heeded_theta(obs, theta))
 
     @property
     def seen_width(self) -> int:

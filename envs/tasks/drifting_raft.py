@@ -90,7 +90,7 @@ class DriftingRaft(PatchedTask):
     def expert_mean(self, obs: Array, theta: Array) -> Array:
         to_mark, velocity, pace = obs[:, :2], obs[:, 2:4], obs[:, 4:6]
         push = pace + STEERING * (to_mark + pace - velocity)
-        push[:, 1] -= np.take_along_axis(theta, self.heeded(obs)[:, None], -1)[:, 0]
+        push[:, 1] -= self.heeded_theta(obs, theta)
         return np.clip(push / THRUST, -1, 1)
 
     def _off(self, state: Array) -> Array:
