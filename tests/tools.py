@@ -23,7 +23,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "deconfounded_gru": {"model": "gru", **FEW},
     "deconfounded_forgetting": {"model": "forgetting", **FEW},
     "deconfounded_discrete": {"model": "discrete", **FEW},
-    "deconfounded_large": FEW,
+    "deconfounded_large": {**FEW, "restart": True},
     "deconfounded_offline": {**OFFLINE, "online_steps": 64},
     "deconfounded_mean": {**FEW, "inference_steps": 64},
     "dagger": {"updates": 2, "rounds": 2, "batch": 4},

@@ -56,6 +56,17 @@ class DeconfoundedConfig(Configuration):
     drifts: bool = False  # theta changes between the episodes of a trial: see deconf/core/drift.py
     device: str = "cpu"
     random_share: float = 0.1  # of exploration's actions that are uniformly random; 1: without the imitator
+    restart: bool = False  # the last round begins with new networks, and has half of all inference updates
+
+    def inference_by_round(self) -> list[int]:
+        """How many inference updates each round has."""
+        before, half = self.rounds - 1, self.rounds * self.inference_updates // 2
+        return [half // before] * before + [half] if self.restarts else [self.inference_updates] * self.rounds
+
+    @property
+    def restarts(self) -> bool:
+        """Whether there are networks before those of the last round."""
+        return self.restart and self.rounds > 1
 
 
 def train(
@@ -75,18 +86,23 @@ def train(
     episodes, first = first.mask.shape[1], unit(signature.checked(first))
     expert, explored = (Batch.of(x, seeds, device) for x in (demonstrations, first))
     draws = Draws(rngs, device)
-    scales = Scales.of(signature, expert, explored)
-    agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
-    model, policy, online = agent.model, agent.policy, agent.online
     inference_batch = config.inference_batch
     if config.drifts:
-        model.kept.fill_(0.5**model.share_power)  # during exploration
         inference_batch = inference_batch and inference_batch * episodes  # as many steps as of whole trials
-
-    inferences = config.rounds * config.inference_updates
+    by_round = config.inference_by_round()
+    inferences = sum(by_round)
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
-    inference = Adam([model], config.inference_rate, inferences if config.cooled else None)
-    imitation = Adam([policy], config.imitation_rate)
+
+    def begun(inferences: int) -> tuple[DeconfoundedAgent, Adam, Adam, Checkpoint]:
+        """An untrained agent, the optimizers of its model, for so many updates, and of its policy; what is saved."""
+        scales = Scales.of(signature, expert, explored)
+        agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
+        if config.drifts:
+            agent.model.kept.fill_(0.5**agent.model.share_power)  # during exploration
+        inference = Adam([agent.model], config.inference_rate, inferences if config.cooled else None)
+        imitation = Adam([agent.policy], config.imitation_rate)
+        checkpoint = Checkpoint(monitor, rngs, **agent.parts(), inference=inference, imitation=imitation, draws=draws)
+        return agent, inference, imitation, checkpoint
 
     def imitate(done: int, optimizer: Adam) -> None:
         """One update of eta."""
@@ -95,11 +111,11 @@ def train(
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
     begin, done = 0, 0
-    checkpoint = Checkpoint(monitor, rngs, **agent.parts(), inference=inference, imitation=imitation, draws=draws)
+    agent, inference, imitation, checkpoint = begun(inferences - config.restarts * by_round[-1])
     if before := checkpoint.load():
         begin, belief, latents, explored = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
         expert = Batch(*before["expert"]) if before["expert"] else expert
-        done = begin * (config.inference_updates + config.imitation_updates)
+        done = sum(by_round[:begin]) + begin * config.imitation_updates
     for i in range(begin, config.rounds):
         if i > 0:
             explorer = Explorer(agent, latents, config.random_share) if config.random_share < 1 else None
@@ -107,9 +123,12 @@ def train(
             explored = explored.joined(new) if config.accumulate else new
             if not config.accumulate:
                 expert = Batch.of(unit(trials_of(trials)), seeds, device)
-        for j in range(config.inference_updates):  # of phi and psi
-            warm = ramp(i * config.inference_updates + j, config.warm_up * inferences)
-            beginnings = explored.beginnings(i * config.inference_updates + j, config.shortest)
+        if config.restarts and i == config.rounds - 1:
+            agent, inference, imitation, checkpoint = begun(by_round[-1])
+        model, online = agent.model, agent.online
+        for j in range(sum(by_round[:i]), sum(by_round[: i + 1])):  # of phi and psi
+            warm = ramp(j, config.warm_up * inferences)
+            beginnings = explored.beginnings(j, config.shortest)
             batch = beginnings.draw_trials(inference_batch, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)
             done += 1
@@ -122,18 +141,18 @@ def train(
         if config.fit_prior:
             model.set_prior(drawn, draws)
         if online is not None:
-            online.fit(model, explored, config.inference_updates, draws)
+            online.fit(model, explored, by_round[i], draws)
         for _ in range(config.imitation_updates):
             imitate(done, imitation)
             done += 1
         fresh = None if isinstance(trials, Trials) else expert.tensors
         checkpoint.save(round=i + 1, belief=belief, latents=latents, seen=explored.tensors, expert=fresh)
-    final = Adam([policy], config.imitation_rate, config.final_updates)
+    final = Adam([agent.policy], config.imitation_rate, config.final_updates)
     for _ in range(config.final_updates):
         imitate(done, final)
         done += 1
     if config.drifts:
-        choose_kept(model, explored[:, -(len(first) // seeds) :], episodes, draws)
+        choose_kept(agent.model, explored[:, -(len(first) // seeds) :], episodes, draws)
     return agent
 
 

@@ -41,7 +41,7 @@ from tests.tools import tiny_preset
 CONTROL = "slippery_cartpole"
 NEW = (
     *("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr"),
-    *("dml_il", "dadp", "dpt", "flow_bc"),
+    *("dml_il", "dadp", "dpt", "flow_bc", "deconfounded_large"),
 )
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 

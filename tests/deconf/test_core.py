@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from safetensors.numpy import save_file
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
+from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.gru import GruBelief, GruMemory
@@ -543,6 +545,35 @@ class TestMethods:
         model = deconfounded.train(fast, lambda agent: slow, config, rng).model
         data = Batch.of(fast, 1)
         assert 0.5 < model.dynamics.change(data.next_obs - data.obs).std() < 2
+
+    def test_updates_of_a_restart(self) -> None:
+        """Half of all inference updates are the last round's, the others' share is equal; a single round has all."""
+        config = DeconfoundedConfig(rounds=5, inference_updates=20, restart=True)
+        assert config.inference_by_round() == [12, 12, 12, 12, 50]
+        assert replace(config, rounds=1).inference_by_round() == [20]
+        assert replace(config, restart=False).inference_by_round() == [20] * 5
+
+    @pytest.mark.parametrize("restart", [False, True])
+    def test_a_restart_renews_networks(self, restart: bool) -> None:
+        """Weights after the last round have as much to do with those before it as those of a network drawn anew."""
+        trials, _ = demonstrations("slippery_cartpole", 4)
+        config = DeconfoundedConfig(
+            **{"rounds": 2, "inference_updates": 2, "inference_batch": 4, "imitation_updates": 2, "final_updates": 2},
+            restart=restart,
+        )
+        before: list[dict[str, NDArray[Any]]] = []
+
+        def explore(agent: Agent | None) -> Trials:
+            if isinstance(agent, LearnedAgent):
+                before.append(agent.state()[1])
+            return trials
+
+        after = deconfounded.train(trials, explore, config, np.random.default_rng(0)).state()[1]
+        (early,) = before
+        for network in ("model.dynamics.gains", "model.reader", "policy", "online.net"):
+            key = max((key for key in after if key.startswith(network)), key=lambda key: after[key].size)
+            alike = np.corrcoef(early[key].ravel(), after[key].ravel())[0, 1]
+            assert abs(alike) < 0.2 if restart else alike > 0.9, key
 
     @pytest.mark.slow
     def test_deconfounded_learns_from_physics(self) -> None:
