@@ -41,7 +41,7 @@ from tests.tools import tiny_preset
 CONTROL = "slippery_cartpole"
 NEW = (
     *("deconfounded_mean", "gail", "rma", "naive_transformer", "naive_obs", "naive_dropout", "palr"),
-    *("dml_il", "dadp", "dpt", "flow_bc", "deconfounded_large"),
+    *("dml_il", "dadp", "dpt", "flow_bc"),
 )
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 
@@ -569,7 +569,7 @@ class Interrupted(Monitor):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", NEW)
+@pytest.mark.parametrize("method", [*NEW, "deconfounded_large"])
 def test_interrupted_training_resumes(method: str) -> None:
     """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one."""
     monitor, task = Interrupted(), envs.get("bandit")
