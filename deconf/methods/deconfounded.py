@@ -93,13 +93,13 @@ def train(
     inferences = sum(by_round)
     total = inferences + config.rounds * config.imitation_updates + config.final_updates
 
-    def begun(inferences: int) -> tuple[DeconfoundedAgent, Adam, Adam, Checkpoint]:
+    def begun(updates: int) -> tuple[DeconfoundedAgent, Adam, Adam, Checkpoint]:
         """An untrained agent, the optimizers of its model, for so many updates, and of its policy; what is saved."""
         scales = Scales.of(signature, expert, explored)
         agent = DeconfoundedAgent.new(config.model, config.latent, config.width, scales, draws)
         if config.drifts:
             agent.model.kept.fill_(0.5**agent.model.share_power)  # during exploration
-        inference = Adam([agent.model], config.inference_rate, inferences if config.cooled else None)
+        inference = Adam([agent.model], config.inference_rate, updates if config.cooled else None)
         imitation = Adam([agent.policy], config.imitation_rate)
         checkpoint = Checkpoint(monitor, rngs, **agent.parts(), inference=inference, imitation=imitation, draws=draws)
         return agent, inference, imitation, checkpoint
