@@ -48,6 +48,10 @@ class PatchedTask(MujocoTask):
     def heeded(self, obs: Array) -> NDArray[np.int64]:
         """The latent [N] by which the expert acts at observations [N, O]."""
 
+    def patch_at(self, place: Array) -> NDArray[np.int64]:
+        """The patch [N] at places [N] along patches in a ring, in units of a patch."""
+        return (np.floor(place) % len(self.latents)).astype(int)
+
     def theta_grid(self, k: int) -> Array:
         """Thetas [K, L] whose patches are all alike, with k equally likely values: as one patch acts at a time."""
         return np.repeat(self.latents[0].grid(k)[:, None], len(self.latents), 1)

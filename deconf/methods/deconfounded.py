@@ -111,7 +111,7 @@ def train(
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
     begin, done = 0, 0
-    agent, inference, imitation, checkpoint = begun(inferences - config.restarts * by_round[-1])
+    agent, inference, imitation, checkpoint = begun(sum(by_round[:-1] if config.restarts else by_round))
     if before := checkpoint.load():
         begin, belief, latents, explored = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
         expert = Batch(*before["expert"]) if before["expert"] else expert

@@ -81,11 +81,11 @@ class DriftingRaft(PatchedTask):
         return np.concatenate([self._to_mark(state), velocities, state[..., -2:], np.cos(angles), np.sin(angles)], -1)
 
     def patch(self, state: Array) -> NDArray[np.int64]:
-        return (np.floor(self.qpos(state, "x") / WIDTH) % STREAMS).astype(int)
+        return self.patch_at(self.qpos(state, "x") / WIDTH)
 
     def heeded(self, obs: Array) -> NDArray[np.int64]:
         streams = np.arctan2(obs[:, 11], obs[:, 8]).astype(float) * STREAMS / (2 * np.pi)
-        return (np.floor(streams + LAG * obs[:, 4] / WIDTH) % STREAMS).astype(int)
+        return self.patch_at(streams + LAG * obs[:, 4] / WIDTH)
 
     def expert_mean(self, obs: Array, theta: Array) -> Array:
         to_mark, velocity, pace = obs[:, :2], obs[:, 2:4], obs[:, 4:6]

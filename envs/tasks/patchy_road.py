@@ -36,11 +36,11 @@ class PatchyRoad(PatchedTask, IcyRoad):
         return mujoco.MjSpec.from_file(str(ASSETS / "icy_road.xml"))
 
     def patch(self, state: Array) -> NDArray[np.int64]:
-        return (np.floor(self.qpos(state, "x") / LENGTH) % PATCHES).astype(int)
+        return self.patch_at(self.qpos(state, "x") / LENGTH)
 
     def heeded(self, obs: Array) -> NDArray[np.int64]:
         turns = np.arctan2(obs[:, -1], obs[:, -2]).astype(float) / (2 * np.pi)
-        return (np.floor(turns * PATCHES + AHEAD / LENGTH) % PATCHES).astype(int)
+        return self.patch_at(turns * PATCHES + AHEAD / LENGTH)
 
     def observe(self, state: Array) -> Array:
         angle = 2 * np.pi * self.qpos(state, "x") / (PATCHES * LENGTH)

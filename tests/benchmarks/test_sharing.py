@@ -20,7 +20,6 @@ from deconfounded.benchmarks.output import card, records
 from deconfounded.deconf.core.data import Draws, Signature
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
-from deconfounded.envs.support.files import unsealed
 from deconfounded.experts import saved_agents
 
 ROOT = Path(__file__).parents[2]
@@ -118,10 +117,9 @@ def test_an_agent_comes_back(
 ) -> None:
     """The same bytes; the card has the score of its own record, and a loop that acts."""
     back = tmp_path / "agent"
-    lines = map(json.loads, (ROOT / "docs/records/bandit.jsonl").read_text().splitlines())
-    lines = [each for each in lines if not each.get("protocol_name")]  # a run has one protocol
-    of = {name: [each for each in lines if each["method"] == name] for name in ("random", "expert", "naive_rnn")}
-    records.write(tmp_path / "run/records", [unsealed(each) for each in of["naive_rnn"]])
+    kept = records.of_task(ROOT / "docs/records", "bandit")
+    of = {name: [each for each in kept if each["method"] == name] for name in ("random", "expert", "naive_rnn")}
+    records.write(tmp_path / "run/records", of["naive_rnn"])
     assert call(monkeypatch, push, agent, "me/naive-bandit", "--private") == 0
     assert hub.calls[0][2]["private"] is True
     (hub.folder / "model/me/naive-bandit/evil.py").write_text("")

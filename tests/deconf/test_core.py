@@ -45,7 +45,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials
-from tests.tools import tiny_preset
+from tests.tools import FEW, tiny_preset
 
 
 def demonstrations(name: str, n: int, episodes: int = 2) -> tuple[Trials, envs.BatchEnv]:
@@ -557,10 +557,7 @@ class TestMethods:
     def test_a_restart_renews_networks(self, restart: bool) -> None:
         """Weights after the last round have as much to do with those before it as those of a network drawn anew."""
         trials, _ = demonstrations("slippery_cartpole", 4)
-        config = DeconfoundedConfig(
-            **{"rounds": 2, "inference_updates": 2, "inference_batch": 4, "imitation_updates": 2, "final_updates": 2},
-            restart=restart,
-        )
+        config = DeconfoundedConfig(**FEW, restart=restart)
         before: list[dict[str, NDArray[Any]]] = []
 
         def explore(agent: Agent | None) -> Trials:
