@@ -99,7 +99,8 @@ class LearnedAgent(Agent):
             raise InputError(
                 f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
             )
-        return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)  # a copy
+        # A copy, in torch's own memory: numpy's is not as aligned, and sums of matrix products have other bits there.
+        return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)
 
     @abstractmethod
     def choose(self, obs: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Gaussians over latents whose dimensions are correlated, as parameters that a network gives."""
 
 import math
+from functools import cache
 from typing import Any
 
 import torch
@@ -38,7 +39,11 @@ class Correlated:
     def about(self, mean: Tensor, raw: Tensor) -> Tensor:
         """Parameters [..., P] by a network's output [..., P]: what is added to the mean, stds before a softplus, A."""
         added, std, lower = self.split(raw)
-        return torch.cat([mean + added, F.softplus(std) + LEAST, lower], -1)
+        return self.joined(mean + added, std, lower)
+
+    def joined(self, mean: Tensor, raw: Tensor, lower: Tensor) -> Tensor:
+        """Parameters [..., P] by the mean, stds before a softplus, and A."""
+        return torch.cat([mean, F.softplus(raw) + LEAST, lower], -1)
 
     def split(self, belief: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, stds and A."""
@@ -48,8 +53,8 @@ class Correlated:
     def triangle(self, lower: Tensor) -> Tensor:
         """1 + A [..., D, D]."""
         d = self.latent
-        unit = torch.eye(d, dtype=lower.dtype, device=lower.device)
-        flat = unit.flatten().expand(*lower.shape[:-1], d * d).contiguous()
+        unit = identity(d, lower.dtype, lower.device)
+        flat = unit.view(-1).expand(*lower.shape[:-1], d * d).clone(memory_format=torch.contiguous_format)
         return flat.index_copy_(-1, self._below.to(lower.device), lower).unflatten(-1, (d, d))
 
     def sample(self, belief: Tensor, draws: Draws) -> Tensor:
@@ -174,9 +179,16 @@ def posterior_moments(factor: Tensor, half: Tensor) -> tuple[Tensor, Tensor]:
     return mean[..., 0], root.mT @ root + mean * mean.mT
 
 
+@cache
+def identity(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The unit matrix [size, size], made once. Not to be written to."""
+    with torch.inference_mode(False):  # or no gradient could pass it
+        return torch.eye(size, dtype=dtype, device=device)
+
+
 def inverse(factor: Tensor) -> Tensor:
     """L^-1 of lower triangular matrices L [..., D, D]: (L L^T)^-1 is its square, and L^-1 b is of use too."""
-    unit = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    unit = identity(factor.shape[-1], factor.dtype, factor.device)
     return torch.linalg.solve_triangular(factor, unit, upper=False)
 
 
@@ -187,7 +199,7 @@ def posterior_root(precision: Tensor) -> Tensor:
     that matrix, and to no other of the stack, as it needs to have a root. A matrix that is not finite has none: its
     root is not finite either.
     """
-    unit = torch.eye(precision.shape[-1], dtype=precision.dtype, device=precision.device)
+    unit = identity(precision.shape[-1], precision.dtype, precision.device)
     lower, failed = torch.linalg.cholesky_ex(precision + unit)
     if not failed.any():
         return lower  # type: ignore[no-any-return]

@@ -6,7 +6,6 @@ seed's numbers are the same, bit for bit, whatever runs beside it.
 
 import ctypes
 import platform
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -37,8 +36,6 @@ prepare_torch()
 
 def stack_differs(rows: Tensor, weight: Tensor) -> bool:
     """Whether the product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than a seed's alone."""
-    if len(rows) == 1:
-        return False
     _, inputs, outputs = weight.shape
     count = rows.shape[1]
     return min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL
@@ -46,7 +43,7 @@ def stack_differs(rows: Tensor, weight: Tensor) -> bool:
 
 def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """Add rows [S, R, I] weight [S, I, O] to out [S, R, O], with the same bits for a seed however many are stacked."""
-    if stack_differs(rows, weight):
+    if rows.shape[0] > 1 and stack_differs(rows, weight):
         for operands in zip(out.split(1), rows.split(1), weight.split(1), strict=True):
             operands[0].baddbmm_(*operands[1:])
         return out
@@ -55,7 +52,7 @@ def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
-    if stack_differs(rows, weight):
+    if rows.shape[0] > 1 and stack_differs(rows, weight):
         return torch.cat([*map(torch.baddbmm, bias.split(1), rows.split(1), weight.split(1))])
     return torch.baddbmm(bias, rows, weight)
 
@@ -85,16 +82,15 @@ def parameter_gradients(rows: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:
     return by_seed(rows.transpose(1, 2), grad), bias[0] if len(bias) == 1 else torch.cat(bias)
 
 
-def activations(rows: Tensor, parameters: Sequence[Tensor]) -> list[Tensor]:
-    """Rows [S, R, I], and what each of some linear maps makes of them, with ReLU between.
+def activations(rows: Tensor, *parameters: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Rows [S, R, I], and what each of three linear maps makes of them, with ReLU between.
 
     parameters: the weight and the bias of each map in turn.
     """
-    layers = [rows]
-    for weight, bias in zip(parameters[::2], parameters[1::2], strict=True):
-        before = layers[-1] if len(layers) == 1 else layers[-1].relu_()
-        layers.append(affine(bias, before, weight))
-    return layers
+    weight, bias, weight_2, bias_2, weight_3, bias_3 = parameters
+    hidden = affine(bias, rows, weight).relu_()
+    hidden_2 = affine(bias_2, hidden, weight_2).relu_()
+    return rows, hidden, hidden_2, affine(bias_3, hidden_2, weight_3)
 
 
 class MlpFunction(torch.autograd.Function):
@@ -102,7 +98,7 @@ class MlpFunction(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *parameters: Tensor) -> Tensor:
-        *inputs, out = activations(rows, parameters)
+        *inputs, out = activations(rows, *parameters)
         ctx.save_for_backward(*inputs, *parameters[::2])
         return out
 
@@ -132,5 +128,5 @@ class Mlp(nn.Sequential):
         parameters = [each for layer in layers if layer for each in layer._parameters.values() if each is not None]
         rows = x if x.dim() == 3 else x.reshape(len(x), -1, x.shape[-1])
         # A node of the graph costs an agent's step a tenth of its time, for a gradient that nobody asks for.
-        out = MlpFunction.apply(rows, *parameters) if torch.is_grad_enabled() else activations(rows, parameters)[-1]
+        out = MlpFunction.apply(rows, *parameters) if torch.is_grad_enabled() else activations(rows, *parameters)[-1]
         return out if rows is x else out.reshape(*x.shape[:-1], out.shape[-1])

@@ -211,4 +211,4 @@ def products(a: Tensor, b: Tensor) -> Tensor:
 
     `layers.by_seed` is for three axes; one function for both, by matmul, has other bits.
     """
-    return a @ b if len(a) == 1 else torch.cat([*map(torch.matmul, a.split(1), b.split(1))])
+    return a @ b if a.shape[0] == 1 else torch.cat([*map(torch.matmul, a.split(1), b.split(1))])

@@ -19,7 +19,8 @@ HEAVY = 30.0  # excess kurtosis of labels: a normal distribution has 0, Laplace'
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
     """[S, F] -> [S, 1, ..., 1, F], to broadcast against tensors [S, ..., F]."""
-    return statistic.view(len(statistic), *(1,) * (like.dim() - 2), -1)
+    seeds, features = statistic.shape
+    return statistic if seeds == 1 else statistic.view(seeds, *(1,) * (like.dim() - 2), features)
 
 
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:

@@ -36,8 +36,8 @@ class OnlineBelief(nn.Module):
         """Memories [S, ..., M] -> beliefs [S, ..., P]."""
         with torch.no_grad():
             read, mean = model.read(memory)
-        added, *rest = self.gaussian.split(self.apart(read))
-        return torch.cat([mean + per_seed(self.unit, mean) * added, *rest], -1)
+        added, std, lower = self.gaussian.split(self.net(read))
+        return self.gaussian.joined(mean + per_seed(self.unit, mean) * added, std, lower)
 
     def apart(self, read: Tensor) -> Tensor:
         """Beliefs [S, ..., P] about how far theta_hat is from the mean of the model's belief, in units of its stds."""
