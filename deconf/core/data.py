@@ -38,6 +38,11 @@ def trials_of(source: Source) -> Trials:
     return trials
 
 
+def stacked(of_seeds: list[Tensor]) -> Tensor:
+    """Tensors of each seed as one, [S, ...]."""
+    return of_seeds[0][None] if len(of_seeds) == 1 else torch.stack(of_seeds)
+
+
 class Draws:
     """S independent streams of random numbers: row s of every draw comes from generator s alone."""
 
@@ -59,15 +64,15 @@ class Draws:
 
     def uniform(self, *shape: int) -> Tensor:
         """U(0, 1) [S, *shape]."""
-        return torch.stack([torch.rand(shape, generator=g, device=self.device) for g in self._streams])
+        return stacked([torch.rand(shape, generator=g, device=self.device) for g in self._streams])
 
     def normal(self, *shape: int) -> Tensor:
         """N(0, 1) [S, *shape]."""
-        return torch.stack([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
+        return stacked([torch.randn(shape, generator=g, device=self.device) for g in self._streams])
 
     def integers(self, high: int, *shape: int) -> Tensor:
         """Uniform integers 0 .. high - 1, [S, *shape]."""
-        return torch.stack([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
+        return stacked([torch.randint(high, shape, generator=g, device=self.device) for g in self._streams])
 
 
 @dataclass(frozen=True)

@@ -89,9 +89,8 @@ class LinearModel(LatentModel):
     def final_memory(self, batch: Batch) -> Tensor:
         return self._terms(batch).sum(2)
 
-    @torch.no_grad()
     def _posterior(self, memory: Tensor) -> Tensor:
-        """Mean and logarithmic stds of the posterior, and the logarithm of the count."""
+        """Mean and logarithmic stds of the posterior, and the logarithm of the count. Memories have no gradient."""
         precision, weighted, _ = self._sums(memory)
         root = inverse(posterior_root(precision))
         mean = (root.mT @ (root @ weighted[..., None]))[..., 0].float()
