@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from deconfounded.deconf.core.data import Batch, Draws, Signature, as_generators
+from deconfounded.deconf.core.data import Batch, Draws, Signature, as_generators, copied
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.envs.streams import Array
@@ -99,8 +99,7 @@ class LearnedAgent(Agent):
             raise InputError(
                 f"observations had shape {shape}; they must be ({self.seeds * self._n}, {width}), a row a trial"
             )
-        # A copy, in torch's own memory: numpy's is not as aligned, and sums of matrix products have other bits there.
-        return torch.tensor(obs, dtype=torch.float32, device=self.device).reshape(self.seeds, self._n, -1)
+        return copied(obs, self.device).view(self.seeds, self._n, width)
 
     @abstractmethod
     def choose(self, obs: Tensor) -> Tensor:
