@@ -33,7 +33,6 @@ class Refit:
     index: int
     seed: int
     refits: int
-    made_of: str
     folder: Path
 
     method = "refit"
@@ -45,16 +44,15 @@ class Refit:
 
     @property
     def file(self) -> Path:
-        return self.folder / f"refit-{self.index}.json"
+        return self.folder / "jobs" / f"refit-{self.index}.json"
 
     def findings(self) -> "Findings | None":
-        """What was measured, if it was of the same."""
+        """What was measured; None if nothing was, or the file is damaged."""
         from deconfounded.deconf.diagnosis.measures import Findings
 
         try:
-            kept = json.loads(self.file.read_bytes())
-            return Findings(**kept["figures"]) if kept["made_of"] == self.made_of else None
-        except (OSError, ValueError, KeyError, TypeError):
+            return Findings(**json.loads(self.file.read_bytes()))
+        except (OSError, ValueError, TypeError):
             return None
 
     def run(self) -> str:
@@ -75,19 +73,21 @@ class Refit:
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
         explore = None if self.explore is None else Trials.load(self.explore)
         findings = measure(Trials.load(self.trials), explore, self.amounts, rng, tell)
-        write_json(self.file, {"made_of": self.made_of, "figures": findings._asdict()})
+        write_json(self.file, findings._asdict())
         return f"measured in {time.time() - start:.0f} s"
 
 
 def run(
     data: list[Path], exploration: list[Path] | None, columns: dict[str, Any], seed: int, folder: Path, command: str
 ) -> "tuple[Diagnosis, str]":
-    """Diagnose, and write the page and the json; returns what to print too. What the folder has of the same, stays.
+    """Diagnose, and write the page and the json; returns what to print too. An interrupted diagnosis goes on.
 
-    columns: arguments of `datasets.read`. Raises InputError for data that cannot be judged.
+    columns: arguments of `datasets.read`. Raises InputError for data that cannot be judged, and for a folder that holds
+    another diagnosis.
     """
     trials, explore = look.read(data, exploration, columns)
     from deconfounded.benchmarks.engine import identity
+    from deconfounded.benchmarks.engine.job_files import prepare
     from deconfounded.benchmarks.engine.scheduler import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
     from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check
@@ -105,10 +105,10 @@ def run(
         "versions": identity.versions(),
         "version": VERSION,
     }
-    shared: dict[str, Any] = {"seed": seed, "refits": config.refits, "made_of": json.dumps(about), "folder": folder}
     files = folder / "trials.npz", None if explore is None else folder / "explored.npz"
-    refits = [Refit(*files, config.amounts, i, **shared) for i in range(config.refits)]
+    refits = [Refit(*files, config.amounts, i, seed, config.refits, folder) for i in range(config.refits)]
     with commands.locked(folder), commands.local() as engine:
+        prepare(folder, about, resume=True)
         for log, file in zip((trials, explore), files, strict=True):
             if log is not None and file is not None:
                 log.save(file)
