@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
@@ -79,6 +79,12 @@ class Method:
         if len(task.observation) >= LARGE_OBSERVATION:
             changes |= {"width": WIDE, **(self.large(config) if self.large else {})}
         return values | {key: value for key, value in changes.items() if key in values}
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Those of the settings of its configuration that have a default."""
+        options = () if self.on_control is None else fields(self.on_control)
+        return {option.name: option.default for option in options if option.default is not MISSING}
 
     def config(self, values: Mapping[str, Any]) -> Any:
         """A configuration of these values; None if the method has none."""

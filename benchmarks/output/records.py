@@ -15,7 +15,7 @@ from typing import Any
 import fastjsonschema
 import numpy as np
 
-from deconfounded.benchmarks.engine.catalogue import label
+from deconfounded.benchmarks.engine.catalogue import METHODS, label
 from deconfounded.benchmarks.engine.identity import named as named_protocol
 from deconfounded.benchmarks.engine.job_files import Finished
 from deconfounded.benchmarks.engine.protocols import STANDARD
@@ -107,8 +107,21 @@ def check(record: Any, where: str) -> Record:
 
 
 def stale(record: Record, identity: Mapping[str, Any]) -> list[str]:
-    """What a record was made of that is no longer so, of `MADE_OF`; identity: of the job that would make it today."""
-    return [key for key in MADE_OF if record.get(key) != identity.get(key)]
+    """What a record was made of that is no longer so, of `MADE_OF`; identity: of the job that would make it today.
+
+    A setting that is newer than the record had its default, by which a method does what it did before.
+    """
+    then = {**record, "settings": _with_newer(record, identity["settings"].get("config", {}))}
+    return [key for key in MADE_OF if then.get(key) != identity.get(key)]
+
+
+def _with_newer(record: Record, config: Mapping[str, Any]) -> Any:
+    """The settings of a record; those of a configuration today that it lacks at their defaults."""
+    settings, method = record["settings"], METHODS.get(record["method"])
+    if method is None or "config" not in settings:
+        return settings
+    newer = {name: value for name, value in method.defaults.items() if name in config}
+    return {**settings, "config": {**newer, **settings["config"]}}
 
 
 def place(task: str) -> str:

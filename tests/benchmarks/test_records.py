@@ -339,6 +339,16 @@ class TestRecords:
         for key in records.MADE_OF:
             assert records.stale({**record, key: "other"}, today) == [key]
 
+    def test_a_setting_that_is_newer_than_the_record(self, job: BenchmarkJob) -> None:
+        """It does not make the record stale where it has its default; elsewhere it does."""
+        record, today = kept(job)[0], identity.identity(job)
+        config = record["settings"]["config"]
+        default = {name: value for name, value in METHODS[job.method].defaults.items() if config.get(name) == value}
+        other = next(name for name in config if name not in default)
+        for name, what in ((next(iter(default)), []), (other, ["settings"])):
+            before = {key: value for key, value in config.items() if key != name}
+            assert records.stale({**record, "settings": {**record["settings"], "config": before}}, today) == what
+
     @pytest.mark.parametrize(
         ("change", "says"),
         [
