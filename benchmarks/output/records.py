@@ -111,11 +111,11 @@ def stale(record: Record, identity: Mapping[str, Any]) -> list[str]:
 
     A setting that is newer than the record had its default, by which a method does what it did before.
     """
-    then = {**record, "settings": _with_newer(record, identity["settings"].get("config", {}))}
-    return [key for key in MADE_OF if then.get(key) != identity.get(key)]
+    made_of = {**record, "settings": _completed(record, identity["settings"].get("config", {}))}
+    return [key for key in MADE_OF if made_of.get(key) != identity.get(key)]
 
 
-def _with_newer(record: Record, config: Mapping[str, Any]) -> Any:
+def _completed(record: Record, config: Mapping[str, Any]) -> Any:
     """The settings of a record; those of a configuration today that it lacks at their defaults."""
     settings, method = record["settings"], METHODS.get(record["method"])
     if method is None or "config" not in settings:
