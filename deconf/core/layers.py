@@ -72,8 +72,16 @@ class Linear(nn.Module):
 
 
 def by_seed(a: Tensor, b: Tensor) -> Tensor:
-    """a [S, N, K] b [S, K, M], seed by seed: products of a stack have another order of sums than those of one seed."""
-    return torch.bmm(a, b) if len(a) == 1 else torch.cat([*map(torch.bmm, a.split(1), b.split(1))])
+    """a [S, N, K] b [S, K, M], seed by seed: products of a stack have another order of sums than those of one seed.
+
+    Without a gradient.
+    """
+    if len(a) == 1:
+        return torch.bmm(a, b)
+    out = a.new_empty(len(a), a.shape[1], b.shape[2])
+    for operands in zip(a.split(1), b.split(1), out.split(1), strict=True):
+        torch.bmm(*operands[:2], out=operands[2])
+    return out
 
 
 def parameter_gradients(rows: Tensor, grad: Tensor) -> tuple[Tensor, Tensor]:

@@ -208,6 +208,11 @@ class Evidence(torch.autograd.Function):
 def products(a: Tensor, b: Tensor) -> Tensor:
     """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M]: seed by seed, since a larger stack rounds otherwise.
 
-    `layers.by_seed` is for three axes; one function for both, by matmul, has other bits.
+    Without a gradient. `layers.by_seed` is for three axes; one function for both, by matmul, has other bits.
     """
-    return a @ b if a.shape[0] == 1 else torch.cat([*map(torch.matmul, a.split(1), b.split(1))])
+    if a.shape[0] == 1:
+        return a @ b
+    out = a.new_empty(*a.shape[:-1], b.shape[-1])
+    for operands in zip(a.split(1), b.split(1), out.split(1), strict=True):
+        torch.matmul(*operands[:2], out=operands[2])
+    return out
