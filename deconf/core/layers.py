@@ -6,6 +6,7 @@ seed's numbers are the same, bit for bit, whatever runs beside it.
 
 import ctypes
 import platform
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -36,14 +37,16 @@ prepare_torch()
 
 def stack_differs(rows: Tensor, weight: Tensor) -> bool:
     """Whether the product of stacked rows [S, R, I] and weights [S, I, O] may have other bits than a seed's alone."""
+    seeds, count, _ = rows.shape
+    if seeds == 1:
+        return False
     _, inputs, outputs = weight.shape
-    count = rows.shape[1]
     return min(count, outputs) < NARROW or inputs == 1 or count * inputs * outputs <= SMALL
 
 
 def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """Add rows [S, R, I] weight [S, I, O] to out [S, R, O], with the same bits for a seed however many are stacked."""
-    if rows.shape[0] > 1 and stack_differs(rows, weight):
+    if stack_differs(rows, weight):
         for operands in zip(out.split(1), rows.split(1), weight.split(1), strict=True):
             operands[0].baddbmm_(*operands[1:])
         return out
@@ -52,7 +55,7 @@ def add_product(out: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
 
 def affine(bias: Tensor, rows: Tensor, weight: Tensor) -> Tensor:
     """bias [S, 1 or R, O] + rows [S, R, I] weight [S, I, O], with the same bits for a seed however many are stacked."""
-    if rows.shape[0] > 1 and stack_differs(rows, weight):
+    if stack_differs(rows, weight):
         return torch.cat([*map(torch.baddbmm, bias.split(1), rows.split(1), weight.split(1))])
     return torch.baddbmm(bias, rows, weight)
 
@@ -71,16 +74,16 @@ class Linear(nn.Module):
         return out.reshape(*x.shape[:-1], out.shape[-1])
 
 
-def by_seed(a: Tensor, b: Tensor) -> Tensor:
-    """a [S, N, K] b [S, K, M], seed by seed: products of a stack have another order of sums than those of one seed.
+def by_seed(a: Tensor, b: Tensor, product: Callable[..., Tensor] = torch.bmm) -> Tensor:
+    """a [S, ..., N, K] b [S, ..., K, M], seed by seed: products of a stack have another order of sums than of one seed.
 
-    Without a gradient.
+    Without a gradient. product: of one seed; torch.bmm is for three axes, and torch.matmul has other bits there.
     """
-    if len(a) == 1:
-        return torch.bmm(a, b)
-    out = a.new_empty(len(a), a.shape[1], b.shape[2])
+    if a.shape[0] == 1:
+        return product(a, b)
+    out = a.new_empty(*a.shape[:-1], b.shape[-1])
     for operands in zip(a.split(1), b.split(1), out.split(1), strict=True):
-        torch.bmm(*operands[:2], out=operands[2])
+        product(*operands[:2], out=operands[2])
     return out
 
 

@@ -12,6 +12,7 @@ from deconfounded.deconf.core.correlated import Correlated, inverse, log_expecte
 from deconfounded.deconf.core.data import Batch, Draws, take
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_model import LatentModel
+from deconfounded.deconf.core.layers import by_seed
 from deconfounded.deconf.core.nets import Inputs, Scales, per_seed
 
 READ = 256  # memories an update, from each of which the evidence that follows is predicted
@@ -206,13 +207,5 @@ class Evidence(torch.autograd.Function):
 
 
 def products(a: Tensor, b: Tensor) -> Tensor:
-    """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M]: seed by seed, since a larger stack rounds otherwise.
-
-    Without a gradient. `layers.by_seed` is for three axes; one function for both, by matmul, has other bits.
-    """
-    if a.shape[0] == 1:
-        return a @ b
-    out = a.new_empty(*a.shape[:-1], b.shape[-1])
-    for operands in zip(a.split(1), b.split(1), out.split(1), strict=True):
-        torch.matmul(*operands[:2], out=operands[2])
-    return out
+    """a @ b, of stacks [S, ..., N, K] and [S, ..., K, M], seed by seed. Without a gradient."""
+    return by_seed(a, b, torch.matmul)

@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source, stacked
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
@@ -99,7 +99,7 @@ class TransformerAgent(LearnedAgent):
     def act_on(self, tokens: Tensor, scaled: Tensor) -> Tensor:
         """Action [S, N, A], given each trial's next token [S, N, I] and its scaled observation [S, N, O]."""
         steps = zip(tokens, self._layers, self._caches, strict=True)
-        self._features = torch.stack([self.net.step(*of_seed) for of_seed in steps])
+        self._features = stacked([self.net.step(*of_seed) for of_seed in steps])
         return self.policy.sample(torch.cat([self._features, scaled], -1), self._draws)
 
     def remember(self, step: Batch) -> None:
