@@ -2,11 +2,12 @@
 
 Every method on every task of the suite: ten seeds of those that a default run makes, the paper's comparison and the
 exact policies, and five of all others. Under another `--protocol`, five seeds of the methods that docs/protocols.md
-compares. A record of today's versions, settings and expert stays; the others are made, and kept as soon as they are
-done. Stopped, it goes on where it was. The first five seeds of everything come first.
+compares; under `scarce`, what learns from no data keeps its records of the standard protocol. A record of today's
+versions, settings and expert stays; the others are made, and kept as soon as they are done. Stopped, it goes on where
+it was. The first five seeds of everything come first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,17 +33,42 @@ def seeds_of(method: str, least: int, most: int, protocol: str = STANDARD) -> tu
     return tuple(range(least, most if many else min(most, FEWER)))
 
 
-def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...]:
-    """The job's seeds of which a deployment has no record among those kept of its task, or one that is stale."""
+def fresh(job: "Job", preset: str, kept: "Sequence[Record]") -> "dict[tuple[int, str], Record]":
+    """Of the records kept of the job's task, those that the job would make again today, by seed and deployment."""
     from deconfounded.benchmarks.engine.identity import identity
     from deconfounded.benchmarks.output import records
 
     today = identity(job)
     same = [record for record in kept if (record["method"], record["preset"]) == (job.method, preset)]
-    same = [record for record in same if record.get("protocol_name") == today.get("protocol_name")]
-    fresh = {(record["seed"], record["deployment"]) for record in same if not records.stale(record, today)}
+    same = [record for record in same if record.get(records.NAME) == today.get(records.NAME)]
+    return {(record["seed"], record["deployment"]): record for record in same if not records.stale(record, today)}
+
+
+def _without(job: "Job", made: "Collection[tuple[int, str]]") -> tuple[int, ...]:
+    """The job's seeds of which a deployment is not among those made."""
     ways = ("", *job.about.deployments)
-    return tuple(seed for seed in job.seeds if any((seed, way) not in fresh for way in ways))
+    return tuple(seed for seed in job.seeds if any((seed, way) not in made for way in ways))
+
+
+def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...]:
+    """The job's seeds of which a deployment has no record among those kept of its task, or one that is stale."""
+    return _without(job, fresh(job, preset, kept))
+
+
+def unchanged(job: "Job", preset: str, kept: "Sequence[Record]") -> "list[Record]":
+    """The job's records as copies of those of the standard protocol, if its protocol does not change what they are of.
+
+    That is so where a protocol only gives less data and a method learns from none. Otherwise empty.
+    """
+    from deconfounded.benchmarks.output import records
+
+    task = envs.get(job.task)
+    if applied(job.protocol, task) is not task:
+        return []
+    standard = fresh(replace(job, protocol=STANDARD), preset, kept)
+    if _without(job, standard):
+        return []
+    return [{**record, records.NAME: job.protocol} for (seed, _), record in standard.items() if seed in job.seeds]
 
 
 def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
@@ -100,6 +126,9 @@ def main() -> None:
     print(f"{sum(map(len, left.values()))} seeds to make, kept one by one: stop when you like")
     options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():
-        base = replace(job.preset, configs={})  # a method's configuration is each job's own affair
-        made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, job.folder.parent, base=base, **options)
+        made = unchanged(job, args.preset, there[job.task])
+        if not made:
+            base = replace(job.preset, configs={})  # a method's configuration is each job's own affair
+            where = job.folder.parent
+            made = runs.run(envs.get(job.task), job.preset, [job.method], seeds, where, base=base, **options)
         records.write(kept, made)

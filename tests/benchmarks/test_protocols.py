@@ -48,6 +48,16 @@ def test_scarce_amounts() -> None:
     assert protocols.amounts("once", plain) == plain
 
 
+def test_scarce_is_evaluated_as_the_standard_protocol() -> None:
+    """So that who learns from no data has the same record under both."""
+    amounts = {"expert_trials": 32, "explore_trials": 16}
+    scarce, standard = (
+        evaluate(context(PUSH, name, **amounts), RandomAgent(PUSH.action_space), False)[0]["returns"]
+        for name in ("scarce", "standard")
+    )
+    assert np.array_equal(scarce, standard)
+
+
 def test_scarce_is_scarce_for_every_method() -> None:
     """Demonstrations are not drawn anew; and a method that says itself how much it explores is refused."""
     bandit = preset("paper", envs.get("bandit"), "cpu")
@@ -170,6 +180,26 @@ class TestTables:
         assert table.missing(replace(job, protocol="once"), "default", fresh) == (0, 1)
         way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
         assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
+
+    def test_what_scarce_data_do_not_change_is_not_made_again(self, both: tuple[list[Any], list[Any]]) -> None:
+        """Records of the standard protocol are also those of a policy that learns from no data, and of no other."""
+
+        def copied(method: str, protocol: str, change: Any = None) -> list[Any]:
+            task = envs.get("curling")
+            settings = protocols.amounts(protocol, preset("default", task, "cpu", [method]))
+            job = BenchmarkJob("curling", settings, method, (0, 1), Path(), protocol=protocol)
+            whole = replace(job, preset=preset("default", task, "cpu", [method]), protocol="standard")
+            today = identity(whole)
+            of = {**both[0][0], **{key: today[key] for key in records.MADE_OF if key in today}, "method": method}
+            return table.unchanged(job, "default", [{**of, "seed": seed, **(change or {})} for seed in (0, 1, 2)])
+
+        assert [(one["seed"], one["protocol_name"]) for one in copied("random", "scarce")] == [
+            (0, "scarce"),
+            (1, "scarce"),
+        ]
+        assert copied("random", "once") == copied("random", "unseen") == []  # others in evaluation
+        assert copied("oracle_bc", "scarce") == copied("rma", "scarce") == []  # learn from fewer trials
+        assert copied("random", "scarce", {"method_version": -1}) == []
 
 
 @pytest.mark.parametrize("protocol", ["scarce", "unseen", "once"])
