@@ -20,6 +20,7 @@ PROTOCOLS = {
     "unseen": "theta from the middle half of each latent's distribution in training, from the rest in evaluation",
     "once": "trials of one episode",
 }
+ONLY_AMOUNTS = (STANDARD, "scarce")  # differ in amounts of data, not in what is evaluated
 COMPARED = (
     *("deconfounded", "deconfounded_offline", "dagger", "rma", "naive_rnn", "oracle_bc"),
     *("conditional", "interventional"),

@@ -17,7 +17,7 @@ from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.identity import named
-from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD, amounts, applied
+from deconfounded.benchmarks.engine.protocols import COMPARED, ONLY_AMOUNTS, PROTOCOLS, STANDARD, amounts, applied
 from deconfounded.benchmarks.studies import runs
 
 if TYPE_CHECKING:
@@ -55,20 +55,19 @@ def missing(job: "Job", preset: str, kept: "Sequence[Record]") -> tuple[int, ...
     return _without(job, fresh(job, preset, kept))
 
 
-def unchanged(job: "Job", preset: str, kept: "Sequence[Record]") -> "list[Record]":
-    """The job's records as copies of those of the standard protocol, if its protocol does not change what they are of.
+def copied(job: "Job", preset: str, kept: "Sequence[Record]") -> "list[Record]":
+    """The job's records as copies of those of another protocol, if the two differ in amounts of data alone.
 
-    That is so where a protocol only gives less data and a method learns from none. Otherwise empty.
+    The records of a method that uses no data are of the same settings under both. Empty if a seed has none there.
     """
-    from deconfounded.benchmarks.output import records
+    from deconfounded.benchmarks.output.records import NAME
 
-    task = envs.get(job.task)
-    if applied(job.protocol, task) is not task:
-        return []
-    standard = fresh(replace(job, protocol=STANDARD), preset, kept)
-    if _without(job, standard):
-        return []
-    return [{**record, records.NAME: job.protocol} for (seed, _), record in standard.items() if seed in job.seeds]
+    for protocol in ONLY_AMOUNTS if job.protocol in ONLY_AMOUNTS else ():
+        of = fresh(replace(job, protocol=protocol), preset, kept)
+        if protocol != job.protocol and not _without(job, of):
+            plain = [{key: record[key] for key in record if key != NAME} for record in of.values()]
+            return [record | named(job.protocol) for record in plain if record["seed"] in job.seeds]
+    return []
 
 
 def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
@@ -126,7 +125,7 @@ def main() -> None:
     print(f"{sum(map(len, left.values()))} seeds to make, kept one by one: stop when you like")
     options = {"preset": args.preset, "changes": args.set, "cluster": args.cluster, **under}
     for job, seeds in left.items():
-        made = unchanged(job, args.preset, there[job.task])
+        made = copied(job, args.preset, there[job.task])
         if not made:
             base = replace(job.preset, configs={})  # a method's configuration is each job's own affair
             where = job.folder.parent

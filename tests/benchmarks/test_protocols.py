@@ -181,17 +181,19 @@ class TestTables:
         way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
         assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
 
-    def test_what_scarce_data_do_not_change_is_not_made_again(self, both: tuple[list[Any], list[Any]]) -> None:
+    def test_what_scarce_data_do_not_change_is_not_made_twice(self, both: tuple[list[Any], list[Any]]) -> None:
         """Records of the standard protocol are also those of a policy that learns from no data, and of no other."""
 
-        def copied(method: str, protocol: str, change: Any = None) -> list[Any]:
+        def copied(method: str, protocol: str, kept_of: str = "standard", **change: Any) -> list[Any]:
             task = envs.get("curling")
-            settings = protocols.amounts(protocol, preset("default", task, "cpu", [method]))
-            job = BenchmarkJob("curling", settings, method, (0, 1), Path(), protocol=protocol)
-            whole = replace(job, preset=preset("default", task, "cpu", [method]), protocol="standard")
-            today = identity(whole)
+
+            def job(under: str) -> BenchmarkJob:
+                settings = protocols.amounts(under, preset("default", task, "cpu", [method]))
+                return BenchmarkJob("curling", settings, method, (0, 1), Path(), protocol=under)
+
+            today = identity(job(kept_of))
             of = {**both[0][0], **{key: today[key] for key in records.MADE_OF if key in today}, "method": method}
-            return table.unchanged(job, "default", [{**of, "seed": seed, **(change or {})} for seed in (0, 1, 2)])
+            return table.copied(job(protocol), "default", [{**of, "seed": seed, **change} for seed in (0, 1, 2)])
 
         assert [(one["seed"], one["protocol_name"]) for one in copied("random", "scarce")] == [
             (0, "scarce"),
@@ -199,7 +201,9 @@ class TestTables:
         ]
         assert copied("random", "once") == copied("random", "unseen") == []  # others in evaluation
         assert copied("oracle_bc", "scarce") == copied("rma", "scarce") == []  # learn from fewer trials
-        assert copied("random", "scarce", {"method_version": -1}) == []
+        assert copied("random", "scarce", method_version=-1) == []
+        assert [one.get("protocol_name") for one in copied("random", "standard", "scarce")] == [None, None]
+        assert copied("random", "standard", "once") == copied("oracle_bc", "standard", "scarce") == []
 
 
 @pytest.mark.parametrize("protocol", ["scarce", "unseen", "once"])
