@@ -10,7 +10,7 @@ import hashlib
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,8 +126,12 @@ def _filled(file: Path, tables: dict[str, str]) -> str:
     return text
 
 
-def texts(found: index.Found) -> dict[Path, str]:
-    """By its file, what each page is to say. found: what `results.published` gives."""
+def texts(found: index.Found, hard_tasks: index.Found, by_protocol: Mapping[str, index.Found]) -> dict[Path, str]:
+    """By its file, what each page is to say.
+
+    found, hard_tasks: what `results.published` gives of the suite and of the hard tasks; by_protocol: what
+    `results.other_protocols` gives.
+    """
     certified = cards.certified()
     tiers = {"none" if tier is None else str(tier): text.partition(": ")[2] for tier, text in TIERS.items()}
     tables = {
@@ -141,7 +145,6 @@ def texts(found: index.Found) -> dict[Path, str]:
         DOCS / "concepts.md": {"certificates": cards.certificates(certified)},
         README: {"summary": results.summary(found, certified)},
     }
-    hard_tasks, by_protocol = results.published(names=envs.HARD), results.other_protocols()
     return {
         DOCS / "index.html": index.page(DOCS, found, certified, results.command, tiers),
         DOCS / "tasks.md": cards.tasks_page(),
@@ -158,17 +161,20 @@ def write() -> str:
 
     Returns README's table of results.
     """
-    found = results.published()
+    found, hard_tasks, by_protocol = results.published(), results.published(names=envs.HARD), results.other_protocols()
     small = index.stills(DOCS)
     for name, file in small.items():
         still(DOCS / name, file)
     for file in {*(DOCS / "stills").rglob("*.webp")} - {*small.values()}:
         file.unlink()
-    for file, text in texts(found).items():
+    for file, text in texts(found, hard_tasks, by_protocol).items():
         if not file.exists() or file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
     redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
     redraw(DOCS / "headroom.png", headroom.picture, headroom.points(found, cards.certified()))
+    under = protocol_scores.points([*found, *hard_tasks], by_protocol)
+    if under:
+        redraw(DOCS / "protocols.png", protocol_scores.picture, under)
     redraw(DOCS / "diagnose" / "validation.png", validate.picture, cards.kept(validate.KEPT))
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
     redraw(DOCS / "exploration.png", exploration.picture, cards.kept("exploration"))

@@ -360,6 +360,32 @@ class TestProtocols:
         assert "| interquartile mean | 0.75 |" in both
         assert "| the same, standard, first episode | 0.50 |" in both
 
+    def test_means_are_over_shared_seeds(self) -> None:
+        """An agent with more seeds under one protocol is compared on those that it has under both."""
+        more = {"seeds": [0, 1, 2], "return": [[0.5, 0.75], [0.5, 0.75], [0.5, 0.0]]}
+        curling, wider = (
+            [(envs.get("curling"), {"methods": {**self.ALL, "dagger": {**self.ALL["dagger"], **of}}})]
+            for of in ({}, more)
+        )
+        expected = protocol_scores.Mean("dagger", 1, 0.75, (0.75, 0.75), 0.75)
+        dagger = protocol_scores.SHOWN.index("dagger")
+        assert protocol_scores.means("unseen", "last", wider, curling)[dagger] == expected
+        assert protocol_scores.means("unseen", "last", curling, wider)[dagger] == expected
+
+    def test_picture(self, tmp_path: Path) -> None:
+        """A row for each protocol with means; what it shows are those of the tables."""
+        curling = [(envs.get("curling"), {"methods": self.ALL})]
+        made = protocol_scores.points(curling, {"unseen": curling, "once": curling})
+        assert [(name, [said for said, _ in by_end]) for name, by_end in made] == [
+            ("unseen", ["the first episode", "the last episode"]),
+            ("once", ["the only episode"]),
+        ]
+        only = [(mean.agent, mean.value, mean.standard) for mean in made[1][1][0][1]]
+        assert only == [(name, 0.75, 0.5) for name in protocol_scores.SHOWN]
+        protocol_scores.picture(made, tmp_path / "protocols.png")
+        assert (tmp_path / "protocols.png").stat().st_size > 10000
+        assert protocol_scores.points([], {"unseen": curling}) == []
+
     def test_table_in_the_making(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A task appears with its references, without which it has no scores; pages can be made before that."""
         for name in ("curling", "slippery_cartpole"):
