@@ -66,7 +66,7 @@ class ThetaModel:
         return np.stack([axis.ravel() for axis in axes], -1)
 
     def _values_each(self, k: int) -> int:
-        return max(2, int(k ** (2 / (len(self.latents) + 1)))) if len(self.latents) > 1 else k
+        return max(2, int(k ** (2 / (len(self.latents) + 1)) + 1e-9)) if len(self.latents) > 1 else k
 
     def transition(self, k: int) -> Array:
         """Transition matrix [K, K] on `theta_grid(k)`: P(theta of the next episode | theta of this episode)."""

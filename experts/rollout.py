@@ -288,6 +288,8 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
             alive = env.alive
             chosen = agent.act(now)
             then, reward, _, _ = env.step(chosen)
+            if not task.n_actions:
+                chosen = np.clip(chosen, -1, 1)  # as the environments did
             agent.observe(now, chosen, then, alive)
             obs[:, e, t + 1] = np.where(alive[:, None], then, obs[:, e, t])
             action[:, e, t] = np.where(alive[:, None], chosen, 0)

@@ -184,13 +184,16 @@ def tables(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str]) 
 def notes(scores: Scores) -> str:
     """What the figures are, and what their intervals hold."""
     fewest = min(len(seeds) for of in scores.values() for seeds in of.values())
-    share = f"; of {fewest} seeds it contains the true value in {statistics.coverage(fewest):.0%} of cases"
-    held = share if fewest > 1 else ""
+    share = (
+        f"; with {fewest} seeds of many tasks it contains the true value in {statistics.coverage(fewest):.0%} of cases"
+    )
+    held = f"{share}, with few tasks in fewer" if fewest > 1 else ""
     return (
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
         " come with the package. Regret is the expert's score less the method's, summed over the episodes; less is"
         " better. Differences are paired by seed; their 95% intervals are Student's, over tasks Welch's."
-        f" IQM is the interquartile mean of all runs; its interval, and that of P, is a stratified bootstrap{held}."
+        f" IQM is the interquartile mean of all runs; its interval is a stratified bootstrap{held}. The interval of P"
+        " is a stratified bootstrap too."
     )
 
 

@@ -60,12 +60,15 @@ def run(
 
 
 def certificate(task: envs.Task, expert: str | None, folder: Path) -> dict[str, Any]:
-    """The task's certificate, made with that expert."""
+    """The task's certificate, made with that expert; kept in the folder as long as neither has a new version."""
     from deconfounded.benchmarks.certify import certify
+    from deconfounded.benchmarks.engine import identity
     from deconfounded.experts import policy
 
-    if not (file := folder / "certificate.json").is_file():
+    file, of = folder / "certificate.json", {"task_version": task.version, **identity.expert(task, expert)}
+    held: dict[str, Any] = json.loads(file.read_bytes()) if file.is_file() else {}
+    if held.get("made_of") != of:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(file, certify(task, policy.load(task, expert)))
-    held: dict[str, Any] = json.loads(file.read_bytes())
-    return held
+        held = {**certify(task, policy.load(task, expert)), "made_of": of}
+        write_json(file, held)
+    return {key: value for key, value in held.items() if key != "made_of"}

@@ -50,14 +50,14 @@ class Adam:
         self.rate = state["rate"]
 
     def step(self, loss: Tensor) -> None:
-        """Take one step on losses [S]. Raises InputError, which names the update, where parameters would become NaN."""
+        """Take one step on losses [S]. Raises InputError, which names the update, if a gradient is not finite."""
         if self.parameters[0].data_ptr() != self._flat.data_ptr():
             raise RuntimeError(f"another Adam trains {self._trained}: this one is out of date")
         grads = torch.autograd.grad(loss.sum(), self.parameters, allow_unused=True, materialize_grads=True)
         torch.cat([grad.flatten(1) for grad in grads], 1, out=self.gradient)
         # Seed by seed: a sum over a stack has another order for one seed than for several.
         squares = torch.stack([row.square().sum() for row in self.gradient])
-        if not math.isfinite(sum(loss.flatten().tolist())) or math.isnan(sum(squares.tolist())):
+        if not all(map(math.isfinite, (*loss.flatten().tolist(), *squares.tolist()))):
             self._fail(loss)
         self.gradient *= (1 / (squares.sqrt() + 1e-6)).clamp(max=1)[:, None]
         # Seed by seed: the fused kernel rounds the end of a tensor otherwise than its middle. torch.optim.Adam itself
@@ -75,7 +75,7 @@ class Adam:
     def _fail(self, loss: Tensor) -> None:
         update = 1 + int(self._done[0])
         value = next((x for x in loss.flatten().tolist() if not math.isfinite(x)), None)
-        what = "its gradient was NaN" if value is None else f"it was {value}"
+        what = "its gradient was NaN or too large" if value is None else f"it was {value}"
         raise InputError(
             f"the loss of {self._trained} failed in update {update}: {what}; a lower learning rate may help, or data of"
             " about unit size"

@@ -26,7 +26,7 @@ def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
 def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and variance [S, F] of x [S, ..., F] where mask [S, ...] is 1."""
     flat, weight = x.flatten(1, -2), mask.flatten(1)[..., None]
-    count = weight.sum(1)
+    count = weight.sum(1).clamp(min=1)  # a seed may have drawn trials without a step
     mean = (flat * weight).sum(1) / count
     return mean, ((flat - mean[:, None]).square() * weight).sum(1) / count
 

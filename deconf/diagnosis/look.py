@@ -49,7 +49,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     remarks = [Remark("size", note) for note in log.notes]
     for describe in (_ranges, _outliers, _duplicates, _pauses, _states, _tails, *[_repeats] * (not blind)):
         remarks += describe(log, steps)
-    if not blind:
+    if not blind and log.actions != 1:  # of one action alone nothing follows
         remarks += [*_lag(part), *_lasting(part, fitted)]
     remarks += _dynamics(part, fitted, log.units.obs, blind)
     return sorted(remarks, key=lambda remark: remark.odd)

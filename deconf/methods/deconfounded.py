@@ -50,7 +50,7 @@ class DeconfoundedConfig(Configuration):
     final_updates: int = 2000  # of the policy, after the last round
     imitation_batch: int | None = 1024  # steps; None: all there are
     imitation_rate: float = 2e-3
-    cooled: bool = True  # learning rates fall to 0 along a cosine
+    cooled: bool = True  # the model's learning rate falls to 0 along a cosine; the policy's does after the last round
     accumulate: bool = True  # train on exploration of all rounds; else of each alone, and on fresh demonstrations
     fit_prior: bool = True  # to the latents of expert trials (empirical Bayes); else it is N(0, 1)
     drifts: bool = False  # theta changes between the episodes of a trial: see deconf/core/drift.py

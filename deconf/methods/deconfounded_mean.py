@@ -1,6 +1,7 @@
 """Tier 2 as in the authors' released code (vuoristo/deconfounding), where it departs from Algorithms 1 and 2.
 
-The data is that of `deconfounded`; four things differ. The policy is trained and deployed on the mean of the running
+The data is as much as that of `deconfounded`; five things differ. The agent itself explores, without random actions
+and without latents of other trials. The policy is trained and deployed on the mean of the running
 belief: theta_hat is sampled in the model's training alone, and expert actions are cloned given the belief at that step,
 not the belief after the whole trial. The KL divergence is from the belief of the step before, not from the prior. The
 latent of a step predicts several transitions, not one. The reconstruction loss is the squared error.

@@ -151,8 +151,9 @@ def draw_queries(mask: Tensor, longest: int, config: DptConfig, draws: Draws) ->
     """Steps of queries [S, B, K] in trials of mask [S, B, T], and how many transitions each reads, up to `longest`."""
     steps = mask.sum(-1, keepdim=True).long()
     readable = steps.clamp(max=longest)
+    last, latest = (steps - 1).clamp(min=0), (readable - 1).clamp(min=0)  # a trial may have no step
     where, first, second = draws.uniform(3, mask.shape[1], config.queries).unbind(1)
-    anywhere, at_end = (first * steps).long().clamp(max=steps - 1), (first * readable).long().clamp(max=readable - 1)
+    anywhere, at_end = (first * steps).long().clamp(max=last), (first * readable).long().clamp(max=latest)
     seen = (second * (readable + 1)).long().clamp(max=readable)
     return torch.where(where < config.anywhere, torch.stack([anywhere, seen]), at_end).unbind(0)  # type: ignore[return-value]
 

@@ -18,14 +18,14 @@ from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent
 
 @dataclass(frozen=True)
 class ExactConfig(Configuration):
-    """grid: values of each latent; 0 where all latents are categorical, and the grid is their categories."""
+    """grid: values of each latent that is not categorical; 0, as for bandits, whose are most often: the default."""
 
     grid: int = 21
 
 
 def _exact(given: Given, conditional: bool) -> Agent:
     env, expert = given.environment
-    return exact_agent(env, expert, conditional, given.config.grid)
+    return exact_agent(env, expert, conditional, given.config.grid or ExactConfig.grid)
 
 
 EXACT: dict[str, Any] = {"exact": True, "on_control": ExactConfig(), "on_bandit": ExactConfig(0), "smoke": {"grid": 9}}

@@ -10,6 +10,7 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.blackbox import BlackBox
 from deconfounded.envs.contract.probe import actions, beyond_bounds, streams
 from deconfounded.envs.physics import MujocoTask
+from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.task import Task
 
@@ -123,12 +124,26 @@ def _check_actions(task: Task) -> None:
 def _check_episodes(task: Task) -> None:
     """Rewards and observations are within their bounds, in an episode of 16 environments with random actions."""
     env = BatchEnv(task, 16)
-    env.reset(0)
+    obs = env.reset(0)
     for action in actions(task, 16, task.horizon):
+        if task.n_actions:
+            _check_probs(task, obs[env.alive], env.theta[env.alive])
         if beyond := beyond_bounds(task, env.state[env.alive]):
             raise InputError(beyond)
-        reward = env.step(action)[1].max()
-        if reward > 1 + 1e-9:
-            raise InputError(f"reward of {task.name} was {reward:g}; it must be at most 1 a step")
+        obs, reward, *_ = env.step(action)
+        if (most := reward.max()) > 1 + 1e-9:
+            raise InputError(f"reward of {task.name} was {most:g}; it must be at most 1 a step")
         if not env.alive.any():
             return
+
+
+def _check_probs(task: Task, obs: Array, theta: Array) -> None:
+    """The expert of a task with discrete actions takes each of them sometimes, or log-likelihoods are infinite."""
+    given = task.expert_probs(obs, theta)
+    probs = np.empty(0) if given is None else np.asarray(given, float)
+    if probs.ndim != 2 or probs.shape[0] not in (1, len(obs)) or probs.shape[1] != task.n_actions:
+        right = f"({len(obs)}, {task.n_actions}), a row for each observation"
+        raise InputError(f"expert_probs of {task.name} had shape {probs.shape}; it must be {right}")
+    if not (probs > 0).all() or not np.allclose(probs.sum(-1), 1):
+        row = probs[(~(probs > 0).all(-1) | ~np.isclose(probs.sum(-1), 1)).argmax()]
+        raise InputError(f"expert_probs of {task.name} gave {row.tolist()}; each must be above 0, and their sum 1")

@@ -1,5 +1,6 @@
 """Logs as Trials: files and folders of several formats, read to the same arrays."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
@@ -182,7 +183,12 @@ def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, ho
         )
         raise InputError(f"{error}{f' ({listed})' if listed else ''}") from None
     where = tables[0].where if len(tables) == 1 else f"{len(tables)} files"
-    notes = [f"{where}: {_size(mask)}.", f"{said}.", *(note for part in parts for note in part.notes)]
+    notes = [f"{where}: {_size(mask)}.", f"{said}."]
+    files = Counter(name for part in parts for name in dict.fromkeys(episode.trial for episode in part.episodes))
+    if not single and (shared := [name for name, count in files.items() if count > 1]):
+        names = ", ".join(shared[:5]) + ", ..." * (len(shared) > 5)
+        notes.append(f"Several files have a trial {names}: rows with one name of a trial are of one trial.")
+    notes += [note for part in parts for note in part.notes]
     return Log(
         *(trials.obs, trials.action, trials.mask, trials.actions), units, tuple(by_trial), tuple(dict.fromkeys(notes))
     )

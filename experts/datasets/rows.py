@@ -57,7 +57,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
     obs_names = tuple(name for name in names[0] if name not in action_names and name not in groups)
     if not obs_names:
         raise InputError(f"obs of {table.where} are none beside the trial, the episode and the action")
-    trial, labels = (None if name is None else table.columns[name] for name in groups)
+    trial, labels = (None if name is None else table.labels(name) for name in groups)
     first = _starts(table, groups, [column for column in (trial, labels) if column is not None], roles)
     obs = np.stack([_numbers(table, name) for name in obs_names], 1)
     action, empty = _actions(table, action_names)
@@ -118,7 +118,9 @@ def _groups(table: Table, roles: Roles) -> list[tuple[str, str | None]]:
 
 def _text(value: Any) -> str:
     """A trial's name; whole numbers without a point."""
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.0f}" if value.is_integer() else repr(float(value))
 
 
 def _starts(table: Table, names: list[str | None], columns: list[Column], roles: Roles) -> list[int]:

@@ -14,6 +14,7 @@ from deconfounded.envs.support.errors import InputError
 
 EXTRA = "`pip install deconfounded-imitation[data]` brings it"
 EMPTY = {"", "na", "n/a", "nan", "null", "none"}  # cells, in lower case
+WHOLE = 2**53  # up to which float64 holds every whole number
 MAX_TEXT = 100  # characters of an attribute that may be a label
 
 Column = NDArray[Any]
@@ -27,6 +28,8 @@ class Table:
     where: the file or folder. columns: each [N], by name. boundaries [N]: the number of each row's episode, or None
     where columns are to say it. obs, action, trial: names of columns that the format itself says are these. limits: the
     range of an action by its name, where the format declares it. discrete, horizon: the declared number of actions, T.
+    written: texts of the columns whose numbers do not tell all of them apart, such as 007 and 7, or are counted from
+    the file's first time.
     """
 
     where: str
@@ -39,9 +42,14 @@ class Table:
     discrete: int = 0
     horizon: int = 0
     notes: tuple[str, ...] = ()
+    written: dict[str, Column] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
+
+    def labels(self, name: str) -> Column:
+        """A column [N] that is to tell trials or episodes apart."""
+        return self.written.get(name, self.columns[name])
 
     def select(self, what: str, patterns: Sequence[str]) -> tuple[str, ...]:
         """Names of columns by name, by the first part of it (before a dot), or by a pattern such as 'speed*'.
@@ -81,8 +89,10 @@ def spread(name: str, values: NDArray[Any], parts: Sequence[str] = ()) -> dict[s
 
 
 def number(cell: Any) -> float:
-    """A cell as a number, NaN if it is empty. Raises ValueError for text."""
+    """A cell as a number, NaN if it is empty. Raises ValueError for text, which 1_0 is, though Python reads 10."""
     text = str(cell).strip()
+    if "_" in text:
+        raise ValueError(text)
     return float("nan") if text.lower() in EMPTY else float(text)
 
 
@@ -102,7 +112,7 @@ def of_episodes(attributes: Sequence[dict[str, Any]], lengths: Sequence[int]) ->
     for key in shared:
         values = [label(entry[key]) for entry in attributes]
         if None not in values:
-            texts = any(isinstance(value, str) for value in values)
+            texts = any(isinstance(value, str) or abs(value) > WHOLE for value in values)
             array = np.array([str(value) for value in values], object) if texts else np.array(values, float)
             columns[key] = np.repeat(array, lengths)
     return columns

@@ -9,29 +9,37 @@ from typing import Any
 import numpy as np
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import EXTRA, Column, Table, number, spread
+from deconfounded.experts.datasets.table import EMPTY, EXTRA, WHOLE, Column, Table, number, spread
 
 BLOCK = 1 << 16  # rows that are converted at once
 
 
 def read_csv(file: Path) -> Table:
     """A csv file with a header; separated by commas, semicolons or tabs, as its header is."""
-    text: set[str] = set()
+    text, exact = set[str](), set[str]()  # names of columns that hold text; of those whose numbers are not all of it
     while True:
         names, blocks, late = *_header(file), set[str]()
         columns: dict[str, list[Column]] = {name: [] for name in names}
+        written: dict[str, list[Column]] = {name: [] for name in names}
         for rows in blocks:
             for name, cells in zip(names, zip(*rows, strict=True), strict=True):
                 values = None if name in text else _numbers(cells)
-                if values is None and name not in text:
-                    text.add(name)
-                    late |= {name} if columns[name] else set()  # blocks before this one were taken for numbers
+                for kind, of_kind in (
+                    (text, values is None),
+                    (exact, values is not None and not _all_there(cells, values)),
+                ):
+                    if of_kind and name not in kind:
+                        kind.add(name)
+                        late |= {name} if columns[name] else set()  # blocks before this one were taken for others
                 columns[name].append(np.array(cells, object) if values is None else values)
+                if name in exact:
+                    written[name].append(np.array([cell.strip() for cell in cells], object))
         if not late:
             break
     if not any(columns.values()):
         raise InputError(f"{file} holds no rows beside its header")
-    return Table(str(file), {name: np.concatenate(parts) for name, parts in columns.items()})
+    as_written = {name: np.concatenate(written[name]) for name in exact - text}
+    return Table(str(file), {name: np.concatenate(parts) for name, parts in columns.items()}, written=as_written)
 
 
 def _header(file: Path) -> tuple[list[str], Iterator[list[list[str]]]]:
@@ -72,6 +80,8 @@ def _blocks(file: Path, separator: str, width: int) -> Iterator[list[list[str]]]
 
 def _numbers(cells: tuple[str, ...]) -> Column | None:
     """Cells as numbers; None if one is text."""
+    if any("_" in cell for cell in cells):  # which numpy reads over
+        return None
     try:
         return np.array(cells, float)
     except ValueError:
@@ -82,9 +92,20 @@ def _numbers(cells: tuple[str, ...]) -> Column | None:
         return None
 
 
+def _all_there(cells: tuple[str, ...], values: Column) -> bool:
+    """Whether whole numbers are all that is in their cells: 007, 1e1 and what float64 rounds are more."""
+    held = values[~np.isnan(values)]
+    if not np.isfinite(held).all() or (held != np.round(held)).any():
+        return True
+    texts = (cell.strip() for cell in {*cells})
+    return all(text.lower() in EMPTY or text.removesuffix(".0") == f"{float(text):.0f}" for text in texts)
+
+
 def read_parquet(file: Path) -> Table:
     """A parquet file."""
-    return Table(str(file), parquet_columns(file))
+    arrays = _arrays(file)
+    written = {name: _texts(array) for name, array in arrays.items() if not _kept(array)}
+    return Table(str(file), _columns(arrays), written=written)
 
 
 def parquet_columns(file: Path, parts: dict[str, list[str]] | None = None) -> dict[str, Column]:
@@ -92,6 +113,11 @@ def parquet_columns(file: Path, parts: dict[str, list[str]] | None = None) -> di
 
     What is neither number, time, text nor such a list is left out.
     """
+    return _columns(_arrays(file), parts)
+
+
+def _arrays(file: Path) -> dict[str, Any]:
+    """The arrow arrays of a parquet file, by name. Raises InputError if there are no rows."""
     try:
         import pyarrow
         from pyarrow import parquet
@@ -101,13 +127,37 @@ def parquet_columns(file: Path, parts: dict[str, list[str]] | None = None) -> di
         data = parquet.ParquetFile(file).read()
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"{file} cannot be read as parquet: {' '.join(str(error).split())}") from None
-    columns: dict[str, Column] = {}
-    for name, chunked in zip(data.column_names, data.columns, strict=True):
-        column = pyarrow.concat_arrays(chunked.chunks) if chunked.num_chunks else pyarrow.array([], chunked.type)
-        columns |= spread(name, values, (parts or {}).get(name, [])) if (values := _values(column)) is not None else {}
     if not len(data):
         raise InputError(f"{file} holds no rows")
+    return {
+        name: pyarrow.concat_arrays(column.chunks) for name, column in zip(data.column_names, data.columns, strict=True)
+    }
+
+
+def _columns(arrays: dict[str, Any], parts: dict[str, list[str]] | None = None) -> dict[str, Column]:
+    columns: dict[str, Column] = {}
+    for name, array in arrays.items():
+        if (values := _values(array)) is not None:
+            columns |= spread(name, values, (parts or {}).get(name, []))
     return columns
+
+
+def _kept(array: Any) -> bool:
+    """Whether `_values` keep all that an arrow array holds: not of times, nor of larger whole numbers than WHOLE."""
+    from pyarrow import compute, types
+
+    if types.is_integer(array.type):
+        ends = compute.min_max(array).as_py().values()
+        return all(end is None or abs(end) <= WHOLE for end in ends)
+    return not (types.is_timestamp(array.type) or types.is_duration(array.type))
+
+
+def _texts(array: Any) -> Column:
+    """Texts of whole numbers, or of times as whole numbers in their unit."""
+    from pyarrow import types
+
+    whole = array if types.is_integer(array.type) else array.cast("int64")
+    return np.array(["" if value is None else str(value) for value in whole.to_pylist()], object)
 
 
 def _values(column: Any) -> Column | None:
@@ -122,7 +172,7 @@ def _values(column: Any) -> Column | None:
         first = compute.min(column.cast("int64"))  # so that float64 keeps nanoseconds
         return np.asarray(compute.subtract(column.cast("int64"), first).to_numpy(False), float) / per_second
     if types.is_boolean(kind) or types.is_integer(kind) or types.is_floating(kind) or types.is_decimal(kind):
-        return column.cast("float64").to_numpy(zero_copy_only=False)
+        return column.cast("float64", safe=False).to_numpy(zero_copy_only=False)
     if types.is_string(kind) or types.is_large_string(kind):
         return np.array(["" if value is None else value for value in column.to_pylist()], object)
     if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):

@@ -76,7 +76,7 @@ class TestSeveralTasks:
         assert [task.name for task in published.tasks(["suite"])] == list(envs.SUITE)
 
     @pytest.mark.slow
-    @pytest.mark.usefixtures("here", "no_pictures")
+    @pytest.mark.usefixtures("no_pictures")
     def test_a_run_goes_on_behind_a_failure(self, mine: Path, monkeypatch: pytest.MonkeyPatch, capfd: Any) -> None:
         """Both tasks are tried, and have reports of the rest; the line is of the user's file; the traceback is kept."""
         monkeypatch.chdir(mine.parent)

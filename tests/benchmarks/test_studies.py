@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,6 +10,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import presets, scheduler
 from deconfounded.benchmarks.studies import performance, runs, stepping, tune
+from deconfounded.envs.tasks.bandit import Bandit
 from tests.tools import tiny_preset
 
 
@@ -96,3 +98,18 @@ def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert usual["loss"] != wide["loss"]
     tune.main()
     assert (tmp_path / "docs" / "tuning.json").read_text() == kept
+
+
+def test_a_certificate_is_kept_while_task_and_expert_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[int]()
+
+    def certify(task: envs.Task, expert: Any) -> dict[str, Any]:
+        made.append(task.version)
+        return {"verdict": "passed"}
+
+    monkeypatch.setattr("deconfounded.benchmarks.certify.certify", certify)
+    task = Bandit()
+    for version in (1, 1, 2, 2):
+        task.version = version
+        assert runs.certificate(task, None, tmp_path) == {"verdict": "passed"}
+    assert made == [1, 2]

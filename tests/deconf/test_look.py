@@ -170,6 +170,14 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
 
 
+def test_one_action_alone() -> None:
+    """Of a log whose every action has the same text: there is nothing to match."""
+    trials = driven()
+    remarks = look(changed(trials, action=np.zeros(trials.action.shape), actions=1))
+    assert "Actions used: 0 100%." in [remark.text for remark in remarks]
+    assert not {"lag", "lasting"} & {remark.kind for remark in remarks}
+
+
 @pytest.mark.slow
 def test_how_far_simple_guesses_get() -> None:
     """By hand: of slow noise, nearly all by repeating; of a constant for each trial, all by its mean."""

@@ -56,6 +56,14 @@ class TestDpt:
             assert seen.amax(-1).tolist() == [[n - 1 + anywhere for n in most]]
             assert torch.equal(index, seen) == (anywhere == 0)
 
+    def test_of_a_trial_without_a_step(self) -> None:
+        """There is no query; its place is that trial's first, which the loss leaves out."""
+        mask = torch.tensor([[[0.0] * 9, [1.0] * 9]])
+        for anywhere in (1.0, 0.0):
+            index, seen = dpt.draw_queries(mask, 4, DptConfig(queries=40, anywhere=anywhere), streams())
+            assert not index[0, 0].any()
+            assert not seen[0, 0].any()
+
     def test_it_infers_theta_in_context(self) -> None:
         """A hidden push is to one side or the other, and the expert acts by it: after ten actions, so does it."""
         rng = np.random.default_rng(0)

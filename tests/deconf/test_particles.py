@@ -1,12 +1,17 @@
 """Beliefs by particles: against the grid, against a closed form, and by ranks of the true theta."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf import particles
+from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.deconf.particles import ParticleAgent, Particles, exact_agent, needs_particles
@@ -17,7 +22,7 @@ from deconfounded.envs.tasks.patchy_road import PatchyRoad
 from deconfounded.experts import policy
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import ExpertAgent, run_trials
-from tests.toys import Push, control
+from tests.toys import Arms, Push, control
 
 N, FEW = 24, 256
 
@@ -185,3 +190,24 @@ def test_particles_are_for_many_latents() -> None:
     env = envs.BatchEnv(Three(), 1)
     assert isinstance(exact_agent(env, expert(env.task), False), ParticleAgent)
     assert isinstance(exact_agent(env, expert(env.task), False, Grid(env, expert(env.task), 2)), ExactAgent)
+
+
+class Biased(Arms):
+    """Two arms, of which the hidden latent says how often the first one pays: discrete actions, a uniform latent."""
+
+    latents = (Latent("chance", "", 0.0, 1.0),)
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        return 0.1 + 0.8 * np.where(action == 0, theta, 0.5)
+
+    def expert_probs(self, obs: Array, theta: Array) -> Array:
+        return np.concatenate([0.1 + 0.7 * theta, np.full((len(theta), 2), 0.45) - 0.35 * theta], -1)
+
+
+def test_discrete_actions_and_a_latent_that_is_not_categorical() -> None:
+    """The bandits' setting, in which the grid is of categories, means the usual grid of values."""
+    task = Biased()
+    settings = preset("default", task, "cpu", ["interventional"])
+    assert settings.configs["interventional"] == {"grid": 0}
+    agent = fit(Context(task, replace(settings, eval_trials=4), (0,), Monitor()), "interventional")
+    assert len(agent.grid.theta) == 21

@@ -19,6 +19,7 @@ from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
+from tests.toys import Push
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
 EXAMPLES = ("context_pendulum.py:ContextPendulum", "reversed_cart.py:ReversedCart")
@@ -152,6 +153,13 @@ def test_episodes_that_end_early() -> None:
     assert not ended.all()
     assert trials.mask[:, :, 0].all()
     assert (returns < 0).all()
+
+
+@pytest.mark.parametrize(("k", "values"), [(8, 4), (27, 9), (26, 8), (21, 7), (2, 2)])
+def test_a_grid_of_two_latents(k: int, values: int) -> None:
+    """m = floor(k^(2/3)) values of each, of perfect powers too, whose roots are rounded down."""
+    two = type("Two", (Push,), {"latents": (Push.latents[0], Push.latents[0])})()
+    assert two.theta_grid(k).shape == (values**2, 2)
 
 
 def test_thetas_of_a_grid_can_occur() -> None:

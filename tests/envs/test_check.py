@@ -20,6 +20,7 @@ from deconfounded.envs.tasks import slippery_walker
 from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
+from tests.toys import Arms
 
 
 class MissingFile(SlipperyCartpole):
@@ -147,6 +148,23 @@ def test_slips_are_named(task: type[envs.Task], says: str) -> None:
     with pytest.raises(envs.InputError, match=f"^{says}") as caught:
         envs.check_task(task())
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("probs", "says"),
+    [
+        (lambda theta: np.where(np.arange(3) == theta, 1.0, 0.0), r"gave \[.*0\.0.*\]; each must be above 0"),
+        (lambda theta: np.full((len(theta), 3), 0.5), r"gave \[0.5, 0.5, 0.5\]; each must be above 0, and their sum 1"),
+        (lambda theta: np.full((len(theta), 2), 0.5), r"had shape \(16, 2\); it must be \(16, 3\)"),
+        (lambda theta: None, r"had shape \(0,\); it must be \(16, 3\)"),
+    ],
+)
+def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -> None:
+    """Else the log-likelihood of an imitator's action is minus infinity, which shows after a whole training."""
+    task = type("Sure", (Arms,), {"expert_probs": lambda self, obs, theta: probs(theta)})()
+    with pytest.raises(envs.InputError, match=f"^expert_probs of arms {says}"):
+        envs.check_task(task)
+    envs.check_task(Arms())
 
 
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

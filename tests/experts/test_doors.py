@@ -32,7 +32,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.rollout import RandomAgent, Trials, run_trials
+from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
 MASK = np.ones((2, 1, 3), bool)
@@ -328,6 +328,19 @@ class TestRunTrials:
         with pytest.raises(envs.InputError, match=says):
             run_trials(env, RandomAgent(env.task.action_space), episodes, seed)
 
+    def test_actions_out_of_range(self) -> None:
+        """They are clipped, as environments do, in trials and in what the agent observes."""
+
+        class Wild(Agent):
+            def act(self, obs: Any) -> Any:
+                return np.full((len(obs), 1), 1.5)
+
+            def observe(self, obs: Any, action: Any, next_obs: Any, alive: Any) -> None:
+                assert (action == 1).all()
+
+        trials = run_trials(envs.BatchEnv(envs.get("tilted_cartpole"), 2), Wild(), 1, 0).trials
+        assert (trials.action[trials.mask] == 1).all()
+
 
 class TestTraining:
     @pytest.mark.parametrize(
@@ -390,3 +403,11 @@ class TestTraining:
         optimizer.step(layer(torch.ones(1, 3, 2)).mean((1, 2)))
         with pytest.raises(envs.InputError, match="the loss of Linear failed in update 2: its gradient was NaN"):
             optimizer.step((0 * layer(torch.ones(1, 3, 2))).square().sum((1, 2)).sqrt())
+
+    def test_a_gradient_without_a_norm(self) -> None:
+        """Its squares are infinite: the update would be none."""
+        layer = Linear(2, 1, Draws([np.random.default_rng(0)], "cpu"))
+        before = layer.weight.detach().clone()
+        with pytest.raises(envs.InputError, match="failed in update 1: its gradient was NaN or too large"):
+            Adam([layer], 1e-3).step((layer.weight - layer.weight.detach()).sum((1, 2)) * 1e25)
+        assert torch.equal(layer.weight, before)

@@ -265,6 +265,69 @@ class TestNotes:
         assert "is dropped" not in notes
 
 
+class TestNames:
+    """Trials whose names are not all in their numbers stay apart."""
+
+    @staticmethod
+    def named(names: list[Any]) -> list[dict[str, Any]]:
+        """Three rows of a trial of each name."""
+        return [{"run": name, "x": float(i + t), "u": t / 10} for i, name in enumerate(names) for t in range(3)]
+
+    @pytest.mark.parametrize(
+        "names",
+        [
+            ["20261129001", "20261129002"],
+            ["1_11", "11_1", "111"],
+            ["007", "7"],
+            ["10", "1e1"],
+            [str(2**60), str(2**60 + 1)],
+            ["0.30000000001", "0.3"],
+        ],
+    )
+    @pytest.mark.parametrize("block", [2, 1000])
+    def test_csv(self, names: list[str], block: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("deconfounded.experts.datasets.tabular.BLOCK", block)
+        file = write_csv(tmp_path / "x.csv", self.named(names))
+        log = datasets.read(file, trial="run", obs=["x"], action=["u"])
+        assert log.names == tuple(names)
+        assert log.mask.shape == (len(names), 1, 2)
+
+    def test_csv_of_plain_numbers(self, tmp_path: Path) -> None:
+        """1.0 and 1 are one number."""
+        made = [
+            {**row, "run": text} for row, text in zip(self.named([1, 2]), ["1", "1.0", "1"] + ["2"] * 3, strict=True)
+        ]
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), trial="run", obs=["x"], action=["u"])
+        assert log.names == ("1", "2")
+
+    @pytest.mark.parametrize("names", [[2**60, 2**60 + 1], [20261129001, 20261129002]])
+    def test_parquet(self, names: list[int], tmp_path: Path) -> None:
+        """Whole numbers that float64 rounds; in a column that nobody asks for they are no trouble."""
+        made = self.named(names)
+        columns = {key: [row[key] for row in made] for key in made[0]}
+        columns["stamp"] = [2**62 + i for i in range(len(made))]
+        log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), trial="run", obs=["x"], action=["u"])
+        assert log.names == tuple(map(str, names))
+
+    def test_times_of_several_files(self, tmp_path: Path) -> None:
+        """A trial that is named by when it began: times are not counted from each file's own first."""
+        pyarrow, files = pytest.importorskip("pyarrow"), []
+        for i in range(3):
+            columns: dict[str, Any] = {key: [row[key] for row in self.named([0])] for key in ("x", "u")}
+            columns["started"] = pyarrow.array([10**15 + i] * 3, pyarrow.timestamp("us"))
+            files.append(write_parquet(tmp_path / f"{i}.parquet", columns))
+        log = datasets.read(files, trial="started", obs=["x"], action=["u"])
+        assert log.mask.shape[:2] == (3, 1)
+        assert "Several files" not in " ".join(log.notes)
+
+    def test_one_name_in_two_files(self, tmp_path: Path) -> None:
+        """It is one trial, and a note says so."""
+        files = [write_csv(tmp_path / f"{i}.csv", self.named([0, i])) for i in (1, 2)]
+        log = datasets.read(files, trial="run", obs=["x"], action=["u"])
+        assert log.names == ("0", "1", "2")
+        assert "Several files have a trial 0: rows with one name of a trial are of one trial." in log.notes
+
+
 class TestActions:
     def test_one_range_of_all_files(self, tmp_path: Path) -> None:
         wide = [{**row, "throttle": 2 * row["throttle"] if row["throttle"] else ""} for row in rows()]
