@@ -98,22 +98,27 @@ class Trials:
 
         return trials_of([[read_minari(source)]], Roles())[0]
 
-    def save(self, file: Path, made_of: str = "") -> None:
+    def save(self, file: Path | str, made_of: str = "") -> None:
         """Write an .npz file atomically. made_of: identity of the data, which `load` compares."""
         buffer, arrays = io.BytesIO(), {"obs": self.obs, "action": self.action, "mask": self.mask}
         np.savez_compressed(buffer, **arrays, actions=self.actions, made_of=made_of)  # type: ignore[arg-type]
-        write_atomically(file, buffer.getvalue())
+        write_atomically(Path(file), buffer.getvalue())
 
     @staticmethod
-    def load(file: Path, made_of: str | None = None) -> Trials:
+    def load(file: Path | str, made_of: str | None = None) -> Trials:
         """Read what `save` wrote. Raises InputError if the file is missing or damaged, or its `made_of` differs."""
         try:
             with np.load(file, allow_pickle=False) as data:
+                if missing := {"obs", "action", "mask", "actions", "made_of"} - {*data}:
+                    raise InputError(f"it lacks {min(missing)}; Trials.save writes such a file")
                 if made_of not in (None, str(data["made_of"])):
                     raise InputError("it was made of something else")
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))
-        except Exception as error:  # a damaged zip file raises many types of errors
-            raise InputError(f"no trials could be read from {file}: {' '.join(str(error).split())}") from None
+        except (InputError, OSError) as error:
+            why = " ".join(str(error).split())
+        except Exception:  # a damaged zip file raises many types of errors, and another kind of file still others
+            why = "it is damaged, or no .npz file of Trials.save"
+        raise InputError(f"no trials could be read from {file}: {why}")
 
 
 def joined(parts: Sequence[Trials]) -> Trials:

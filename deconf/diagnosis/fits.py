@@ -86,8 +86,8 @@ def copies(trials: Trials) -> tuple[list[list[int]], ...]:
 
 
 def _standard(x: Array) -> Array:
-    std = x.std(0)
-    return (x - x.mean(0)) / np.where(std > 1e-9, std, np.inf)
+    std, rounding = x.std(0), 1e-9 * np.abs(x).max(0, initial=0)  # of a column that hardly varies
+    return (x - x.mean(0)) / np.where(std > rounding, std, np.inf)
 
 
 def features(x: Array) -> Array:

@@ -218,14 +218,16 @@ def _constant(column: Column) -> bool:
 
 def _of_time(table: Table, clock: str, passed: NDArray[np.float64], inside: NDArray[np.bool_]) -> list[str]:
     """Gaps, rows of the same time, and time that runs backwards, by a column of time."""
-    usual = float(np.median(passed[inside])) if inside.any() else 0.0
+    forward = inside & (passed > 0)
+    usual = float(np.median(passed[forward])) if forward.any() else 0.0
+    back = f"{clock} runs backwards {{}} times; are rows of several episodes taken for one, or unsorted?"
     kinds = {
         f"{{}} gaps: more than {GAP:g} times the usual {usual:.4g} of {clock} passes": passed > GAP * usual,
         f"{{}} rows have the {clock} of the row before them: duplicates?": passed == 0,
-        f"{clock} runs backwards {{}} times": passed < 0,
+        back: passed < 0,
     }
     notes = []
     for text, where in kinds.items():
-        if usual > 0 and (rows := np.flatnonzero(where & inside)).size:
+        if (usual or text == back) and (rows := np.flatnonzero(where & inside)).size:
             notes.append(f"{text.format(f'{len(rows):,}')} (the first: row {rows[0] + 2} of {table.where}).")
     return notes

@@ -15,7 +15,7 @@ from deconfounded.benchmarks import look as look_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
-from deconfounded.deconf.diagnosis import diagnose, judgement
+from deconfounded.deconf.diagnosis import diagnose, fits, judgement
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -168,6 +168,21 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert set(odd(remarks)) - {"repeat"} == kinds
     assert words in said(remarks, kind)
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1e6])
+def test_units_do_not_matter(unit: float) -> None:
+    """Fits are of standardised columns, however small these are."""
+    x = np.random.default_rng(0).normal(size=(100, 2))
+    np.testing.assert_allclose(fits.features(x * [1, unit]), fits.features(x), atol=1e-9)
+    assert not fits.features(np.full((100, 1), 0.1) * unit).any()
+
+
+def test_what_was_misread_is_odd() -> None:
+    """That time runs backwards, or that files share trials, is marked; what is merely said is not."""
+    notes = ("step runs backwards 3 times; ...", "Several files have a trial 0: ...", "2 trials of 1 episode.")
+    log = replace(Log.of(driven()), notes=notes)
+    assert [remark.odd for note in notes for remark in look(log) if remark.text == note] == [True, True, False]
 
 
 def test_one_action_alone() -> None:

@@ -251,6 +251,19 @@ class TestNotes:
         assert "Constant: gear." in notes
         assert "Constant" not in " ".join(of_csv(tmp_path).notes)
 
+    def test_time_that_runs_backwards(self, tmp_path: Path) -> None:
+        """In all of it, in a shuffled part, or where a column that says what an episode is was forgotten."""
+        made = [{**row, "time": -row["time"]} for row in rows()]
+        notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES).notes)
+        assert f"time runs backwards {len(made) - 5} times" in notes
+        assert "gaps" not in notes
+        roles = {**ROLES, "episode": None}
+        notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", rows(AFTER)), **roles).notes)
+        assert (
+            "time runs backwards 2 times; are rows of several episodes taken for one, or unsorted? (the first" in notes
+        )
+        assert "backwards" not in " ".join(of_csv(tmp_path).notes)
+
     def test_duplicates_without_a_clock(self, tmp_path: Path) -> None:
         made = [{key: value for key, value in row.items() if key != "time"} for row in rows()]
         log = datasets.read(write_csv(tmp_path / "x.csv", [*made[:3], made[2], *made[3:]]), **ROLES)
@@ -458,7 +471,7 @@ class TestBadInput:
             ("x.csv", b"a,a\n1,2\n", "two columns that are called 'a'"),
             ("x.parquet", b"junk", "x.parquet cannot be read as parquet"),
             ("x.hdf5", b"junk", "x.hdf5 cannot be read as HDF5"),
-            ("x.npz", b"junk", "no trials could be read from"),
+            ("x.npz", b"junk", "no trials could be read from .*x.npz: it is damaged, or no .npz file of Trials.save"),
         ],
     )
     def test_no_such_file(self, name: str, content: bytes, says: str, tmp_path: Path) -> None:
