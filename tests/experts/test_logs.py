@@ -262,7 +262,7 @@ class TestNotes:
         assert (
             "time runs backwards 2 times; are rows of several episodes taken for one, or unsorted? (the first" in notes
         )
-        assert "backwards" not in " ".join(of_csv(tmp_path).notes)
+        assert "runs backwards" not in " ".join(of_csv(tmp_path).notes)
 
     def test_duplicates_without_a_clock(self, tmp_path: Path) -> None:
         made = [{key: value for key, value in row.items() if key != "time"} for row in rows()]
