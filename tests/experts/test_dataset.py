@@ -47,6 +47,18 @@ def test_the_same_in_another_process(
         data.main()
 
 
+def test_episodes_in_any_order(tmp_path: Path) -> None:
+    """Theta is of the trial and the episode that the metadata say, as observations are."""
+    task = envs.get("slippery_cartpole")
+    trials, theta, returns = collected = datasets.collect(task, 2, lambda env: RandomAgent(task.action_space), 5)
+    place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    storage = minari.MinariDataset(place / "data").storage
+    turned = [{"trial": 1 - trial} for trial in range(2) for _ in range(task.episodes)]
+    storage.update_episode_metadata(turned)
+    np.testing.assert_array_equal(datasets.read_theta(place), theta[::-1])
+    np.testing.assert_array_equal(datasets.read(place).action, trials.action[::-1])
+
+
 def test_what_it_says(tmp_path: Path) -> None:
     """Returns, ends, reference scores and trials are Minari's own to read; theta is in the metadata alone."""
     task = envs.get("slippery_cartpole")
