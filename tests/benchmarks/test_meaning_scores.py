@@ -19,6 +19,7 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.output import aggregation, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
+from deconfounded.deconf.exact import Grid
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
 from deconfounded.experts.policy import CallableExpert
@@ -29,6 +30,13 @@ from tests.tools import tiny_preset
 ROOT = Path(__file__).parents[2]
 PUSH = toys.Push()
 EXPERT = CallableExpert(PUSH, toys.control, "control")
+
+
+class Switching(toys.Push):
+    """Push, under a force that is drawn anew in one step of ten."""
+
+    name = "switching"
+    latents = (envs.Latent("force", "N", -1.0, 1.0, switch=0.1),)
 
 
 class Late(Agent):
@@ -346,6 +354,25 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     assert np.diag(scores) == pytest.approx(1)
     assert returns[0, -1] < 0.6 * returns[0, 0]
     assert returns[-1, 0] < 0.6 * returns[-1, -1]
+
+
+def test_a_certificate_s_belief_goes_on_after_an_early_end() -> None:
+    """Theta switches in the steps that an episode lacks too: by hand, one step in ten draws it anew, here for four."""
+    env, k = envs.BatchEnv(Switching(), 5), 6
+    expert = CallableExpert(env.task, toys.control, "control")
+    recorder = certify.EvidenceRecorder(env, expert, Grid(env, expert, k))
+    obs = env.reset(0)
+    recorder.begin(5)
+    recorder.reset([np.random.default_rng(0)])
+    for _ in range(PUSH.horizon - 4):
+        alive, action = env.alive, recorder.act(obs)
+        following = env.step(action)[0]
+        recorder.observe(obs, action, following, alive)
+        obs = following
+    before = np.exp(recorder.log_belief)
+    recorder.reset([np.random.default_rng(1)])
+    stays = 0.9**4
+    np.testing.assert_allclose(np.exp(recorder.log_belief), stays * before + (1 - stays) / k, atol=1e-9)
 
 
 def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPatch) -> None:

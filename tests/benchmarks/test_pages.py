@@ -649,6 +649,15 @@ def test_equal_methods_stand_in_one_order(monkeypatch: pytest.MonkeyPatch) -> No
     assert [row[0].removeprefix("| ") for row in rows] == list(METHODS)
 
 
+def test_tasks_on_which_a_method_fared_worst_and_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The least first."""
+    scores = {task: {"naive_rnn": {0: score, 1: score}} for task, score in (("bandit", 0.8), ("curling", 0.2))}
+    monkeypatch.setattr(index, "certified", lambda found, certified: scores)
+    head, _, row = results.fared([], {}).splitlines()
+    ends = [[cell.strip() for cell in line.split("|")[-3:-1]] for line in (head, row)]
+    assert ends == [["least on", "most on"], ["curling, 0.20", "bandit, 0.80"]]
+
+
 def test_commands_of_numbers() -> None:
     """Another way to deploy an agent is of its method's job; a method from outside is named by its file."""
     task = envs.get("bandit")

@@ -16,7 +16,7 @@ import pytest
 
 from deconfounded.benchmarks import pull, push
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.output import card, records
+from deconfounded.benchmarks.output import aggregation, card, records
 from deconfounded.deconf.core.data import Draws, Signature
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
@@ -206,6 +206,19 @@ def test_what_is_amiss_is_one_line(
     assert "is a link" in refused(push, agent, "me/x")
     monkeypatch.setattr(push, "find_spec", lambda name: None)
     assert "pip install deconfounded-imitation[hub]" in refused(pull, "me/x", "--out", out)
+
+
+def test_interval_of_a_card() -> None:
+    """1.96 standard errors on either side, which are of as many trials as there were, whatever their episodes."""
+    kept = records.of_task(ROOT / "docs/records", "slippery_cartpole")
+    [own] = [each for each in kept if (records.named(each), each["seed"]) == ("naive_rnn", 1)]
+    _, section = card._scores(own, kept)
+    zero, one = aggregation.references(own, kept)
+    last = own["episodes"] - 1
+    score, sd = (own["returns"][last] - zero) / (one - zero), own["returns_sd"][last] / (one - zero)
+    low, high = (score + side * 1.96 * sd / np.sqrt(own["eval_trials"]) for side in (-1, 1))
+    assert own["episodes"] > 1
+    assert f"95% interval {low:.2f} to {high:.2f}" in section
 
 
 def test_card_without_a_record(tmp_path: Path) -> None:

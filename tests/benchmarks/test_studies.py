@@ -1,7 +1,9 @@
 """What the studies share, and what the benchmark costs."""
 
 import json
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import presets, scheduler
-from deconfounded.benchmarks.studies import performance, runs, stepping, tune
+from deconfounded.benchmarks.studies import latency, performance, runs, stepping, tune
 from deconfounded.envs.tasks.bandit import Bandit
 from tests.tools import tiny_preset
 
@@ -54,6 +56,13 @@ def test_median_of_repeats_after_one_to_warm_up() -> None:
 
     assert stepping.seconds({"slow": slow, "fast": lambda: None}, lambda: now, 3) == {"slow": 2, "fast": 0}
     assert performance.power({1: 3.0, 2: 12.0, 4: 48.0}) == pytest.approx(2)
+
+
+def test_latency_is_in_milliseconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that advances 2 ms from one reading to the next."""
+    clock = count()
+    monkeypatch.setattr(latency, "time", SimpleNamespace(perf_counter=lambda: 2e-3 * next(clock)))
+    assert latency.latency(envs.get("bandit"), "random") == pytest.approx({"median_ms": 2, "p99_ms": 2})
 
 
 def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

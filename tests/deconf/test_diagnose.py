@@ -178,6 +178,7 @@ class TestJudge:
             ({"expert_evidence": 0.05}, "confounded", 2, advice.EXPLORE),
             ({"latent_gain": -0.1}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"latent_gain": 2.0, "naive": 0.98, "latent": 1.0}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.05}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.05, "model_deviation": 5.0}, "not confounded", 1, advice.CLONE),
@@ -221,6 +222,7 @@ class TestJudge:
         mixed = CLEAR._replace(**SILENT)
         assert judge([mixed, mixed]).tier == 3
         assert judge([mixed, mixed._replace(trait_gain=0.05)]).verdict == "cannot tell"
+        assert judge([mixed, mixed, mixed._replace(paired_trait_stakes=2.9)]).verdict == "cannot tell"
         alike = CLEAR._replace(paired_stakes=1.4)
         assert judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
@@ -252,6 +254,10 @@ class TestJudge:
     def test_headline(self, naive: float, headline: str) -> None:
         """It says so if little is lost."""
         assert judge([CLEAR._replace(naive=naive, latent=1.0)]).headline == headline
+
+    def test_cost(self) -> None:
+        """What is lost is what the score lacks: its range is from the least loss to the most."""
+        assert "by 70% (50% to 80%) of" in judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5)]).cost
 
     def test_figures(self) -> None:
         """The mean over refits, the least, and the most of them."""

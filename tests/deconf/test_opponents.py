@@ -31,6 +31,24 @@ class TestDpt:
                 torch.testing.assert_close(agent._features, expected[:, :, t], rtol=0, atol=1e-5)
                 agent.remember(batch[:, :, t])
 
+    @pytest.mark.parametrize("forgets", [False, True])
+    def test_what_is_left_of_the_episode_before(self, forgets: bool) -> None:
+        """Its transitions are read on, or, where theta drifts, not at all."""
+        batch = random_batch(streams(2), 3, 12)
+        agent = DptAgent.blank({**SHAPE, "forgets": forgets}, scales(batch), streams(2))
+        seen = torch.full((2, 3, 1), 0 if forgets else 4)
+        with torch.no_grad():
+            query = agent.queries(batch.obs[:, :, 4:5])
+            expected = agent.net.answers(agent.transitions(batch), query, seen)
+            agent.begin(6)
+            for first, last in ((0, 4), (4, 5)):
+                agent.reset([np.random.default_rng(i) for i in range(2)])
+                for t in range(first, last):
+                    agent.choose(batch.obs[:, :, t])
+                    features = agent._features.clone()
+                    agent.remember(batch[:, :, t])
+        torch.testing.assert_close(features, expected[:, :, 0], rtol=0, atol=1e-5)
+
     def test_a_query_reads_what_it_may(self) -> None:
         """Neither later transitions nor other queries; but the transitions before."""
         batch = random_batch(streams(2), 3, 12)

@@ -170,6 +170,29 @@ def test_a_quadratic_stands_for_simulation() -> None:
     assert belief.missed < 16
 
 
+def test_a_move_keeps_mean_and_variance() -> None:
+    """In quantiles, of a normal belief far from 0 and 1: those of the weighted particles before, over all trials."""
+    task = Push()
+    env = envs.BatchEnv(task, N)
+    env.reset(0)
+    belief = Particles(env, expert(task), conditional=False)
+    belief.begin(N)
+    belief.reset(Streams([np.random.default_rng(0)]))
+    log_weight = -0.5 * np.square((belief._u[..., 0] - 0.5) / 0.1)
+    belief.log_weight = log_weight - np.logaddexp.reduce(log_weight, -1, keepdims=True)
+
+    def moments() -> Array:
+        weight, u = np.exp(belief.log_weight), belief._u[..., 0]
+        mean = (weight * u).sum(-1)
+        return np.array([mean.mean(), (weight * np.square(u - mean[:, None])).sum(-1).mean()])
+
+    before = moments()
+    belief._move(np.arange(N))
+    after = moments()
+    assert after[0] == pytest.approx(before[0], abs=0.01)
+    assert after[1] == pytest.approx(before[1], rel=0.05)
+
+
 def test_a_trial_does_not_depend_on_those_beside_it() -> None:
     """Two groups with a generator each: the second group's particles are those that it has alone."""
     task = Three()

@@ -12,14 +12,17 @@ from gymnasium import spaces
 from deconfounded import envs
 from deconfounded.benchmarks.engine import protocols
 from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.deconf import learned_reference
 from deconfounded.deconf.learned_reference import LearnedGrid, learn
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.blackbox import BlackBox, task_of
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
+from deconfounded.envs.streams import Array, Mask
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
-from tests.toys import Push
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, run_trials
+from tests.toys import Push, control
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
 EXAMPLES = ("context_pendulum.py:ContextPendulum", "reversed_cart.py:ReversedCart")
@@ -228,6 +231,23 @@ class TestErrors:
         (tmp_path / "mine.py").write_text("class Mine:\n    steps = 3\n    def make(self, theta): pass\n")
         with pytest.raises(envs.InputError, match="world Mine lacks sample_theta, expert, episodes; a world has make"):
             envs.get(f"{tmp_path}/mine.py:Mine")
+
+
+def test_noise_is_of_trials_that_the_mean_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its covariance, and the exponent too."""
+    used, original = list[Mask](), learned_reference.steps
+
+    def steps(rollouts: list[Rollout], which: Mask) -> tuple[Array, Array, Array, Array]:
+        used.append(which)
+        return original(rollouts, which)
+
+    monkeypatch.setattr(learned_reference, "steps", steps)
+    task = Push()
+    learn(task, CallableExpert(task, control, "control"), 64, 0)
+    fitted, *held_out = used
+    assert fitted.sum() == 48
+    assert len(held_out) > 1
+    assert not any((fitted & which).any() for which in held_out)
 
 
 @pytest.mark.slow

@@ -61,6 +61,8 @@ DIRECTIONS = (
     ("curling", 0, (0.025, 0.1), (1.0,), 10, "slide", -0.545),
     ("swapped_lander", 0, (0, 1), (0.0, 1.0), 5, "x", -0.39),  # 1 is to the right, if it is not swapped
     ("slippery_walker", 1, (-0.1, 0.18), (0.0,) * 6, 10, "rootx", -0.69),  # uphill along x
+    ("loaded_arm", 0, (-20, 20), (0.0, 0.0), 5, "joint0", 3.8),  # 40 N m for .1 s, on 1 kg m^2 and some damping
+    ("loaded_arm", 1, (-20, 20), (0.0, 0.0), 5, "joint1", 3.8),
 )
 
 
@@ -209,6 +211,21 @@ def test_servos_reach_the_speed_that_is_asked_for(name: str, joint: str, velocit
     for _ in range(30):
         state = env.simulator.outcome(state, np.full((1, 1), 0.5))
     assert task.qvel(state, joint)[0] == pytest.approx(velocity, rel=0.05)
+
+
+def test_a_weak_leg_gets_larger_commands() -> None:
+    """With half the strength of a hip's motor the expert doubles the command of that motor, and of no other."""
+    task = envs.get("lame_ant")
+    assert isinstance(task, MujocoTask)
+    obs = envs.BatchEnv(task, 1).reset(3)
+    even = task.expert_mean(obs, np.ones((1, 4)))
+    for leg in range(1, 5):
+        theta = np.ones((1, 4))
+        theta[0, [latent.name for latent in task.latents].index(f"strength_{leg}")] = 0.5
+        expected = even.copy()
+        expected[0, task.model.actuator(f"hip_{leg}").id] *= 2
+        assert (expected != even).any()
+        np.testing.assert_allclose(task.expert_mean(obs, theta), expected)
 
 
 def test_a_stone_is_worth_most_at_the_tee() -> None:

@@ -11,6 +11,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import data
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, Context, stream
+from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets, policy
@@ -45,6 +46,34 @@ def test_the_same_in_another_process(
         np.testing.assert_array_equal(array, again.state()[1][key])
     with pytest.raises(envs.InputError, match="is there already"):
         data.main()
+
+
+def test_episodes_in_any_order(tmp_path: Path) -> None:
+    """Theta is of the trial and the episode that the metadata say, as observations are."""
+    task = envs.get("slippery_cartpole")
+    trials, theta, _ = collected = datasets.collect(task, 2, lambda env: RandomAgent(task.action_space), 5)
+    place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    storage = minari.MinariDataset(place / "data").storage
+    turned = [{"trial": 1 - trial} for trial in range(2) for _ in range(task.episodes)]
+    storage.update_episode_metadata(turned)
+    np.testing.assert_array_equal(datasets.read_theta(place), theta[::-1])
+    np.testing.assert_array_equal(datasets.read(place).action, trials.action[::-1])
+
+
+def test_as_many_trials_as_a_run_imitates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless another number is asked for."""
+    task, asked = envs.get("slippery_cartpole"), list[int]()
+
+    def collect(task: envs.Task, n: int, *_: object) -> None:
+        asked.append(n)
+        raise envs.InputError("enough")
+
+    monkeypatch.setattr(type(task), "horizon", 4)
+    monkeypatch.setattr(datasets, "collect", collect)
+    monkeypatch.setattr("sys.argv", ["data", "--task", task.name, "--out", str(tmp_path / "data")])
+    with pytest.raises(envs.InputError, match="enough"):
+        data.main()
+    assert asked == [preset("default", task, "cpu").expert_trials]
 
 
 def test_what_it_says(tmp_path: Path) -> None:

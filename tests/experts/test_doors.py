@@ -341,6 +341,20 @@ class TestRunTrials:
         trials = run_trials(envs.BatchEnv(envs.get("tilted_cartpole"), 2), Wild(), 1, 0).trials
         assert (trials.action[trials.mask] == 1).all()
 
+    def test_random_numbers_of_an_agent_are_new_in_each_episode(self) -> None:
+        """And of each seed its own."""
+        drawn = list[float]()
+
+        class Drawing(Agent):
+            def reset(self, rngs: Any) -> None:
+                drawn.extend(rng.random() for rng in rngs)
+
+            def act(self, obs: Any) -> Any:
+                return np.zeros((len(obs), 1))
+
+        run_trials(envs.BatchEnv(envs.get("bandit"), 2), Drawing(), 3, [0, 5])
+        assert len(set(drawn)) == len(drawn) == 6
+
 
 class TestTraining:
     @pytest.mark.parametrize(

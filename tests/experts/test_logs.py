@@ -241,6 +241,13 @@ class TestNotes:
         )
         assert "every episode counts as a trial" in " ".join(log.notes)
 
+    def test_episodes_of_lerobot_in_any_order(self, tmp_path: Path) -> None:
+        """What is said of an episode is by its number, not by its line."""
+        log, lines = of_lerobot(tmp_path, "v2.1"), tmp_path / "set" / "meta" / "episodes.jsonl"
+        lines.write_text("\n".join(reversed(lines.read_text().splitlines())))
+        again = datasets.read(tmp_path / "set", "vehicle")
+        assert (again.sha256, again.names) == (log.sha256, log.names)
+
     def test_gaps_and_constants(self, tmp_path: Path) -> None:
         made = [{**row, "gear": 3} for row in rows(skip=(6,))]
         made[3]["time"] = made[2]["time"]
