@@ -32,20 +32,22 @@ seeds, with 95% intervals of a percentile bootstrap over seeds. A method's tier 
 have records under both protocols, and over the seeds that both have; that of the standard one is left out where its
 records are of other versions of the method. The last row has the versions. [Headroom](headroom.md) says what is left
 to gain under each."""
-    pictures = ["![interquartile means under each protocol](protocols.png)"] * bool(points(standard, by_protocol))
-    parts = [_part(name, standard, by_protocol.get(name, ())) for name in PROTOCOLS if name != STANDARD]
+    over = {name: dict(by_end) for name, by_end in points(standard, by_protocol)}
+    pictures = ["![interquartile means under each protocol](protocols.png)"] * bool(over)
+    parts = [_part(name, by_protocol.get(name, ()), over.get(name, {})) for name in PROTOCOLS if name != STANDARD]
     return "\n\n".join([head, *pictures, *parts]) + "\n"
 
 
-def _part(protocol: str, standard: index.Found, found: index.Found) -> str:
+def _part(protocol: str, found: index.Found, over: "Mapping[str, Sequence[Mean]]") -> str:
+    """A protocol's part. over: the means, by what the episode is called; empty where no task has all of SHOWN."""
     parts = [f"## {protocol}", f"{PROTOCOLS[protocol].capitalize()}. Records: `deconf table --protocol {protocol}`."]
     for end, said in _ends(protocol).items() if found else ():
         head = (said.removeprefix("the "), *(f"{name} ({_tier(name)})" for name in SHOWN))
         rows = [(task.name, *_cells(of["methods"], end)) for task, of in found]
-        if over := means(protocol, end, standard, found):
+        if of_agents := over.get(said):
             beside = f"the same, {STANDARD}" + ", first episode" * (protocol == "once")
-            rows.append(("interquartile mean", *(two_decimals(mean.value) for mean in over)))
-            rows.append((beside, *("" if mean.standard is None else two_decimals(mean.standard) for mean in over)))
+            rows.append(("interquartile mean", *(two_decimals(mean.value) for mean in of_agents)))
+            rows.append((beside, *("" if mean.standard is None else two_decimals(mean.standard) for mean in of_agents)))
         parts.append(markdown_table(head, [*rows, ("version", *_versions(found))]))
     tasks = published.tasks(["suite", "hard"])
     unfit = {task.name: why for task in tasks if (why := protocols.why_not(protocol, task))}
@@ -103,12 +105,11 @@ def means(protocol: str, end: str, standard: index.Found, found: index.Found) ->
     rows = []
     for agent, now, was in zip(SHOWN, versions, before, strict=True):
         pairs = {name: _shared(under[name][agent], plain[name][agent]) for name in names}
-        figure, other = (
-            statistics.over_tasks(statistics.iqm, {name: both[i] for name, both in pairs.items()}) for i in (0, 1)
-        )
-        if figure is None or other is None:
+        figure = statistics.over_tasks(statistics.iqm, {name: scores for name, (scores, _) in pairs.items()})
+        if figure is None:
             return []
-        value, standing = (round(each.value.item(), 4) for each in (figure, other))  # the same on all machines
+        beside = statistics.iqm([scores for _, scores in pairs.values()])
+        value, standing = (round(float(mean), 4) for mean in (figure.value, beside))  # the same on all machines
         low, high = (round(end.item(), 4) for end in figure.interval or (figure.value, figure.value))
         rows.append(Mean(agent, len(names), value, (low, high), standing if was == now else None))
     return rows

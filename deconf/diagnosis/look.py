@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from deconfounded.deconf.diagnosis import fits
 from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.experts.datasets.logs import Log
+from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.rollout import Trials
 
 Array = NDArray[np.float64]
@@ -21,7 +22,6 @@ LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing fo
 BETTER = 0.95  # of the variance that another row leaves
 REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
 ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
-MISREAD = "runs backwards", "Several files have a trial"  # in notes of a reader: trials may not be what they seem
 HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
 
 
@@ -47,7 +47,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
         index = np.linspace(0, len(log) - 1, min(len(log), max(8, int(len(log) * MOST / total)))).astype(int)
         part = Trials(log.obs[index], log.action[index], log.mask[index], log.actions)
     fitted = Steps.of(part)
-    remarks = [Remark("size", note, any(sign in note for sign in MISREAD)) for note in log.notes]
+    remarks = [Remark("size", note, isinstance(note, Odd)) for note in log.notes]
     for describe in (_ranges, _outliers, _duplicates, _pauses, _states, _tails, *[_repeats] * (not blind)):
         remarks += describe(log, steps)
     if not blind and log.actions != 1:  # of one action alone nothing follows

@@ -144,6 +144,8 @@ def _check_probs(task: Task, obs: Array, theta: Array) -> None:
     if probs.ndim != 2 or probs.shape[0] not in (1, len(obs)) or probs.shape[1] != task.n_actions:
         right = f"({len(obs)}, {task.n_actions}), a row for each observation"
         raise InputError(f"expert_probs of {task.name} had shape {probs.shape}; it must be {right}")
-    if not (probs > 0).all() or not np.allclose(probs.sum(-1), 1):
-        row = probs[(~(probs > 0).all(-1) | ~np.isclose(probs.sum(-1), 1)).argmax()]
-        raise InputError(f"expert_probs of {task.name} gave {row.tolist()}; each must be above 0, and their sum 1")
+    fits = (probs > 0).all(-1) & np.isclose(probs.sum(-1), 1)
+    if not fits.all():
+        raise InputError(
+            f"expert_probs of {task.name} gave {probs[fits.argmin()].tolist()}; each must be above 0, and their sum 1"
+        )

@@ -15,7 +15,7 @@ from deconfounded.experts.datasets.hdf5 import read_hdf5
 from deconfounded.experts.datasets.lerobot import read_lerobot
 from deconfounded.experts.datasets.minari_sets import read_minari
 from deconfounded.experts.datasets.rows import Episode, Episodes, Roles, episodes_of
-from deconfounded.experts.datasets.table import Table
+from deconfounded.experts.datasets.table import Odd, Table
 from deconfounded.experts.datasets.tabular import read_csv, read_parquet
 from deconfounded.experts.datasets.units import Units
 from deconfounded.experts.rollout import Trials
@@ -187,7 +187,7 @@ def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, ho
     files = Counter(name for part in parts for name in dict.fromkeys(episode.trial for episode in part.episodes))
     if not single and (shared := [name for name, count in files.items() if count > 1]):
         names = ", ".join(shared[:5]) + ", ..." * (len(shared) > 5)
-        notes.append(f"Several files have a trial {names}: rows with one name of a trial are of one trial.")
+        notes.append(Odd(f"Several files have a trial {names}: rows with one name of a trial are of one trial."))
     notes += [note for part in parts for note in part.notes]
     return Log(
         *(trials.obs, trials.action, trials.mask, trials.actions), units, tuple(by_trial), tuple(dict.fromkeys(notes))

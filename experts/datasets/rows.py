@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.datasets.table import EMPTY, Column, Table, number
+from deconfounded.experts.datasets.table import EMPTY, Column, Odd, Table, number
 
 CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
 GAP = 1.5  # times the usual time between rows
@@ -220,14 +220,14 @@ def _of_time(table: Table, clock: str, passed: NDArray[np.float64], inside: NDAr
     """Gaps, rows of the same time, and time that runs backwards, by a column of time."""
     forward = inside & (passed > 0)
     usual = float(np.median(passed[forward])) if forward.any() else 0.0
-    back = f"{clock} runs backwards {{}} times; are rows of several episodes taken for one, or unsorted?"
     kinds = {
         f"{{}} gaps: more than {GAP:g} times the usual {usual:.4g} of {clock} passes": passed > GAP * usual,
-        f"{{}} rows have the {clock} of the row before them: duplicates?": passed == 0,
-        back: passed < 0,
+        f"{{}} rows have the {clock} of the row before them: duplicates?": (passed == 0) & (usual > 0),
+        Odd(f"{clock} runs backwards {{}} times; are rows of several episodes taken for one, or unsorted?"): passed < 0,
     }
     notes = []
     for text, where in kinds.items():
-        if (usual or text == back) and (rows := np.flatnonzero(where & inside)).size:
-            notes.append(f"{text.format(f'{len(rows):,}')} (the first: row {rows[0] + 2} of {table.where}).")
+        if (rows := np.flatnonzero(where & inside)).size:
+            note = f"{text.format(f'{len(rows):,}')} (the first: row {rows[0] + 2} of {table.where})."
+            notes.append(type(text)(note))
     return notes

@@ -21,6 +21,10 @@ Column = NDArray[Any]
 """N numbers, or N texts; NaN is an empty cell."""
 
 
+class Odd(str):
+    """A note on what may mislead: trials may not be what they seem."""
+
+
 @dataclass(frozen=True)
 class Table:
     """Rows of logs in the order of time. A row holds an observation, and the action that was chosen on it.

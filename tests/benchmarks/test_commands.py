@@ -522,8 +522,8 @@ def test_records_are_few_and_small() -> None:
 def test_pages_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     """What publish.py writes of tasks, certificates and results; docs/ has a row for each of the latter two."""
     monkeypatch.setattr(records, "held", cache(records.held))  # pages read the same files
-    found = results.published(), results.published(names=envs.HARD), results.other_protocols()
-    for file, text in publish.texts(*found).items():
+    kept = results.published(), results.published(names=envs.HARD), results.other_protocols()
+    for file, text in publish.texts(*kept).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     docs = ROOT / "docs"
     of_results = re.findall(r"^\| \[(\w+)\]\(#", (docs / "results.md").read_text(), re.M)

@@ -213,9 +213,9 @@ def test_interval_of_a_card() -> None:
     kept = records.of_task(ROOT / "docs/records", "slippery_cartpole")
     [own] = [each for each in kept if (records.named(each), each["seed"]) == ("naive_rnn", 1)]
     _, section = card._scores(own, kept)
-    zero, one = aggregation.references(own, kept)
-    last = own["episodes"] - 1
-    score, sd = (own["returns"][last] - zero) / (one - zero), own["returns_sd"][last] / (one - zero)
+    by_random, by_expert = aggregation.references(own, kept)
+    last, unit = own["episodes"] - 1, by_expert - by_random
+    score, sd = (own["returns"][last] - by_random) / unit, own["returns_sd"][last] / unit
     low, high = (score + side * 1.96 * sd / np.sqrt(own["eval_trials"]) for side in (-1, 1))
     assert own["episodes"] > 1
     assert f"95% interval {low:.2f} to {high:.2f}" in section

@@ -23,6 +23,7 @@ from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets, policy
 from deconfounded.experts.datasets import Log
+from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.datasets.units import Units
 from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
 from tests.deconf.test_diagnose import _tiny_init
@@ -180,7 +181,11 @@ def test_units_do_not_matter(unit: float) -> None:
 
 def test_what_was_misread_is_odd() -> None:
     """That time runs backwards, or that files share trials, is marked; what is merely said is not."""
-    notes = ("step runs backwards 3 times; ...", "Several files have a trial 0: ...", "2 trials of 1 episode.")
+    notes = (
+        Odd("step runs backwards 3 times; ..."),
+        Odd("Several files have a trial 0: ..."),
+        "2 trials of 1 episode.",
+    )
     log = replace(Log.of(driven()), notes=notes)
     assert [remark.odd for note in notes for remark in look(log) if remark.text == note] == [True, True, False]
 

@@ -17,6 +17,7 @@ from deconfounded import envs
 from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets
+from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.datasets.units import RawAgent, Units
 from deconfounded.experts.rollout import Trials
 
@@ -261,8 +262,10 @@ class TestNotes:
     def test_time_that_runs_backwards(self, tmp_path: Path) -> None:
         """In all of it, in a shuffled part, or where a column that says what an episode is was forgotten."""
         made = [{**row, "time": -row["time"]} for row in rows()]
-        notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES).notes)
+        log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+        notes = " ".join(log.notes)
         assert f"time runs backwards {len(made) - 5} times" in notes
+        assert ["runs backwards" in note for note in log.notes if isinstance(note, Odd)] == [True]
         assert "gaps" not in notes
         roles = {**ROLES, "episode": None}
         notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", rows(AFTER)), **roles).notes)
@@ -346,6 +349,7 @@ class TestNames:
         log = datasets.read(files, trial="run", obs=["x"], action=["u"])
         assert log.names == ("0", "1", "2")
         assert "Several files have a trial 0: rows with one name of a trial are of one trial." in log.notes
+        assert [type(note) for note in log.notes if note.startswith("Several files")] == [Odd]
 
 
 class TestActions:
