@@ -38,14 +38,15 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure, with_tier
 from deconfounded.envs.support.errors import InputError
 
 
-def judge(refits: Sequence[Findings], explored: int | None = None) -> Diagnosis:
+def judge(refits: Sequence[Findings], explored: int | None = None, labels: Sequence[str] = ()) -> Diagnosis:
     """The verdict, and why. It cannot tell where less than half of the refits, judged alone, lead to the same tier.
 
     That is, both "not confounded" and "nothing at stake" say that a clone loses nothing. explored: trials of
-    exploration. Raises InputError if a figure is not finite.
+    exploration. labels: observations that show how trials differ in their dynamics, see `labels.py`. Raises InputError
+    if a figure is not finite.
     """
-    diagnosis = _judge(refits, explored)
-    alone = [_judge([refit], explored) for refit in refits]
+    diagnosis = _judge(refits, explored, labels)
+    alone = [_judge([refit], explored, labels) for refit in refits]
     if diagnosis.tier is not None and 2 * sum(split.tier == diagnosis.tier for split in alone) < len(refits):
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
@@ -71,7 +72,7 @@ def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
     return figures
 
 
-def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
+def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[str]) -> Diagnosis:
     figures = _figures(refits)
     names = ("memory_gain", "stakes", "paired_stakes", "model_deviation", "naive", "latent", "gap", "gap_by_actions")
     memory, stakes, paired, model, naive, latent, gap, by_actions = (figures[name] for name in names)
@@ -113,6 +114,13 @@ def _judge(refits: Sequence[Findings], explored: int | None) -> Diagnosis:
             conclusion = (
                 "Your system differs from trial to trial, but past actions tell a clone nothing of the expert's next"
                 " one that the present observation does not."
+            )
+            return conclude("not confounded", 1, conclusion, CLONE)
+        if labels:
+            conclusion = (
+                f"Your system differs from trial to trial, and your columns show it: {', '.join(labels)}, constant in"
+                " each trial. Given this, past actions tell a clone nothing more. A clone that will not observe it is"
+                " another matter: leave it out of --obs, and diagnose again."
             )
             return conclude("not confounded", 1, conclusion, CLONE)
         conclusion = (

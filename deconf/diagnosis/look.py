@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.deconf.diagnosis import fits
+from deconfounded.deconf.diagnosis import fits, labels
 from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.datasets.table import Odd
@@ -52,6 +52,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
         remarks += describe(log, steps)
     if not blind and log.actions != 1:  # of one action alone nothing follows
         remarks += [*_lag(part), *_lasting(part, fitted)]
+    remarks += [*_labels(log)] * (not blind)
     remarks += _dynamics(part, fitted, log.units.obs, blind)
     return sorted(remarks, key=lambda remark: remark.odd)
 
@@ -272,6 +273,16 @@ def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
         yield Remark("tails", text, True)
 
 
+def _labels(log: Log) -> Iterator[Remark]:
+    """Columns that are constant in each trial."""
+    if columns := [log.units.obs[i] for i in labels.constant(log)]:
+        text = (
+            f"Constant in each trial, and another in others, as what is hidden would be: {_list(columns)}. A diagnosis"
+            " is of an imitator that observes it. If yours will not, leave it out of --obs."
+        )
+        yield Remark("label", text, True)
+
+
 def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
     """Whether trials differ in their dynamics."""
     measured = fits.own_dynamics(trials, steps)
@@ -282,6 +293,9 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
             f"Trials differ in their dynamics: {names[measured[1]]} departs from a fit of all trials in the same way in"
             f" both halves of a trial (rank correlation {measured[0]:.2f})."
         )
+    elif columns := [names[i] for i in labels.of_dynamics(trials)]:
+        text = f"Trials differ in their dynamics, and observations show how: {_list(columns)}, constant in each trial."
+        measured = None
     elif blind:
         text = (
             "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
