@@ -14,15 +14,18 @@ from deconfounded.envs.contract.probe import Skipped
 
 def main() -> None:
     parser = Parser(__doc__, "--task")
-    task, failed = envs.get(parser.parse_args().task), False
+    task = envs.get(parser.parse_args().task)
+    faults: dict[str, str] = {}  # the first check that reports each
     for name, check in {"check_task": check_task, **CONTRACT}.items():
         try:
             check(task)
         except Skipped as why:
             print(f"skip {name}: {why}", flush=True)
         except (Exception, SystemExit) as error:
-            failed = True
-            print(f"FAIL {name}: {sentence(error)}", flush=True)
+            fault = sentence(error)
+            same = next((f"the same as {first}" for text, first in faults.items() if text in fault), "")
+            faults.setdefault(fault, name)
+            print(f"FAIL {name}: {same or fault}", flush=True)
         else:
             print(f"ok   {name}", flush=True)
-    sys.exit(failed)
+    sys.exit(bool(faults))

@@ -72,15 +72,21 @@ class Given:
 
     def explore(self, agent: Agent | None = None, trials: int | None = None) -> Trials:
         """Roll out an agent (None: random actions) under fresh thetas. trials: for each seed; None: the preset's."""
-        return self._ask("exploration", trials, agent=agent)
+        return self._roll_out("exploration", agent, trials)
 
     def explore_with_theta(self, agent: Agent | None = None) -> tuple[Trials, Array]:
         """Roll out an agent as in `explore`, with the encoded theta, as `theta` has it."""
-        return self._ask("exploration with theta", None, agent=agent)
+        return self._roll_out("exploration with theta", agent, None)
 
     def query(self, agent: Agent | None = None, trials: int | None = None) -> tuple[Trials, FloatArray]:
         """Roll out an agent as in `explore`, with the expert's action at each step [B, E, T, A]."""
-        return self._ask("queries", trials, agent=agent)
+        return self._roll_out("queries", agent, trials)
+
+    def _roll_out(self, kind: str, agent: Agent | None, trials: int | None) -> Any:
+        if not isinstance(agent, Agent | None):
+            right = "an Agent, or None: random actions; a number of trials is trials=..."
+            raise InputError(f"agent of {kind} was {agent!r}; it must be {right}")
+        return self._ask(kind, trials, agent=agent)
 
     def environments(self, seed: int, n: int) -> "Environments":
         """n environments of the seed of that index, under fresh thetas, for exploration step by step."""

@@ -97,8 +97,7 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
             except Exception as error:
                 send("done", error_line(error), time.process_time())
     except (Exception, SystemExit) as error:  # among them that the other end is gone
-        file = outside.file(reference)
-        send("failed", error_line(error, file and file.parent), "".join(traceback.format_exception(error)))
+        send("failed", error_line(error), "".join(traceback.format_exception(error)))
 
 
 def _end_with_parent() -> None:

@@ -50,7 +50,7 @@ class GymSimulator(Simulator):
         for i, first, then in zip(rows.tolist(), start[:, 0], noise[:, 0, 0], strict=True):
             env = self._envs[i] = self._envs[i] or self.box.make(self.theta[i])
             with part(self.box.name, "reset"):
-                obs, _ = env.reset(seed=int(first))
+                obs, _ = self._values("reset", env.reset(seed=int(first)), "obs, info")
                 bits = env.unwrapped.np_random.bit_generator
                 bits.state = type(bits)(int(then)).state  # in place, as parts of the environment may hold the generator
             states.append(self._state("reset", obs, 0.0, False))
@@ -63,9 +63,17 @@ class GymSimulator(Simulator):
             env = self._envs[i]
             assert env is not None
             with part(self.box.name, "step"):
-                obs, reward, terminated, truncated, _ = env.step(self.box.raw(action[k]))
-                after[k] = self._state("step", obs, float(reward), terminated or truncated)
+                values = "obs, reward, terminated, truncated, info"
+                obs, reward, over, cut, _ = self._values("step", env.step(self.box.raw(action[k])), values)
+                after[k] = self._state("step", obs, float(reward), over or cut)
         return after
+
+    def _values(self, where: str, values: object, names: str) -> tuple[Any, ...]:
+        """What an environment returned, of the names of Gymnasium's interface."""
+        if not isinstance(values, tuple) or len(values) != len(names.split(", ")):
+            what = f"{len(values)} values" if isinstance(values, tuple) else f"a {type(values).__name__}"
+            raise InputError(f"{where} of {self.box.name} returned {what}; it must return {names}, as gymnasium.Env")
+        return values
 
     def _state(self, where: str, obs: object, reward: float, over: bool) -> Array:
         row, width = np.asarray(obs, float), len(self.box.observation)
@@ -197,10 +205,10 @@ class BlackBox(Task):
         space, rows = self.facts.space, []
         for seen, hidden in zip(obs, theta, strict=True):
             with part(self.name, "expert"):
-                rows.append(np.asarray(self.facts.world.expert(seen.astype(float), hidden.copy()), float))
+                rows.append(np.asarray(given := self.facts.world.expert(seen.astype(float), hidden.copy()), float))
             right = () if isinstance(space, spaces.Discrete) else space.shape
             if rows[-1].size != np.prod(right) or not np.isfinite(rows[-1]).all():
-                wrong = f"{rows[-1].tolist()} for an observation"
+                wrong = f"{given if given is None else rows[-1].tolist()} for an observation"
                 raise InputError(f"expert of {self.name} gave {wrong}; it must be of shape {right}, finite, of {space}")
         action = np.stack(rows).reshape(len(obs), -1)
         if not isinstance(space, spaces.Discrete):
@@ -221,7 +229,7 @@ class BlackBox(Task):
 
 def task_of(cls: type) -> type[BlackBox]:
     """The class of a world's task, called as the world is. Raises InputError if parts of a world are missing."""
-    missing = [name for name in PARTS if not hasattr(cls, name)]
+    missing = [name for name in PARTS if getattr(cls, name, None) is None]
     missing += [name for name in getattr(cls, "__abstractmethods__", ()) if name not in missing]
     if missing:
         raise InputError(f"world {cls.__name__} lacks {', '.join(missing)}; a world has {SHAPE}")

@@ -1,5 +1,6 @@
 """Worlds: classes that make other people's Gymnasium environments for a hidden theta, and what is known of them."""
 
+import inspect
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -118,6 +119,9 @@ def made(name: str, world: World, theta: Array) -> gymnasium.Env[Any, Any]:
         env = world.make(theta.copy())
     if not isinstance(env, gymnasium.Env):
         raise InputError(f"make of {name} gave {env!r}; it must be a gymnasium.Env")
+    parameters = inspect.signature(env.unwrapped.reset).parameters.values()
+    if not any(parameter.name == "seed" or parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
+        raise InputError(f"reset of {name} takes no seed; it must be reset(seed=None, options=None), as gymnasium.Env")
     seen, acts = (" ".join(str(space).split()) for space in (env.observation_space, env.action_space))
     if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
         right = "a Box of one axis: wrap it in gymnasium.wrappers.FlattenObservation"

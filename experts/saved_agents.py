@@ -79,12 +79,19 @@ def load(folder: Path | str) -> Agent:
         raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
     about = describe(folder := Path(folder))
     try:
+        content = from_bytes(arrays(folder, about))
         where, _, name = about["class"].rpartition(":")
-        cls = outside.find("agent", f"{folder / where if where == CODE else where}:{name}")
-        if not (inspect.isclass(cls) and issubclass(cls, Agent)):
-            raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
-        return cls.from_state(about["settings"], from_bytes(arrays(folder, about)))
+        cls, settings = outside.find("agent", f"{folder / where if where == CODE else where}:{name}"), about["settings"]
     except InputError:
         raise
-    except Exception as error:  # any error of the class's own `from_state`
+    except Exception as error:
         raise InputError(f"the agent in {folder} is damaged ({error_line(error)}); run the benchmark again") from None
+    if not (inspect.isclass(cls) and issubclass(cls, Agent)):
+        raise InputError(f"the agent in {folder} is {cls!r}; it must be a subclass of Agent")
+    try:
+        return cls.from_state(settings, content)
+    except InputError:
+        raise
+    except Exception as error:  # what was saved is whole, by its sha256
+        what = f"from_state of {cls.__qualname__} fails on the agent in {folder}"
+        raise InputError(f"{what}: {error_line(error)}; it must undo what state() gives") from None

@@ -96,7 +96,7 @@ class Guest(Agent):
         try:
             said = unpack(self.channel.recv_bytes())
         except (EOFError, ConnectionError):
-            raise envs.InputError(f"method {self.name}: its process was killed (out of memory?)") from None
+            raise envs.InputError(f"method {self.name}: its process {self._end()}") from None
         except envs.InputError as error:
             raise envs.InputError(f"method {self.name}: {error}") from None
         if not isinstance(said, list) or not said or not isinstance(said[0], str):
@@ -106,6 +106,15 @@ class Guest(Agent):
             failure.add_note(str(said[-1]))  # its traceback
             raise failure
         return said
+
+    def _end(self) -> str:
+        """How its process ended."""
+        try:
+            status = self.process.wait(2)
+        except subprocess.TimeoutExpired:
+            return "closed the connection"
+        killed = "was killed (out of memory?)" if status == -signal.SIGKILL else f"was ended by signal {-status}"
+        return f"ended with status {status}" if status >= 0 else killed
 
     def _fit(self) -> None:
         while True:
@@ -150,7 +159,11 @@ class Guest(Agent):
         """Clipped to [-1, 1] if continuous, as environments do. Raises InputError for what is not a row for each."""
         given, task = self._do("act", obs), self.context.task
         width = task.action_width
-        action = np.asarray(given, float) if isinstance(given, np.ndarray) else np.empty(0)
+        if not isinstance(given, np.ndarray):
+            right = f"an array ({len(obs)}, {width})"
+            what = "None" if given is None else f"a {type(given).__name__}"
+            raise envs.InputError(f"method {self.name} gave {what} for actions; they must be {right}")
+        action = given.astype(float)
         if action.shape != (len(obs), width) or not np.isfinite(action).all():
             what = f"shape {action.shape}" if action.shape != (len(obs), width) else "NaN or infinity"
             raise envs.InputError(

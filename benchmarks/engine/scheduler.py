@@ -15,7 +15,6 @@ from deconfounded.benchmarks.engine.catalogue import METHODS, Method
 from deconfounded.benchmarks.engine.job_files import Finished, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import check_folder, write_atomically
 
@@ -49,8 +48,7 @@ def run_job(job: Work) -> str:
     except Exception as error:
         if not (theirs := job.from_outside if isinstance(job, Job) else []):
             raise
-        folders = [file.parent for name in theirs if (file := outside.file(name))]
-        failure = InputError(f"{' and '.join(theirs)}: {error_line(error, *folders)}")
+        failure = InputError(f"{' and '.join(theirs)}: {error_line(error)}")
         failure.add_note("".join(traceback.format_exception(error)))
         raise failure from None
 

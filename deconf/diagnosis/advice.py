@@ -57,7 +57,9 @@ EXPLORE = Next(
     "deconfounded.train(trials, explore, deconfounded.DeconfoundedConfig(), np.random.default_rng(0))",
 )
 QUERY = Next(
-    "Ask the expert for its actions in states that the clone visits (Tier 3).",
+    "If you can, let the clone observe it, by a sensor or by a person's word. If the world shows it somewhere, ask the"
+    " expert for its actions in states that the clone visits (Tier 3, the printed lines). If nothing shows it, no data"
+    " helps, and no clone can know where to go.",
     "dagger.train(query, dagger.DaggerConfig(), np.random.default_rng(0))",
 )
 EXPLORE_FIRST = Next(

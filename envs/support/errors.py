@@ -1,8 +1,11 @@
 """The error for bad input, and how other errors are reported in one line."""
 
+import sysconfig
 import traceback
 from pathlib import Path
 
+PACKAGE, PARTS = Path(__file__).resolve().parents[2], ("envs", "experts", "deconf", "benchmarks")
+STANDARD_LIBRARY = Path(sysconfig.get_path("stdlib")).resolve()
 LONGEST = 1000  # of an error, in characters: what was given may be an array, or a file
 
 
@@ -14,10 +17,10 @@ class InputError(ValueError):
         return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
-def error_line(error: BaseException, *folders: Path | None) -> str:
+def error_line(error: BaseException) -> str:
     """An error in one line: its message, its type and its place in the source; of an InputError the message alone.
 
-    folders: of code from outside. The place is the innermost line of a file in them, if there is one.
+    The place is the innermost line that is neither this package's nor a library's, if there is one.
     """
     text = " ".join(str(error.args[0] if isinstance(error, KeyError) and error.args else error).split())
     if isinstance(error, InputError):
@@ -25,12 +28,13 @@ def error_line(error: BaseException, *folders: Path | None) -> str:
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if any(folder and _is_in(Path(frame.filename), folder) for folder in folders)]
-    frame = (own or frames)[-1]
+    frame = ([frame for frame in frames if _is_users(frame.filename)] or frames)[-1]
     return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
 
 
-def _is_in(file: Path, folder: Path) -> bool:
-    """Whether a file is in a folder, but in no environment of installed packages there."""
-    file, folder = file.resolve(), folder.resolve()
-    return file.is_relative_to(folder) and "site-packages" not in file.relative_to(folder).parts
+def _is_users(name: str) -> bool:
+    """Whether a file is the user's own: neither of this package nor of a library."""
+    file = Path(name).resolve()
+    ours = any(file.is_relative_to(PACKAGE / part) for part in PARTS)
+    installed = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(STANDARD_LIBRARY)
+    return not name.startswith("<") and not ours and not installed

@@ -37,8 +37,7 @@ def find(kind: str, reference: str) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        folder = here(Path(where)).parent if where.endswith(".py") else None
-        raise InputError(f"{kind} {reference!r}: {error_line(error, folder)}") from error
+        raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
     if not hasattr(module, name):
         names = [key for key in vars(module) if not key.startswith("_")]
         raise InputError(f"{kind} {reference!r}: {where} has no {name!r}; it has {', '.join(names)}")

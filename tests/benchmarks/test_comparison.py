@@ -143,8 +143,7 @@ def test_an_error_s_line_is_of_the_user_s_file(tmp_path: Path) -> None:
 
         with pytest.raises(ValueError, match="Expecting") as caught:
             own.f()
-        assert error_line(caught.value, tmp_path).endswith("(JSONDecodeError, own.py:3)")
-        assert "decoder.py" in error_line(caught.value)
+        assert error_line(caught.value).endswith("(JSONDecodeError, own.py:3)")
     finally:
         sys.path.remove(str(tmp_path))
     assert len(str(InputError("x" * 22_000))) < 1100

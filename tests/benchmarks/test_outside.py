@@ -316,7 +316,11 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.rollout.Agent"),
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
-        ("def fit(given): import os; os._exit(1)", r"its process was killed \(out of memory\?\)"),
+        ("def fit(given): import os; os._exit(3)", "its process ended with status 3$"),
+        ("def fit(given): import os; os.kill(os.getpid(), 9)", r"its process was killed \(out of memory\?\)"),
+        ("def fit(given): import os; os.kill(os.getpid(), 11)", "its process was ended by signal 11$"),
+        ("def fit(given): given.explore(3)", "agent of exploration was 3; it must be an Agent, or None"),
+        ("def fit(given): np.linalg.inv(np.zeros((2, 2)))", r"Singular matrix \(LinAlgError, mine.py:11\)"),
         ("def fit(given): given.explore(trials=0)", "asked for exploration, and declares"),
     ],
 )
@@ -335,7 +339,8 @@ def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
             r"actions of shape \(3,\) for 4 obs.*; they must be \(4, 1\), finite",
         ),
         ("    def act(self, obs): return np.full((len(obs), 1), np.nan)", "actions of NaN or infinity"),
-        ("    def act(self, obs): return [[1], [1, 2]]", r"actions of shape \(0,\)|inhomogeneous|what it sent|it gave"),
+        ("    def act(self, obs): return [[1], [1, 2]]", r"gave a list for actions; they must be an array \(4, 1\)"),
+        ("    def act(self, obs): pass", "gave None for actions"),
         ("    def act(self, obs): return Thief()", "it gave Thief; it must be numbers, or arrays of them"),
         ("    def features(self): return np.full((4, 2), np.nan)", "gave features of NaN or infinity"),
         (
@@ -643,9 +648,13 @@ class TestSaved:
             (None, "is of no agent"),
             ("0" * 64, r"agent\.safetensors is damaged, or of another agent"),
             (hashlib.sha256(b"half").hexdigest(), r"is damaged \(.*\); run the benchmark again"),
+            (
+                hashlib.sha256(empty := saved_agents.to_bytes({})).hexdigest(),
+                "from_state of RecurrentAgent fails",
+            ),
         ):
             write_sealed(tmp_path / "agent.json", {**about, "arrays": arrays})
-            (tmp_path / "agent.safetensors").write_bytes(b"half")
+            (tmp_path / "agent.safetensors").write_bytes(empty if "from_state" in says else b"half")
             with pytest.raises(envs.InputError, match=says):
                 deconfounded.load(tmp_path)
 

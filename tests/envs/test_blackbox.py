@@ -193,6 +193,14 @@ def four(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"step": lambda self, action: Slide.step(self, action)[:4]})(0.0)
 
 
+def old_reset(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"reset": lambda self: np.zeros(1)})(0.0)
+
+
+def reset_of_one(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"reset": lambda self, **options: Slide.reset(self, **options)[0]})(0.0)
+
+
 def wide(self: Any, theta: Any) -> Any:
     def step(self: Slide, action: Any) -> Any:
         obs, *rest = Slide.step(self, action)
@@ -209,13 +217,15 @@ class TestErrors:
         ("make", lambda self, theta: 1 / 0, r"make of Sliding: division by zero \(ZeroDivisionError, test_bl"),
         ("make", dict_obs, "observation_space of Sliding was Dict.*; it must be a Box of one axis: wrap"),
         ("make", unbounded, r"action_space of Sliding was Box\(-inf.*; it must be bounded"),
-        ("make", four, "step of sliding: not enough values to unpack"),
+        ("make", four, "step of sliding returned 4 values; it must return obs, reward, terminated, truncated, info"),
+        ("make", old_reset, "reset of Sliding takes no seed; it must be reset.seed=None, options=None., as gymn"),
+        ("make", reset_of_one, "reset of sliding returned a ndarray; it must return obs, info, as gymnasium.Env"),
         ("make", wide, r"step of sliding gave an observation of shape \(2,\); it must be 1 finite numbers"),
         ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),
         ("sample_theta", lambda self, rng: [np.nan], "sample_theta of Sliding gave .nan.; it must be"),
         ("sample_theta", lambda self, rng: [1] * rng.integers(1, 3), "it must be . finite numbers, as at first"),
         ("expert", lambda self, obs, theta: np.zeros(3), r"expert of sliding gave .* must be of shape \(1,\)"),
-        ("expert", lambda self, obs, theta: None, "expert of sliding"),
+        ("expert", lambda self, obs, theta: None, "expert of sliding gave None for an observation; it must be of"),
         ("steps", 0, "the number of steps of Sliding was 0"),
         ("noise", -1, "noise of Sliding was -1; it must be a number from 0 up"),
         ("names", ("a", "b"), "names of Sliding were .*; they must be 1 different texts"),

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -312,6 +313,25 @@ def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     assert code == 1
     assert failed.startswith("FAIL effect: thetas [")
     assert rest == ["ok   reset_options", "ok   bounds_are_wide_enough"]
+
+
+def test_check_command_says_a_fault_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where several checks fail by one fault, those after the first name that check."""
+
+    def fault(text: str) -> Callable[[envs.Task], None]:
+        def fail(task: envs.Task) -> None:
+            raise envs.InputError(text)
+
+        return fail
+
+    checks = {"one": fault("no step"), "two": fault("checker: no step"), "three": fault("no start")}
+    monkeypatch.setattr(check, "CONTRACT", checks)
+    monkeypatch.setattr("sys.argv", ["check", "--task", "bandit"])
+    with pytest.raises(SystemExit) as done:
+        check.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1:] == ["FAIL one: no step", "FAIL two: the same as one", "FAIL three: no start"]
+    assert done.value.code == 1
 
 
 @pytest.mark.slow
