@@ -121,6 +121,13 @@ class Trials:
         raise InputError(f"no trials could be read from {file}: {why}")
 
 
+def check_trials(what: str, given: object) -> None:
+    """Raises InputError for what is no Trials. what: was given it."""
+    if not isinstance(given, Trials):
+        right = "Trials: of deconfounded.experts.datasets.read, or of arrays"
+        raise InputError(f"{what} was given a {type(given).__name__}; it must be {right}")
+
+
 def joined(parts: Sequence[Trials]) -> Trials:
     """Concatenate trials of the same shape."""
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))

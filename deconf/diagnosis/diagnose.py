@@ -15,7 +15,7 @@ from deconfounded.deconf.diagnosis.latent import in_range
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.rollout import Trials, check_trials
 
 VERSION = 13  # raised when figures or verdicts of the same trials change
 
@@ -37,6 +37,10 @@ def diagnose(
     report: Report = lambda share: None,
 ) -> Diagnosis:
     """Judge expert trials, and exploration if there is any. Raises InputError for data that cannot be judged."""
+    for data in (trials, *[explore] * (explore is not None)):
+        check_trials("diagnose", data)
+    if not isinstance(rng, np.random.Generator):
+        raise InputError(f"rng was {rng!r}; it must be a generator: np.random.default_rng(0)")
     check(trials, explore, config)
     refits: list[Findings] = []
 

@@ -1,19 +1,18 @@
 """A first look at logs, before any diagnosis: what is in them, and what would mislead it, in plain words."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.deconf.diagnosis import fits, labels
+from deconfounded.deconf.diagnosis import columns, fits, labels
 from deconfounded.deconf.diagnosis.fits import Steps
+from deconfounded.deconf.diagnosis.remark import LISTED, Remark, listed
 from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.datasets.table import Odd
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.rollout import Trials, check_trials
 
 Array = NDArray[np.float64]
-LISTED = 8  # columns, trials, that are named
 OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials
 MOST = 50_000  # steps that are fitted
 FEW = 8  # values of a column that does not move, but jumps
@@ -22,25 +21,15 @@ LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing fo
 BETTER = 0.95  # of the variance that another row leaves
 REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
 ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
-HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
-
-
-class Remark(NamedTuple):
-    """A sentence or two. kind: what it is about; odd: whether it may mislead a diagnosis, and should be mended."""
-
-    kind: str
-    text: str
-    odd: bool = False
-
-    def __str__(self) -> str:
-        return f"{'!' if self.odd else '-'} {self.text}"
 
 
 def look(given: Trials, blind: bool = False) -> list[Remark]:
     """Remarks on trials, those of a log by the names of its columns; what is odd comes last.
 
-    blind: they are of exploration, of which it does not matter how its actions are chosen.
+    blind: they are of exploration, of which it does not matter how its actions are chosen. Raises InputError for what
+    is no Trials.
     """
+    check_trials("look", given)
     log = given if isinstance(given, Log) else Log.of(given, "Trials")
     steps, part = Steps.of(log), given
     if (total := len(steps.trial)) > MOST:  # evenly spaced trials, for what is fitted
@@ -48,36 +37,40 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
         part = Trials(log.obs[index], log.action[index], log.mask[index], log.actions)
     fitted = Steps.of(part)
     remarks = [Remark("size", note, isinstance(note, Odd)) for note in log.notes]
-    for describe in (_ranges, _outliers, _duplicates, _pauses, _states, _tails, *[_repeats] * (not blind)):
+    for describe in (
+        _ranges,
+        _outliers,
+        _duplicates,
+        _pauses,
+        _states,
+        columns.extremes,
+        columns.angles,
+        *[_repeats] * (not blind),
+    ):
         remarks += describe(log, steps)
     if not blind and log.actions != 1:  # of one action alone nothing follows
         remarks += [*_lag(part), *_lasting(part, fitted)]
-    remarks += [*_labels(log)] * (not blind)
+    remarks += [*columns.of_trials(log)] * (not blind)
     remarks += _dynamics(part, fitted, log.units.obs, blind)
     return sorted(remarks, key=lambda remark: remark.odd)
 
 
-def _list(names: list[str]) -> str:
-    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
-    return ", ".join(names[:LISTED]) + more
-
-
 def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
     low, middle, high = np.quantile(steps.obs, [0, 0.5, 1], 0)
-    columns = zip(log.units.obs, low, middle, high, strict=True)
-    said = [f"{name} {a:.4g} to {c:.4g} (median {b:.4g})" for name, a, b, c in columns]
-    yield Remark("range", f"Observations: {_list(said)}.")
+    ranges = zip(log.units.obs, low, middle, high, strict=True)
+    said = [f"{name} {a:.4g} to {c:.4g} (median {b:.4g})" for name, a, b, c in ranges]
+    yield Remark("range", f"Observations: {listed(said)}.")
     if log.actions:
         counts = np.bincount(steps.action[:, 0].astype(int), minlength=log.actions) / len(steps.action)
         named = [f"{name} {share:.0%}" for name, share in zip(log.units.values, counts, strict=True)]
-        yield Remark("range", f"Actions used: {_list(named)}.")
+        yield Remark("range", f"Actions used: {listed(named)}.")
         return
     raw = log.units.unscaled(steps.action)
     said = []
     for name, column, scaled in zip(log.units.action, raw.T, steps.action.T, strict=True):
         a, b = np.quantile(column, [0.01, 0.99])
         said.append(f"{name} {a:.4g} to {b:.4g} ({(np.abs(scaled) > 0.999).mean():.0%} at an end of the range)")
-    yield Remark("range", f"Actions used, without the extreme 1% at each side: {_list(said)}.")
+    yield Remark("range", f"Actions used, without the extreme 1% at each side: {listed(said)}.")
 
 
 def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -91,8 +84,8 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     names, features = ["length of episodes"], [per_episode.astype(float)]
     least = [0.1 * float(per_episode.mean())]
     rows = [np.flatnonzero(steps.trial == i) for i in present]
-    columns = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
-    for name, column in columns:
+    named = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
+    for name, column in named:
         quartiles = np.array([np.quantile(column[index], [0.25, 0.5, 0.75]) for index in rows])
         names += [f"median of {name}", f"interquartile range of {name}"]
         features += [quartiles[:, 1], quartiles[:, 2] - quartiles[:, 0]]
@@ -120,14 +113,14 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
         if groups:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
-            text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {_list(named)}."
+            text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {listed(named)}."
             apart = "A diagnosis never holds one out without its copies; still, they count as often as they are there."
             betrays = "Where one is held out, its copy betrays it; keep one of each."
             yield Remark("duplicate", f"{text} {betrays if kind else apart}", True)
     if repeated := [group for group in episodes if group not in whole]:
         names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
         again = sum(len(group) - 1 for group in repeated)
-        yield Remark("duplicate", f"{again} episodes repeat others, in trials {_list(names)}.", True)
+        yield Remark("duplicate", f"{again} episodes repeat others, in trials {listed(names)}.", True)
 
 
 def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
@@ -256,33 +249,6 @@ def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
         yield Remark("lasting", text, True)
 
 
-def _tails(log: Log, steps: Steps) -> Iterator[Remark]:
-    """Columns with heavy tails, and what mends them."""
-    columns = list(zip(log.units.obs, steps.obs.T, strict=True))
-    if not log.actions:
-        columns += list(zip(log.units.action, log.units.unscaled(steps.action).T, strict=True))
-    for name, x in columns:
-        if (heavy := fits.kurtosis(x)) < HEAVY:
-            continue
-        how, left = fits.mended(name, x)
-        low, high = np.quantile(x, [0.005, 0.995])
-        text = (
-            f"{name} has heavy tails: 99% of it lies within {low:.4g} and {high:.4g}, all within {x.min():.4g} and"
-            f" {x.max():.4g} (excess kurtosis {heavy:.0f}). {how} mends it ({left:.1f})."
-        )
-        yield Remark("tails", text, True)
-
-
-def _labels(log: Log) -> Iterator[Remark]:
-    """Columns that are constant in each trial."""
-    if columns := [log.units.obs[i] for i in labels.constant(log)]:
-        text = (
-            f"Constant in each trial, and another in others, as what is hidden would be: {_list(columns)}. A diagnosis"
-            " is of an imitator that observes it. If yours will not, leave it out of --obs."
-        )
-        yield Remark("label", text, True)
-
-
 def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
     """Whether trials differ in their dynamics."""
     measured = fits.own_dynamics(trials, steps)
@@ -293,8 +259,8 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
             f"Trials differ in their dynamics: {names[measured[1]]} departs from a fit of all trials in the same way in"
             f" both halves of a trial (rank correlation {measured[0]:.2f})."
         )
-    elif columns := [names[i] for i in labels.of_dynamics(trials)]:
-        text = f"Trials differ in their dynamics, and observations show how: {_list(columns)}, constant in each trial."
+    elif shown := [names[i] for i in labels.of_dynamics(trials)]:
+        text = f"Trials differ in their dynamics, and observations show how: {listed(shown)}, constant in each trial."
         measured = None
     elif blind:
         text = (

@@ -89,8 +89,8 @@ def read_together(
 
 
 def _files(source: Source) -> list[Path]:
-    given = [source] if isinstance(source, str | Path) else list(source)
-    if not given or not all(isinstance(file, str | Path) for file in given):
+    given = [source] if isinstance(source, str | Path) else source
+    if not isinstance(given, Sequence) or not given or not all(isinstance(file, str | Path) for file in given):
         raise InputError(f"a log was {source!r}; it must be {KINDS}")
     for file in map(Path, given):
         if not file.exists():
@@ -149,8 +149,6 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
         for i, name in enumerate(action):
             if name in table.limits:
                 low[i], high[i] = min(low[i], table.limits[name][0]), max(high[i], table.limits[name][1])
-    if not np.isfinite([low, high]).all():
-        raise InputError(f"{action[int(np.argmin(np.isfinite(low + high)))]!r} is infinite; an action must be finite")
     said = "; ".join(f"{name} {a:.6g} to {b:.6g}" for name, a, b in zip(action, low, high, strict=True))
     return Units(
         obs, action, tuple(low.tolist()), tuple(high.tolist())

@@ -54,6 +54,9 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
     names = table.select("obs", roles.obs) or table.obs, table.select("action", roles.action) or table.action
     action_names = names[1]
     groups = [None if name is None else table.select(what, [name])[0] for what, name in _groups(table, roles)]
+    if both := [name for name in roles.obs if name in (*action_names, *groups)]:
+        used = "an action" if both[0] in action_names else "what a trial or an episode is"
+        raise InputError(f"obs {both[0]!r} of {table.where} is {used} too; a column has one role")
     obs_names = tuple(name for name in names[0] if name not in action_names and name not in groups)
     if not obs_names:
         raise InputError(f"obs of {table.where} are none beside the trial, the episode and the action")
@@ -76,7 +79,10 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
             single += 1
             continue
         _check(table, obs_names, np.isnan(obs[a:b]), a, "holds no number")
+        _check(table, obs_names, np.isinf(obs[a:b]), a, "is infinite")
         _check(table, action_names, empty[a : b - 1], a, "is empty")
+        if action.dtype != object:
+            _check(table, action_names, np.isinf(action[a : b - 1]), a, "is infinite")
         lost += not empty[b - 1].any()
         episodes.append(Episode(str(i) if trial is None else _text(trial[a]), obs[a:b], action[a : b - 1]))
     if not episodes:

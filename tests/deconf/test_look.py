@@ -113,9 +113,29 @@ def with_an_outlier(trials: Trials) -> Trials:
     return changed(trials, obs=obs)
 
 
+def more(trials: Trials, column: Any) -> Trials:
+    """Trials with one observation more, of shape [B, E, T + 1]."""
+    return changed(trials, obs=np.concatenate([trials.obs, column[..., None]], -1))
+
+
 def with_heavy_tails(trials: Trials) -> Trials:
-    wild = np.random.default_rng(0).standard_t(1.5, (*trials.obs.shape[:-1], 1))
-    return changed(trials, obs=np.concatenate([trials.obs, wild], -1))
+    return more(trials, np.random.default_rng(0).standard_t(1.5, trials.obs.shape[:-1]))
+
+
+def with_codes(trials: Trials) -> Trials:
+    """A sensor that fails in one step of twenty."""
+    rng = np.random.default_rng(0)
+    return more(trials, np.where(rng.random((B, E, T + 1)) < 0.05, -9999, rng.normal(size=(B, E, T + 1))))
+
+
+def with_a_heading(trials: Trials) -> Trials:
+    """A compass that turns, from 0 to 360 degrees."""
+    turned = np.random.default_rng(0).normal(10, 10, (B, E, T + 1)).cumsum(-1)
+    return more(trials, turned % 360)
+
+
+def with_a_label(trials: Trials) -> Trials:
+    return more(trials, np.broadcast_to(np.arange(B)[:, None, None] % 2, (B, E, T + 1)))
 
 
 def with_the_next_state(trials: Trials) -> Trials:
@@ -156,6 +176,14 @@ PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a
         "Trial 5 is unlike the others: its median of obs",
     ),
     "tails": (lambda: with_heavy_tails(driven()), {"tails"}, "tails", "arcsinh((observation 2 - "),
+    "code": (lambda: with_codes(driven()), {"code"}, "code", "observation 2 is -9999 in "),
+    "angle": (lambda: with_a_heading(driven()), {"angle"}, "angle", "observation 2 jumps by about 360 in "),
+    "label": (
+        lambda: with_a_label(driven()),
+        {"label"},
+        "label",
+        "in others, as what is hidden would be: observation 2",
+    ),
     "next": (lambda: with_the_next_state(driven()), {"state"}, "state", "action 0 is the next observation 0, to 0.0%"),
     "present": (lambda: with_the_present_state(driven()), {"state"}, "state", "action 0 is the present observation 0"),
 }
@@ -169,6 +197,25 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert set(odd(remarks)) - {"repeat"} == kinds
     assert words in said(remarks, kind)
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
+
+
+@pytest.mark.parametrize(
+    "column",
+    [
+        np.where(np.arange(T + 1) == 7, 99.0, np.linspace(0, 60, T + 1)),  # as near as others are to each other
+        np.where(np.arange(T + 1) % 20, np.arange(T + 1) % 3, -12.0),  # no code
+        np.linspace(0, 6.3, T + 1),  # turns once, and does not jump
+        np.where(np.arange(T + 1) % 9, 360.0, 0.0) - 180 * (np.arange(T + 1) % 2),  # jumps by half a turn
+    ],
+)
+def test_what_is_no_code_and_no_angle(column: Any) -> None:
+    remarks = look(more(driven(), np.broadcast_to(column, (B, E, T + 1))))
+    assert not {"code", "angle"} & set(odd(remarks))
+
+
+def test_what_are_no_trials() -> None:
+    with pytest.raises(envs.InputError, match="look was given a ndarray; it must be Trials"):
+        look(np.zeros((3, 4)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e6])

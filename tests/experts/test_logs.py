@@ -433,7 +433,10 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     "text among actions": ({}, {"throttle": "off"}, "'throttle' of .*x.csv is 'off' in row 3; it must be a number"),
     "NaN": ({}, {"speed x": "nan"}, "'speed x' of .*x.csv holds no number in row 3"),
     "no action": ({}, {"throttle": ""}, "'throttle' of .*x.csv is empty in row 3"),
-    "infinite": ({}, {"throttle": "inf"}, "'throttle' is infinite"),
+    "infinite": ({}, {"throttle": "inf"}, "'throttle' of .*x.csv is infinite in row 3"),
+    "infinite observation": ({}, {"speed x": "-inf"}, "'speed x' of .*x.csv is infinite in row 3"),
+    "two roles": ({"obs": ["speed x", "throttle"]}, {}, "obs 'throttle' of .*x.csv is an action too; a column has one"),
+    "a trial observed": ({"obs": ["speed x", "vehicle"]}, {}, "obs 'vehicle' of .* is what a trial or an episode is"),
     "apart": (
         {},
         {"lap": 7},
@@ -443,7 +446,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     "nothing said": ({"obs": []}, {}, "does not say what is obs; give --obs, of vehicle, lap"),
     "no episode": ({"trial": None, "episode": None}, {}, "does not say where an episode begins; give --episode or"),
     "one text": ({"obs": "speed x"}, {}, r"obs was 'speed x'; it must be a list of columns, \['speed x'\]"),
-    "all used": ({"obs": ["throttle", "lap"]}, {}, "obs of .* are none beside the trial"),
+    "all used": ({"obs": ["thr*", "lap*"]}, {}, "obs of .* are none beside the trial"),
 }
 
 
@@ -455,6 +458,11 @@ class TestBadInput:
         with pytest.raises(envs.InputError, match=says) as caught:
             datasets.read(write_csv(tmp_path / "x.csv", made), **{**ROLES, **roles})
         assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize("source", [None, 3, [], [None]])
+    def test_no_path(self, source: Any) -> None:
+        with pytest.raises(envs.InputError, match=r"a log was .*; it must be a \.csv, \.parquet"):
+            datasets.read(source, **ROLES)
 
     def test_actions_of_the_row_before(self, tmp_path: Path) -> None:
         made = rows(AFTER)
