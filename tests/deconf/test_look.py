@@ -205,7 +205,7 @@ def test_what_is_planted_is_named(case: str) -> None:
         np.where(np.arange(T + 1) == 7, 99.0, np.linspace(0, 60, T + 1)),  # as near as others are to each other
         np.where(np.arange(T + 1) % 20, np.arange(T + 1) % 3, -12.0),  # no code
         np.linspace(0, 6.3, T + 1),  # turns once, and does not jump
-        np.where(np.arange(T + 1) % 9, 360.0, 0.0) - 180 * (np.arange(T + 1) % 2),  # jumps by half a turn
+        np.array([0.0, 200.0, 360.0, 200.0])[np.arange(T + 1) % 4],  # jumps by little more than half a turn
     ],
 )
 def test_what_is_no_code_and_no_angle(column: Any) -> None:
