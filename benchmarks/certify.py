@@ -24,8 +24,9 @@ from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, nee
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
 from deconfounded.experts import policy
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.rollout import run_trials
 
 EPISODES, SEED, TRIALS = 5, 0, 64
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")

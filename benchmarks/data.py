@@ -12,7 +12,8 @@ from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.envs.support.files import check_folder
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials
 
 
 def main() -> None:

@@ -61,7 +61,7 @@ class Refit:
 
         from deconfounded.benchmarks.engine import progress
         from deconfounded.deconf.diagnosis.measures import measure
-        from deconfounded.experts.rollout import Trials
+        from deconfounded.experts.trials import Trials
 
         start, ticked = time.time(), 0
 

@@ -13,7 +13,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, whole
 from deconfounded.envs.support.files import check_file
 from deconfounded.experts import saved_agents
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 
 def ready(folder: Path, task: envs.Task) -> Agent:

@@ -13,8 +13,9 @@ from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.play import ready
 from deconfounded.envs.support.files import check_file, write_json
 from deconfounded.experts import policy
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.rollout import run_trials
 
 
 def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:

@@ -14,7 +14,8 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.files import check_file, write_atomically, write_json
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials
 
 STEPS = 3_000_000
 

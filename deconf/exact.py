@@ -17,8 +17,8 @@ from deconfounded.envs import BatchEnv, MujocoTask
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.task import Simulator
+from deconfounded.experts.agent import Agent
 from deconfounded.experts.policy import Expert, sample_rows
-from deconfounded.experts.rollout import Agent
 
 PRUNE_BELOW = 1e-4  # of the mass: values with less are not simulated
 AT_LEAST = 2  # values that are

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.trials import Trials
 
 if TYPE_CHECKING:
     from deconfounded.deconf.core.monitor import Monitor

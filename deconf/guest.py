@@ -17,7 +17,7 @@ import numpy as np
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.wire import pack
 from deconfounded.envs.support.errors import InputError, error_line
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 RETURNING = ("act", "features")  # calls whose result is sent back
 
@@ -87,7 +87,7 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
         agent = fit(Given(ask, about, config, rngs, ChannelMonitor(channel)))
         ask.close()
         if not isinstance(agent, Agent):
-            raise InputError(f"it returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
+            raise InputError(f"it returned {agent!r}; it must return a deconfounded.experts.agent.Agent")
         send("fitted")
         while True:
             folder, described = serve(channel, agent)

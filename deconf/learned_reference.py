@@ -15,8 +15,9 @@ from sklearn.preprocessing import StandardScaler
 from deconfounded.deconf.exact import Grid
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.streams import Array, Mask, Streams
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, of_steps, run_trials
+from deconfounded.experts.rollout import Rollout, of_steps, run_trials
 
 HELD_OUT = 4  # every so many-th trial fits the noise, not the mean
 SHRINKAGE = 0.05  # of the residuals' covariance to its diagonal: what is nearly deterministic is what the fit misses

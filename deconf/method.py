@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 if TYPE_CHECKING:
     from deconfounded.deconf.given import Given

@@ -22,8 +22,8 @@ from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
+from deconfounded.experts.agent import Agent
 from deconfounded.experts.policy import Expert, sample_rows
-from deconfounded.experts.rollout import Agent
 
 PARTICLES = 1024
 GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior factorises

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from deconfounded.experts.rollout import Agent
+    from deconfounded.experts.agent import Agent
 
 
 def load(folder: Path | str) -> "Agent":

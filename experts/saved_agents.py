@@ -13,7 +13,7 @@ from deconfounded import __version__
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import as_json, check_folder, read_sealed, sealed, write_atomically
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 ARRAYS = "agent.safetensors"
 CODE = "agent.py"  # source of an agent from outside, kept beside its arrays

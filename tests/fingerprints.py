@@ -33,7 +33,8 @@ from deconfounded.benchmarks.output import index, scoring, statistics
 from deconfounded.deconf.diagnosis import diagnose, measures
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import RandomAgent, run_trials
+from deconfounded.experts.agent import RandomAgent
+from deconfounded.experts.rollout import run_trials
 from tests import toys
 
 FILE = Path(__file__).with_suffix(".json")

@@ -19,7 +19,8 @@ from deconfounded import envs
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, run_trials
+from deconfounded.experts.agent import ExpertAgent
+from deconfounded.experts.rollout import run_trials
 
 N, SEED = 64, 1000
 Arrays = dict[str, Array]

@@ -20,8 +20,10 @@ from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
 from deconfounded.experts import saved_agents
+from deconfounded.experts.agent import Agent, AgentWrapper
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Agent, AgentWrapper, Trials, of_steps, run_trials
+from deconfounded.experts.rollout import of_steps, run_trials
+from deconfounded.experts.trials import Trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 QUANTILE = 0.85  # of the first latent, in the trial of the video

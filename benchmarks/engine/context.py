@@ -14,17 +14,9 @@ from deconfounded.benchmarks.engine.protocols import STANDARD, applied
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import (
-    Agent,
-    ExpertAgent,
-    RandomAgent,
-    Rollout,
-    Trials,
-    joined,
-    of_steps,
-    run_trials,
-    thetas,
-)
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import Rollout, of_steps, run_trials, thetas
+from deconfounded.experts.trials import Trials, joined
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset

@@ -31,7 +31,7 @@ from deconfounded.deconf.method import Method
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs.support import outside
 from deconfounded.envs.task import Array
-from deconfounded.experts.rollout import Agent, AgentWrapper
+from deconfounded.experts.agent import Agent, AgentWrapper
 
 MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
 
@@ -236,5 +236,5 @@ def fit_guest(context: Context, name: str, method: Method) -> Agent:
     agent = function(Given(ask, provider.about(), config, rngs, context.monitor))
     provider.fitted = True
     if not isinstance(agent, Agent):
-        raise envs.InputError(f"method {name} returned {agent!r}; it must return a deconfounded.experts.rollout.Agent")
+        raise envs.InputError(f"method {name} returned {agent!r}; it must return a deconfounded.experts.agent.Agent")
     return ReseededAgent(agent)

@@ -25,7 +25,7 @@ from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.envs.support.outside import is_outside
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 SAVE_EVERY_S = 60.0  # a checkpoint within a job
 LAYOUT = 2  # of checkpoints: those of another one are not gone on with

@@ -21,7 +21,8 @@ from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import ENVIRONMENT, Method
 from deconfounded.envs.streams import Array, unseeded
-from deconfounded.experts.rollout import Agent, trial_seeds
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.rollout import trial_seeds
 
 OPENS = {  # what a method may ask for, by what it declares that it uses
     "demonstrations": ("demonstrations", "fresh demonstrations"),

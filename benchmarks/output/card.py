@@ -145,7 +145,7 @@ def of_data(about: dict[str, Any], repo: str) -> str:
         _table(rows),
         "## Load it\n",
         "```bash\n" + "\n".join(use) + "\n```\n",
-        '```python\nfrom deconfounded.experts.rollout import Trials\n\ntrials = Trials.from_minari("data")\n```\n',
+        '```python\nfrom deconfounded.experts.trials import Trials\n\ntrials = Trials.from_minari("data")\n```\n',
         "Metadata of episodes may hold theta, for scoring. `Trials.from_minari` leaves it out, as imitators must not\n"
         "see it.\n",
     ]

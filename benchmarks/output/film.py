@@ -13,7 +13,8 @@ from PIL import Image, ImageDraw
 
 from deconfounded import envs
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, run_trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.rollout import run_trials
 
 WIDTH, HEIGHT, HEAD, STRIP = 320, 240, 30, 80  # of a pane, px; a strip for each latent, under its label
 FRAMES = 240  # of a whole film, at most

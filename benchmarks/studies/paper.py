@@ -30,7 +30,8 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, AgentWrapper, ExpertAgent, run_trials
+from deconfounded.experts.agent import Agent, AgentWrapper, ExpertAgent
+from deconfounded.experts.rollout import run_trials
 
 SHOWN = ("naive_rnn", "deconfounded")  # in Figure 3
 LEARNERS = (*SHOWN, "deconfounded_gru", "deconfounded_discrete", "deconfounded_offline", "dagger")

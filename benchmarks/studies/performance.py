@@ -70,7 +70,7 @@ def by_steps(steps: int) -> dict[str, float]:
     from deconfounded.deconf.core.monitor import Monitor
     from deconfounded.deconf.core.nets import Scales
     from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
-    from deconfounded.experts.rollout import Trials
+    from deconfounded.experts.trials import Trials
 
     rng = np.random.default_rng(0)
     obs = rng.standard_normal((16, 1, steps + 1, 6), np.float32)
@@ -139,7 +139,7 @@ def update_seconds(task: envs.Task, settings: "Preset", method: str, seeds: int)
     from deconfounded.benchmarks.engine.context import Context
     from deconfounded.benchmarks.engine.provider import fit
     from deconfounded.deconf.core.monitor import Monitor
-    from deconfounded.experts.rollout import Agent
+    from deconfounded.experts.agent import Agent
 
     class Clock(Monitor):
         """Times the updates of each kind."""

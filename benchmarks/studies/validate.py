@@ -75,7 +75,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     from deconfounded.benchmarks.engine.context import Context
     from deconfounded.benchmarks.engine.presets import preset
     from deconfounded.deconf.diagnosis import exploration
-    from deconfounded.experts.rollout import Trials, joined
+    from deconfounded.experts.trials import Trials, joined
 
     count = TRIALS.get(task.name, 256)
     settings = replace(preset("default", task, "cpu"), expert_trials=count, explore_trials=count // 4)

@@ -17,7 +17,7 @@ from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import saved_agents
-from deconfounded.experts.rollout import Agent, State
+from deconfounded.experts.agent import Agent, State
 
 
 class Stateful(Protocol):

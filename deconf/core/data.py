@@ -13,7 +13,8 @@ from torch.nn import functional as F
 
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials, of_steps
+from deconfounded.experts.rollout import of_steps
+from deconfounded.experts.trials import Trials
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""

@@ -9,7 +9,7 @@ import torch
 
 from deconfounded.deconf.core.data import Batch, Draws, trials_of
 from deconfounded.deconf.core.latent_model import LatentModel
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 SHARES = 11  # 0, .1, ..., 1, or powers of these
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from deconfounded.experts.rollout import Agent
+    from deconfounded.experts.agent import Agent
 
 Training = dict[str, Any]
 """Tensors, numbers, strings, and lists and dictionaries of these."""

@@ -10,7 +10,7 @@ from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.data import Draws, take
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.nets import Scaler
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 UPDATES, ROWS, WIDTH, RATE = 600, 1024, 32, 3e-3
 

@@ -15,7 +15,7 @@ from deconfounded.deconf.diagnosis.latent import in_range
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings, measure
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials, check_trials
+from deconfounded.experts.trials import Trials, check_trials
 
 VERSION = 13  # raised when figures or verdicts of the same trials change
 

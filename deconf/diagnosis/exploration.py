@@ -5,7 +5,7 @@ from torch import Tensor
 from deconfounded.deconf.core.data import Rngs
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent, MemorylessConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 SHARE = 0.25  # of actions that are random
 

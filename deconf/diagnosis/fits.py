@@ -9,7 +9,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]

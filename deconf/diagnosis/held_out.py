@@ -10,7 +10,7 @@ from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 CHECKS = 12  # of a training
 TRIM = 0.1  # share of held-out trials that is left out at either end, when likelihoods are averaged

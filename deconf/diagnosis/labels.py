@@ -4,7 +4,7 @@ import numpy as np
 
 from deconfounded.deconf.diagnosis import fits
 from deconfounded.experts.datasets.logs import Log
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 def constant(trials: Trials) -> list[int]:

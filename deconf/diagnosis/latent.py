@@ -28,7 +28,7 @@ from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
 

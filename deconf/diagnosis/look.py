@@ -10,7 +10,7 @@ from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.deconf.diagnosis.remark import LISTED, Remark, listed
 from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.datasets.table import Odd
-from deconfounded.experts.rollout import Trials, check_trials
+from deconfounded.experts.trials import Trials, check_trials
 
 Array = NDArray[np.float64]
 OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials

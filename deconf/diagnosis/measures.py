@@ -38,7 +38,7 @@ from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 CLEAR = 0.1  # nats a step
 RESOLVED = 0.5  # correlation of halves of trials that must be visible, if trials are to be said not to differ

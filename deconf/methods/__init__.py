@@ -7,7 +7,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from deconfounded.deconf.given import Given
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 METHODS = {
     "deconfounded": "deconfounded:fit",

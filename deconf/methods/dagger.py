@@ -31,7 +31,8 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.trials import Trials
 
 Query = Callable[[Agent | None], tuple[Trials, NDArray[np.float32]]]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.

@@ -21,7 +21,8 @@ from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.trials import Trials
 
 Explore = Callable[[Agent | None], Trials]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas: as many trials for each seed."""

@@ -26,7 +26,7 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.deconfounded import Explore
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
 from deconfounded.deconf.equations import gaussian_kl, offline_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 LAST = 512  # least synthetic trials for the belief in the course of a trial
 

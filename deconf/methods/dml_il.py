@@ -38,7 +38,7 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss, masked_mean
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 @dataclass(frozen=True)

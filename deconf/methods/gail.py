@@ -32,7 +32,7 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Environments, Given
 from deconfounded.deconf.method import uses
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 if TYPE_CHECKING:
     from deconfounded.deconf.methods.gail_ppo import TrialVecEnv

@@ -16,7 +16,7 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.particles import exact_agent
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 
 
 @dataclass(frozen=True)

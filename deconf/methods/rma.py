@@ -28,7 +28,8 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.trials import Trials
 
 Explore = Callable[[Agent | None], tuple[Trials, Array]]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.

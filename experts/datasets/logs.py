@@ -18,7 +18,7 @@ from deconfounded.experts.datasets.rows import Episode, Episodes, Roles, episode
 from deconfounded.experts.datasets.table import Odd, Table
 from deconfounded.experts.datasets.tabular import read_csv, read_parquet
 from deconfounded.experts.datasets.units import Units
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 READERS = {
     **{".csv": read_csv, ".tsv": read_csv, ".parquet": read_parquet, ".pq": read_parquet},

@@ -15,8 +15,10 @@ from gymnasium import spaces
 from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.spaces import action_sizes
+from deconfounded.experts.agent import Agent
 from deconfounded.experts.datasets.table import EXTRA, Column, Table, of_episodes, spread
-from deconfounded.experts.rollout import Agent, Trials, run_trials
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 
 HORIZON = "deconf_horizon"  # key in the data set's metadata of T, which every episode may end before
 

@@ -11,7 +11,7 @@ from deconfounded.envs.streams import Array, Mask, Obs
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import saved_agents
-from deconfounded.experts.rollout import Agent, AgentWrapper, State
+from deconfounded.experts.agent import Agent, AgentWrapper, State
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from pathlib import Path
 
 import beside
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import RandomAgent
+from deconfounded.experts.agent import RandomAgent
 
 
 @uses("demonstrations")

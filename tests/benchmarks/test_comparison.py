@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, TensorDataset
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 @dataclass(frozen=True)
 class Config:

@@ -7,7 +7,7 @@ from deconfounded.benchmarks.studies import findings, validate
 from deconfounded.benchmarks.studies.foreign import report, world
 from deconfounded.benchmarks.studies.foreign.cases import CASES, Case
 from deconfounded.benchmarks.studies.foreign.measure import scores
-from deconfounded.experts.rollout import RandomAgent
+from deconfounded.experts.agent import RandomAgent
 
 OURS = [case for case in CASES if case.reference.split(":")[0] in ("arm", "classic", "mujoco")]
 NAMES = [case.name for case in OURS]

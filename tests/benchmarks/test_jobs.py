@@ -20,7 +20,7 @@ from deconfounded.benchmarks.studies.paper import FigureJob
 from deconfounded.deconf.methods import naive_rnn, references
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 
 def settings(name: str, fresh: bool) -> Any:

@@ -22,8 +22,9 @@ from deconfounded.benchmarks.studies import results
 from deconfounded.deconf.exact import Grid
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, run_trials, thetas
+from deconfounded.experts.rollout import run_trials, thetas
 from tests import toys
 from tests.tools import tiny_preset
 

@@ -18,8 +18,10 @@ from deconfounded.deconf.method import USES, uses
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.contract.probe import far_thetas
 from deconfounded.experts import datasets
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, Trials, run_trials, thetas
+from deconfounded.experts.rollout import Rollout, run_trials, thetas
+from deconfounded.experts.trials import Trials
 from tests import toys
 from tests.tools import tiny_preset
 

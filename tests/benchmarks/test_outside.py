@@ -35,7 +35,9 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
 from deconfounded.experts import policy, saved_agents
-from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.tools import deconf, tiny_preset
 
 ROOT = Path(__file__).parents[2]
@@ -288,7 +290,7 @@ def test_a_bad_expert_is_one_line(tmp_path: Path, code: str, says: str) -> None:
 HEAD = """
 import numpy as np
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 class Still(Agent):
     def begin(self, n): self.n = n
@@ -313,7 +315,7 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): raise EOFError('mine')", r"mine \(EOFError, mine.py:11\)"),
         ("def fit(given): given.progress(float('nan'))", "progress was nan, {}; it must be finite numbers"),
         ("def fit(given): given._ask('environment')", "it asked for environment, and declares"),
-        ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.rollout.Agent"),
+        ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.agent.Agent"),
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
         ("def fit(given): import os; os._exit(3)", "its process ended with status 3$"),

@@ -20,7 +20,7 @@ from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import aggregation, comparison, records
 from deconfounded.benchmarks.studies import table
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.experts.rollout import RandomAgent
+from deconfounded.experts.agent import RandomAgent
 from tests import toys
 from tests.tools import deconf, tiny_preset
 

@@ -24,7 +24,7 @@ from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.deconf.methods import dagger
 from deconfounded.envs.support.files import PARTIAL, write_sealed
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 

@@ -24,7 +24,7 @@ from deconfounded.benchmarks.engine.context import stream
 from deconfounded.envs.contract.probe import actions, gl_works
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.rollout import RandomAgent
+from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.sb3 import Sb3VecEnv
 
 ROOT = Path(__file__).parents[2]

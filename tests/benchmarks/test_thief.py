@@ -23,7 +23,7 @@ HEAD = """
 import json, os, subprocess, sys
 import numpy as np
 from deconfounded.deconf.method import uses
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 class Still(Agent):
     def act(self, obs): return np.zeros((len(obs), 1))
@@ -79,7 +79,7 @@ def test_the_suite_cannot_be_imported(tmp_path: Path, monkeypatch: pytest.Monkey
     assert len(refused) == 10
     assert all("no tasks, experts or simulators" in why for why in refused.values())
     modules = json.loads((tmp_path / "modules").read_text())
-    assert "deconfounded.experts.rollout" in modules
+    assert "deconfounded.experts.agent" in modules
     loaded = [name for name in modules if name.startswith(("deconfounded.envs", "deconfounded.benchmarks", "mujoco"))]
     inside = "deconfounded.envs.support"
     assert [name for name in loaded if not name.startswith((inside, "deconfounded.envs.streams"))] == [

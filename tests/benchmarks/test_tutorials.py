@@ -12,7 +12,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.output.film import Film
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs import render
-from deconfounded.experts.rollout import Agent, Trials
+from deconfounded.experts.agent import Agent
+from deconfounded.experts.trials import Trials
 
 TUTORIALS = Path(__file__).parents[2] / "docs" / "tutorials"
 CELL = re.compile(r"^```\{code-cell\} ipython3\n(:tags: \[parameters\]\n)?(.*?)^```$", re.S | re.M)

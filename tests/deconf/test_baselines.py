@@ -34,8 +34,10 @@ from deconfounded.deconf.methods.naive_obs import ObsAgent, ObsMemory
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig, hscic
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.train import train
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 CONTROL = "slippery_cartpole"

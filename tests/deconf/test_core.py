@@ -44,7 +44,9 @@ from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig, Synt
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.tools import FEW, tiny_preset
 
 

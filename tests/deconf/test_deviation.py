@@ -7,7 +7,7 @@ import torch
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
 from deconfounded.deconf.diagnosis.measures import draw_distant
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 def walks(n: int, seed: int) -> torch.Tensor:

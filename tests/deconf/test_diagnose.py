@@ -22,7 +22,9 @@ from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 
 ROOT = Path(__file__).parents[2]
 TINY = Amounts(

@@ -22,7 +22,9 @@ from deconfounded.deconf.methods.flow_bc import FlowConfig
 from deconfounded.deconf.methods.naive_dropout import DropoutConfig
 from deconfounded.deconf.particles import Particles
 from deconfounded.envs.streams import Streams
-from deconfounded.experts.rollout import Agent, ExpertAgent, Trials, run_trials
+from deconfounded.experts.agent import Agent, ExpertAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.deconf.test_particles import Three, expert
 from tests.tools import tiny_preset
 

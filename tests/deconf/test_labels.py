@@ -6,7 +6,7 @@ import pytest
 from deconfounded.deconf.diagnosis import labels
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.look import look
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 from tests.deconf.test_diagnose import CLEAR
 from tests.deconf.test_lookalikes import world
 

@@ -13,7 +13,7 @@ from deconfounded.deconf.diagnosis.measures import Amounts, split
 from deconfounded.deconf.diagnosis.thresholds import NO_EVIDENCE
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 NOISE, FALL = 0.1, 1.5
 EXPLORING = DeconfoundedConfig(inference_updates=1600, inference_rate=3e-3)

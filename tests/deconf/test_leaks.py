@@ -38,9 +38,11 @@ from deconfounded.deconf.methods import (
 from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import NetworkExpert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.sb3 import Sb3VecEnv
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 TASKS = envs.names()

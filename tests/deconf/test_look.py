@@ -22,10 +22,12 @@ from deconfounded.deconf.methods import deconfounded, naive_rnn
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets, policy
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.datasets import Log
 from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.datasets.units import Units
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.deconf.test_diagnose import _tiny_init
 
 B, E, T = 48, 2, 60

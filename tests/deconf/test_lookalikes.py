@@ -15,7 +15,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 SMALL = Amounts(
     candidates=16,

@@ -25,7 +25,7 @@ from deconfounded.deconf.methods.naive_obs import ObsAgent
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 

@@ -15,7 +15,7 @@ from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 from tests.deconf.ball import STEPS, pushed, streams
 from tests.tools import tiny_preset
 

@@ -10,7 +10,7 @@ from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.methods import dpt, flow_bc
 from deconfounded.deconf.methods.dpt import DptAgent, DptConfig
 from deconfounded.deconf.methods.flow_bc import FlowAgent, FlowConfig
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 from tests.deconf.test_baselines import random_batch, scales, streams
 
 SHAPE = {"width": 16, "layers": 2, "heads": 2, "window": 12, "forgets": False}

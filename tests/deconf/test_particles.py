@@ -20,8 +20,9 @@ from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.task import Task
 from deconfounded.envs.tasks.patchy_road import PatchyRoad
 from deconfounded.experts import policy
+from deconfounded.experts.agent import ExpertAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import ExpertAgent, run_trials
+from deconfounded.experts.rollout import run_trials
 from tests.toys import Arms, Push, control
 
 N, FEW = 24, 256

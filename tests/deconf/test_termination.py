@@ -11,7 +11,7 @@ from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.nets import Scaler
 from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 
 def observed(trials: Trials) -> Scaler:

@@ -18,9 +18,10 @@ from deconfounded.deconf.methods import dagger, memoryless_bc
 from deconfounded.deconf.methods.dagger import DaggerConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
-from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.streams import Array, Obs, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Agent, ExpertAgent, Obs, RandomAgent, run_trials, thetas
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials, thetas
 
 N, EPISODES = 48, 3
 

@@ -7,7 +7,8 @@ from deconfounded import envs
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, run_trials
+from deconfounded.experts.agent import ExpertAgent
+from deconfounded.experts.rollout import run_trials
 
 N = 6_000
 

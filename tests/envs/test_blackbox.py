@@ -20,8 +20,9 @@ from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.experts import policy
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Rollout, run_trials
+from deconfounded.experts.rollout import Rollout, run_trials
 from tests.toys import Push, control
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"

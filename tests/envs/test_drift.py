@@ -15,7 +15,8 @@ from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, run_trials, thetas
+from deconfounded.experts.agent import ExpertAgent
+from deconfounded.experts.rollout import run_trials, thetas
 
 
 class Walking(TiltedCartpole):

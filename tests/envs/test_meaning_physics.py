@@ -14,8 +14,9 @@ from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials
+from deconfounded.experts.rollout import run_trials
 from tests import toys
 
 DOCS = Path(__file__).parents[2] / "docs"

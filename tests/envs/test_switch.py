@@ -11,7 +11,8 @@ from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs.contract.probe import streams
 from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, run_trials, thetas
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials, thetas
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "loguniform", "categorical"])

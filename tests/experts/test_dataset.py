@@ -15,7 +15,9 @@ from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.rollout import ExpertAgent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import ExpertAgent, RandomAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 minari = pytest.importorskip("minari")
@@ -35,7 +37,7 @@ def test_the_same_in_another_process(
     monkeypatch.setattr("sys.argv", ["data", "--task", name, "--trials", "4", "--out", tmp_path.name])
     data.main()
     assert f"{name}: 4 trials, sha256 {demonstrations.sha256} -> {tmp_path}" in capsys.readouterr().out
-    code = f"from deconfounded.experts.rollout import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
+    code = f"from deconfounded.experts.trials import Trials; print(Trials.from_minari({str(tmp_path)!r}).sha256)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[2])
     assert done.stdout.strip() == demonstrations.sha256, done.stderr
     trials, theta = datasets.read(tmp_path), datasets.read_theta(tmp_path)

@@ -32,7 +32,9 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.rollout import Agent, RandomAgent, Trials, run_trials
+from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
 MASK = np.ones((2, 1, 3), bool)

@@ -19,7 +19,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets
 from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.datasets.units import RawAgent, Units
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 LENGTHS = {"a": (3, 5), "b": (4,), "c": (2, 3)}  # steps of each episode of each trial
 OWNERS = [name for name, lengths in LENGTHS.items() for _ in lengths]

@@ -25,7 +25,7 @@ from deconfounded.benchmarks.output import records
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.envs.support.files import read_sealed
 from deconfounded.experts import policy
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 Read = Callable[[], Any]

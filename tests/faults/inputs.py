@@ -31,7 +31,8 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig, train
 from deconfounded.experts import policy, saved_agents
-from deconfounded.experts.rollout import Trials, run_trials
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 REACHED = (  # where a command's work begins

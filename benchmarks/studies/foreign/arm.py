@@ -7,7 +7,7 @@ import numpy as np
 
 from deconfounded.benchmarks.studies.foreign.world import World
 from deconfounded.envs.streams import Array, Mask, Obs
-from deconfounded.experts.rollout import Agent
+from deconfounded.experts.agent import Agent
 
 GEAR, LOAD, GUST, DT = 200.0, 40.0, 1.0, 0.02  # N m an action of 1; N m; rad/s a step; s
 STIFFNESS, DAMPING = 50.0, 14.0  # of the expert's error dynamics: 1/s^2, 1/s

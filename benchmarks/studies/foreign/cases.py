@@ -9,7 +9,7 @@ import numpy as np
 
 from deconfounded.benchmarks.studies.foreign.world import World, demonstrations, explorer
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import Trials, joined
+from deconfounded.experts.trials import Trials, joined
 
 TRIALS, EXPLORED, SEED = 160, 96, 11  # of the expert; of each exploration; of the logs
 

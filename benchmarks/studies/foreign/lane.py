@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from deconfounded.benchmarks.studies.foreign.world import World
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 WIND, GUST, DT = 12.0, 1.2, 0.1  # m/s^2 to the side; m/s to the side a step; s
 BIAS, SWAY = 0.25, 1.5  # added to the action, of which 1 is full lock; rad/s of yaw a step

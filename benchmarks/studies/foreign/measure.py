@@ -28,7 +28,8 @@ from deconfounded.benchmarks.studies.foreign.world import (
 )
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_json
-from deconfounded.experts.rollout import Agent, RandomAgent, Rollout
+from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.rollout import Rollout
 
 SIMULATORS = ("gym-electric-motor", "highway-env", "do-mpc", "casadi")  # others are ours too
 SCORED, SCORING = 96, 7  # trials, and their seed

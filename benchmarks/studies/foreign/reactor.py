@@ -10,7 +10,7 @@ from gymnasium import spaces
 
 from deconfounded.benchmarks.studies.foreign.world import World
 from deconfounded.envs.streams import Array
-from deconfounded.experts.rollout import Trials
+from deconfounded.experts.trials import Trials
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -10,7 +10,9 @@ import numpy as np
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.blackbox import BlackBox, task_of
 from deconfounded.envs.streams import Array, Mask, Obs
-from deconfounded.experts.rollout import Agent, RandomAgent, Rollout, Trials, run_trials
+from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.rollout import Rollout, run_trials
+from deconfounded.experts.trials import Trials
 
 Controller = Callable[[Array], Array]
 """Maps an observation [O] to an action in the simulator's units."""
