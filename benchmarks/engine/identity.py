@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.jobs import Job
 
 PROTOCOL = 1  # of seeding, roll-outs, what methods are handed, and what is measured of an agent
-LIBRARIES = ("dm_control", "gymnasium", "numpy", "torch", "stable-baselines3")
+LIBRARIES = ("dm_control", "gymnasium", "numpy", "scipy", "scikit-learn", "torch", "stable-baselines3", "sb3-contrib")
 AMOUNTS = {  # of a preset, by what a method uses
     "demonstrations": ("expert_trials", "fresh"),
     "exploration": ("explore_trials",),
