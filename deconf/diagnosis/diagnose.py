@@ -68,6 +68,10 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
                 f"{len(data)} trials{kind} given, of which {copied} repeat{'s' * (copied == 1)} another; at least"
                 f" {config.least} different ones are needed"
             )
+        if (np.diff(data.mask.astype(int), axis=2) > 0).any():
+            raise InputError(
+                f"a mask{kind} has steps after one that did not take place; steps of an episode come first"
+            )
         actions = data.action[data.mask]
         if (actions == actions[0]).all():
             raise InputError(f"every action{kind} is the same; there is nothing to learn, and nothing to judge")

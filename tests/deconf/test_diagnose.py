@@ -91,6 +91,22 @@ class TestBadInput:
         with pytest.raises(InputError, match="every action is the same"):
             diagnose.check(Trials(data.obs, 0 * data.action + 0.5, data.mask), None, DiagnoseConfig())
 
+    def test_steps_after_one_that_did_not_take_place(self) -> None:
+        data = trials()
+        mask = data.mask.copy()
+        mask[3, 0, 2] = False
+        with pytest.raises(InputError, match="a mask has steps after one that did not take place"):
+            diagnose.check(Trials(data.obs, data.action, mask), None, DiagnoseConfig())
+
+    def test_what_are_no_trials_and_no_generator(self) -> None:
+        config, rng = DiagnoseConfig(), np.random.default_rng(0)
+        with pytest.raises(InputError, match="diagnose was given a ndarray; it must be Trials"):
+            diagnose.diagnose(trials().obs, None, config, rng)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="diagnose was given a list; it must be Trials"):
+            diagnose.diagnose(trials(), [], config, rng)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="rng was 0; it must be a generator"):
+            diagnose.diagnose(trials(), None, config, 0)  # type: ignore[arg-type]
+
     def test_nan(self) -> None:
         data = trials()
         with pytest.raises(InputError, match="NaN"):
