@@ -70,7 +70,7 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
             )
         if (np.diff(data.mask.astype(int), axis=2) > 0).any():
             raise InputError(
-                f"a mask{kind} has steps after one that did not take place; steps of an episode come first"
+                f"a mask{kind} has steps after one that did not take place; those of an episode come first"
             )
         actions = data.action[data.mask]
         if (actions == actions[0]).all():

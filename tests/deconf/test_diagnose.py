@@ -94,7 +94,7 @@ class TestBadInput:
     def test_steps_after_one_that_did_not_take_place(self) -> None:
         data = trials()
         mask = data.mask.copy()
-        mask[3, 0, 2] = False
+        mask[3, 0, 0] = False
         with pytest.raises(InputError, match="a mask has steps after one that did not take place"):
             diagnose.check(Trials(data.obs, data.action, mask), None, DiagnoseConfig())
 
