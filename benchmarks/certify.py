@@ -34,7 +34,7 @@ LEVELS = 5  # of theta in the stakes matrix, for one latent
 MOST = 16  # levels of many latents, drawn from all combinations
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
-    "told_wrong_theta": ("<=", 0.65),
+    "wrong_theta": ("<=", 0.65),
     "conditional_last": ("<=", 0.7),
     "interventional_last": (">=", 0.95),
 }
@@ -182,7 +182,7 @@ def certify(
     curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in policies.items()}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),
-        "told_wrong_theta": float(matrix[far_pairs(task, levels)].mean()),
+        "wrong_theta": float(matrix[far_pairs(task, levels)].mean()),
         **{f"{name}_last": curves[name]["score"][-1] for name in ("conditional", "interventional")},
     }
     checks = {}

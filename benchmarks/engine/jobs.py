@@ -116,9 +116,9 @@ class Job(ABC):
         if why := job_files.broken(result):
             return why
         meta, expected = result["meta"], identity(self)
-        told = meta["identity"]
-        if differ := [key for key in {**expected, **told} if expected.get(key) != told.get(key)]:
-            which = job_files.differing(differ[0], told.get(differ[0]), expected.get(differ[0]))
+        made = meta["identity"]
+        if differ := [key for key in {**expected, **made} if expected.get(key) != made.get(key)]:
+            which = job_files.differing(differ[0], made.get(differ[0]), expected.get(differ[0]))
             return f"it was made with another {which}"
         if meta["seed"] != seed:
             return f"it is of seed {meta['seed']}"
@@ -158,7 +158,7 @@ class JobMonitor(Monitor):
     def __init__(self, job: Job, share: float) -> None:
         super().__init__()
         self.identity, self.last_edit = identity(job), last_edit()
-        self.ticks, self.share, self.told = job.ticks, share, 0
+        self.ticks, self.share, self.ticked = job.ticks, share, 0
         self.device = job.device
         self.file = job.checkpoint
         self.start, self.saved = time.time(), time.monotonic()
@@ -179,9 +179,9 @@ class JobMonitor(Monitor):
         return sum(end - start for start, end in self.spans())
 
     def _tell(self, share: float) -> None:
-        if (now := int(self.ticks * share)) > self.told:
-            tick(now - self.told)
-            self.told = now
+        if (now := int(self.ticks * share)) > self.ticked:
+            tick(now - self.ticked)
+            self.ticked = now
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         self._tell(self.share * done / total)

@@ -114,9 +114,9 @@ class Here(Engine):
         return 1
 
     def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
-        told = SimpleQueue[int]()
-        progress.tell(told)
+        ticks = SimpleQueue[int]()
+        progress.tell(ticks)
         for job in jobs:
             say(job, job.run())
-            while not told.empty():
-                tick(told.get())
+            while not ticks.empty():
+                tick(ticks.get())

@@ -75,7 +75,7 @@ class Engine(ABC):
     def run(self, jobs: list[Job], tick: Callable[[int], None], say: Callable[[Job, str | Exception], None]) -> None:
         """Run them side by side, first come, first served; a job's files are in its folder when it has ended.
 
-        tick: to be told of progress; say: what became of a job, an InputError if it failed: the others go on.
+        tick: is called with progress; say: with what became of a job, an InputError if it failed: the others go on.
         """
 
 

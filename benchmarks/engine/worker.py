@@ -102,7 +102,7 @@ class Courier:
 
     def __init__(self, folder: Path, number: int, mailbox: Any) -> None:
         self.folder, self.number, self.mailbox = folder, number, mailbox
-        self.ticks, self.told, self.over = 0, 0, threading.Event()
+        self.ticks, self.sent, self.over = 0, 0, threading.Event()
         self.seen: dict[Path, tuple[int, int]] = {}
         threading.Thread(target=self._go, daemon=True).start()
 
@@ -120,6 +120,6 @@ class Courier:
             stamp = (file.stat().st_mtime_ns, file.stat().st_size)
             if self.seen.get(file) != stamp:
                 new[str(file.relative_to(self.folder))], self.seen[file] = file.read_bytes(), stamp
-        if new or self.ticks > self.told:
-            self.told = self.ticks
-            self.mailbox.put.remote(self.number, self.told, new)
+        if new or self.ticks > self.sent:
+            self.sent = self.ticks
+            self.mailbox.put.remote(self.number, self.sent, new)

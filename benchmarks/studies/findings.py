@@ -83,7 +83,7 @@ def noises() -> str:
     measured = kept("spectrum")
     points = measured["points"]
     about = f"Means over {measured['seeds']} seeds; {_origins(points)}."
-    return "\n\n".join([spectrum.foretold(points), spectrum.table(points), about])
+    return "\n\n".join([spectrum.predictions(points), spectrum.table(points), about])
 
 
 def explored() -> str:

@@ -11,7 +11,7 @@ from deconfounded.benchmarks.output.pictures import label, panels
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 
-FORETOLD = "exact interventional less conditional"
+PREDICTOR = "exact interventional less conditional"
 
 
 class Gap(NamedTuple):
@@ -23,7 +23,7 @@ class Gap(NamedTuple):
 
 
 def gap(task: envs.Task, methods: dict[str, Any]) -> Gap | None:
-    """FORETOLD and measured, from the `methods` of results.json; None if one of the four is not there."""
+    """PREDICTOR and measured, from the `methods` of results.json; None if one of the four is not there."""
     if not {"interventional", "conditional", "deconfounded", "naive_rnn"} <= set(methods):
         return None
     last = {name: float(methods[name]["score_last"]) for name in methods}
@@ -51,17 +51,17 @@ is {_correlation(explored)}. With those, whose gap only queries of the expert ca
     return "\n\n".join([text, table, "![predicted and measured gap](gap.png)"])
 
 
-def picture(points: Sequence[Sequence[Any]], file: Path, foretold: str = FORETOLD, mark: str = "") -> None:
-    """A dot for each name, predicted and measured gap, and its colour and fill if dots differ; foretold: what predicts.
+def picture(points: Sequence[Sequence[Any]], file: Path, predictor: str = PREDICTOR, mark: str = "") -> None:
+    """A dot for each name, predicted and measured gap, and its colour and fill if dots differ.
 
-    Dots within 0.05 of the origin, where there is nothing to tell, bear no name: they hide each other's.
+    predictor: what the prediction is. Dots within 0.05 of the origin, where there is nothing to tell, bear no name.
     """
     with panels(file, size=(6.4, 5.2), dpi=100, mark=mark) as [[axes]]:
         axes.axline((0, 0), slope=1, color="0.8", lw=1)
         for _, predicted, measured, *style in points:
             hue, fill = style or ("tab:blue", "full")
             axes.plot(predicted, measured, "o", color=hue, fillstyle=fill)
-        axes.set(xlabel=f"predicted: {foretold}", ylabel="measured: deconfounded less naive_rnn")
+        axes.set(xlabel=f"predicted: {predictor}", ylabel="measured: deconfounded less naive_rnn")
         axes.margins(0.14, 0.08)
         axes.set_title("what cloning loses, score in the last episode", fontsize=11)
         named = [point for point in points if np.hypot(point[1], point[2]) > 0.05]

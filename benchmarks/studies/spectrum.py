@@ -44,7 +44,7 @@ def _columns(points: list[Point]) -> list[tuple[str, str, list[Point]]]:
     return columns
 
 
-def foretold(points: list[Point]) -> str:
+def predictions(points: list[Point]) -> str:
     """By how much deconfounded is ahead of naive_rnn, where the certificate is passed and where it is failed."""
     parts = []
     for verdict in ("passed", "failed"):

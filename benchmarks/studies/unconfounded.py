@@ -38,7 +38,7 @@ class NoStakes(Cartpole):
 
 
 def feedback(obs: Array, theta: Array) -> Array:
-    """A linear controller that adds what friction it is told of, in the direction of motion."""
+    """A linear controller that adds the friction that it is given, in the direction of motion."""
     return _balance(obs) + 0.1 * theta * np.tanh(20 * obs[:, 3:4])
 
 
@@ -62,7 +62,7 @@ class ShownAtOnce(Cartpole):
 
 
 def compensating(obs: Array, theta: Array) -> Array:
-    """The same controller, which divides by the gain that it is told of."""
+    """The same controller, which divides by the gain that it is given."""
     return _balance(obs) / theta
 
 
@@ -80,7 +80,7 @@ class NothingHidden(Cartpole):
 
 
 def blind(obs: Array, theta: Array) -> Array:
-    """The same controller, told of nothing."""
+    """The same controller, which is given nothing."""
     return _balance(obs)
 
 

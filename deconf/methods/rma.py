@@ -126,7 +126,7 @@ def train(
     checkpoint = Checkpoint(monitor, rngs, **agent.parts(), optimizer=optimizer, draws=draws)
     data, targets, begin = None, torch.empty(0), 0
     if before := checkpoint.load():
-        begin, data, targets = before["round"], Batch(*before["data"]), before["told"]
+        begin, data, targets = before["round"], Batch(*before["data"]), before["targets"]
     for i in range(begin, config.rounds):
         own, thetas = explore(agent if i > 0 else None)
         new, target = Batch.of(own, len(rngs), config.device), joined_theta(own, thetas, len(rngs), config.device)
@@ -135,7 +135,7 @@ def train(
             index = draws.integers(len(data), config.batch)
             error = _pass(agent, optimizer, data.trials(index), take(targets, index), config.chunk)
             monitor.update((sum(passes[:i]) + j + 1) * chunks, total, {"theta": error}, agent)
-        checkpoint.save(round=i + 1, data=data.tensors, told=targets)
+        checkpoint.save(round=i + 1, data=data.tensors, targets=targets)
     return agent
 
 

@@ -445,7 +445,7 @@ def test_certificate_fails_what_deserves_it(monkeypatch: pytest.MonkeyPatch) -> 
     result = certify.certify(task, CallableExpert(task, feedback, "feedback"), trials=6, grid=3)
     assert result["return_expert"] > 2.5 * result["return_random"]
     assert result["verdict"] == "failed"
-    assert not result["checks"]["told_wrong_theta"]["passed"]
+    assert not result["checks"]["wrong_theta"]["passed"]
     assert not result["checks"]["blind_bc"]["passed"]
 
 

@@ -64,9 +64,9 @@ def test_a_filter_does_as_well_as_the_expert() -> None:
 
 
 def test_scores() -> None:
-    returns = {"random": [0.0, 0.0], "expert": [9.0, 10.0], "told another": [9.0, 6.0], "naive_rnn": [9.0, 8.0]}
-    assert scores(returns) == {"random": -1.5, "expert": 1, "told another": 0, "naive_rnn": 0.5}
-    assert scores(returns | {"told another": [9.0, 9.9]})["naive_rnn"] == 0.8  # nothing is at stake: 0 is random
+    returns = {"random": [0.0, 0.0], "expert": [9.0, 10.0], "wrong theta": [9.0, 6.0], "naive_rnn": [9.0, 8.0]}
+    assert scores(returns) == {"random": -1.5, "expert": 1, "wrong theta": 0, "naive_rnn": 0.5}
+    assert scores(returns | {"wrong theta": [9.0, 9.9]})["naive_rnn"] == 0.8  # nothing is at stake: 0 is random
 
 
 def test_report() -> None:

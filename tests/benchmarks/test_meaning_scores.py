@@ -267,7 +267,7 @@ def test_cpu_seconds_are_of_a_cpu() -> None:
 
 def test_a_certificate_asks_for_what_it_says() -> None:
     """The thresholds that the certificates in docs/ were judged by, the pages name, and a task is certified by."""
-    required = {"blind_bc": "<= 0.7", "told_wrong_theta": "<= 0.65", "conditional_last": "<= 0.7"}
+    required = {"blind_bc": "<= 0.7", "wrong_theta": "<= 0.65", "conditional_last": "<= 0.7"}
     required["interventional_last"] = ">= 0.95"
     assert {name: f"{relation} {bound}" for name, (relation, bound) in certify.THRESHOLDS.items()} == required
     for file in (ROOT / "docs" / "certificates").glob("*.json"):

@@ -62,15 +62,15 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
     assert (tmp_path / "spectrum.png").read_bytes().startswith(PNG)
 
 
-def test_what_the_certificate_foretold() -> None:
+def test_what_the_certificate_predicted() -> None:
     """Of each point once: the least and the most that deconfounded is ahead; and that there is none."""
     points = [
         {"certificate": {"verdict": verdict}, "scores": {"deconfounded": [0.8, 1.0], "naive_rnn": [naive, naive + 0.2]}}
         for verdict, naive in (("passed", 0.1), ("passed", 0.4), ("failed", 0.9))
     ]
-    sentence = spectrum.foretold(points)
+    sentence = spectrum.predictions(points)
     assert "passed, on 2, by 0.40 to 0.70; where it is failed, on 1, by -0.10 to -0.10." in sentence
-    assert "failed, on 0, by (none)" in spectrum.foretold(points[:2])
+    assert "failed, on 0, by (none)" in spectrum.predictions(points[:2])
 
 
 def test_predicted_and_measured_gap(tmp_path: Path) -> None:

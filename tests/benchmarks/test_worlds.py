@@ -56,5 +56,5 @@ def test_a_certificate_says_that_it_is_learned(monkeypatch: pytest.MonkeyPatch) 
     task = envs.get(CART)
     result = certify.certify(task, policy.load(task), trials=8, grid=5)
     assert set(result["learned_dynamics"]) == {"r2", "exponent"}
-    assert result["checks"]["told_wrong_theta"]["passed"]
+    assert result["checks"]["wrong_theta"]["passed"]
     assert len(result["interventional"]["score"]) == len(result["conditional"]["score"]) == 5

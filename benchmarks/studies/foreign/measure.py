@@ -71,7 +71,7 @@ class Bench:
             if name in METHODS:
                 versions[name] = METHODS[name].version
             write_json(self.file, self.made)
-            if {"random", "expert", "told another"} <= returns.keys():
+            if {"random", "expert", "wrong theta"} <= returns.keys():
                 write(self.case, scores=scores(returns), **self.made)
         return f"{returns[name][-1]:.4g}"
 
@@ -113,7 +113,7 @@ def _deconfounded(bench: Bench) -> Agent:
 AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
     "random": lambda bench: RandomAgent(task(bench.case.world).action_space),
     "expert": lambda bench: WorldExpert(bench.case.world, bench.scorer.theta),
-    "told another": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
+    "wrong theta": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
     "filter": lambda bench: LinearFilter(bench.case.world, TRIALS, SEED) if bench.case.world.evidence else None,
     "naive_rnn": _naive_rnn,
 }
@@ -126,10 +126,10 @@ LATER: dict[str, Callable[[Bench], Agent | None]] = {
 
 
 def scores(returns: dict[str, list[float]]) -> dict[str, float]:
-    """Of the last episode, 1 of the expert. 0 is the expert told another theta; where that costs nothing, random."""
+    """Of the last episode, 1 of the expert. 0 is the expert given a wrong theta; where that costs nothing, random."""
     last = {name: values[-1] for name, values in returns.items()}
     whole = last["expert"] - last["random"]
-    zero = "told another" if last["expert"] - last["told another"] > 0.05 * whole else "random"
+    zero = "wrong theta" if last["expert"] - last["wrong theta"] > 0.05 * whole else "random"
     return {name: (value - last[zero]) / (last["expert"] - last[zero]) for name, value in last.items()}
 
 

@@ -8,7 +8,7 @@ from deconfounded.benchmarks.studies.validate import rank_correlation
 from deconfounded.deconf.diagnosis.verdict import with_tier
 
 KEPT = "diagnose/foreign"
-AGENTS = ("told another", "blind_bc", "naive_rnn", "deconfounded", "oracle_bc", "filter")
+AGENTS = ("wrong theta", "blind_bc", "naive_rnn", "deconfounded", "oracle_bc", "filter")
 JUDGED = {True: "right", False: "wrong", None: "cannot tell"}
 
 

@@ -114,7 +114,7 @@ def explorer(world: World, n: int, rng: np.random.Generator) -> Callable[[Agent 
 
 
 class Scorer:
-    """Scores of agents by returns in n trials: 0 of an expert told another theta, 1 of the expert."""
+    """Scores of agents by returns in n trials: 0 of an expert given a wrong theta, 1 of the expert."""
 
     def __init__(self, world: World, n: int, seed: int) -> None:
         self.world, self.seed, self.theta = world, seed, thetas(world, n, seed)
@@ -126,7 +126,7 @@ class Scorer:
 
     @cached_property
     def other(self) -> Array:
-        """The returns [N, E] of the expert told another theta."""
+        """The returns [N, E] of the expert given a wrong theta."""
         return self.returns(WorldExpert(self.world, np.roll(self.theta, 1, 0)))
 
     def returns(self, agent: Agent) -> Array:
@@ -143,7 +143,7 @@ class LinearFilter(Agent):
     """A reference: the linear-Gaussian filter of theta, and the expert at its mean.
 
     The next observation's columns `evidence` are W [1, s, a] + C [theta, theta a] + N(0, Sigma), fitted by least
-    squares to n trials of known thetas, half by the expert and half by the expert told another; theta is Gaussian.
+    squares to n trials of known thetas, half by the expert and half by one given a wrong theta; theta is Gaussian.
     """
 
     def __init__(self, world: World, n: int, seed: int) -> None:
