@@ -20,11 +20,12 @@ def page(found: index.Found, certified: dict[str, Any]) -> str:
     """found: what `results.published` gives of the hard tasks; certified: their certificates by name."""
     head = f"""# Hard tasks
 
-Tasks beside the suite (`envs.HARD`), for methods that solve it. Made by `deconf publish` from the [records](records)
-and the certificates alone. *Exact* is the interventional policy in the task's certificate, *best* the best learner that
-never sees theta, its tier in brackets: of those that do not query the expert, and of all. A task is *hard* in the
-episodes in which the best has at most {SOLVED:g} of the expert's score; the [history](history.md) says how hard it
-was when it was admitted. What each task is: [tasks.md](tasks.md). Records: `deconf table --tasks hard`."""
+Tasks beside the suite (`envs.HARD`), for methods that solve the suite. Made by `deconf publish` from the
+[records](records) and the certificates alone. *Exact* is the interventional policy in the task's certificate. *Best* is
+the best learner that never sees theta, its tier in brackets: first (*no queries*) of the learners that do not query the
+expert, then of *all*. A task is *hard* in the episodes in which the best learner has at most {SOLVED:g} of the expert's
+score; the [history](history.md) says how hard it was when it was admitted. What each task is: [tasks.md](tasks.md).
+Records: `deconf table --tasks hard`."""
     by_task = {task.name: of["methods"] for task, of in found}
     rows = [_row(envs.get(name), certified.get(name), by_task.get(name, {})) for name in envs.HARD]
     columns = ["task", "latents", "certificate", *(f"exact, {end}" for end in headroom.ENDS)]

@@ -101,23 +101,23 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     if (DOCS / f"{task.name}.png").exists():
         parts.append(f"![score by episode]({task.name}.png)")
     if older := outdated(task, results):
-        parts.append(f"Of an older version, and not yet made again: {'; '.join(older)}.")
+        parts.append(f"Records of an older version, not yet made again: {'; '.join(older)}.")
     if (DOCS / (link := f"records/superseded/{records.place(task.name)}")).exists():
-        parts.append(f"Superseded, and not to be compared: [the records of earlier versions]({link}).")
+        parts.append(f"Superseded, and not to be compared with these: [the records of earlier versions]({link}).")
     if (DOCS / f"{task.name}.webp").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
     return "\n\n".join(parts)
 
 
 def outdated(task: envs.Task, results: dict[str, Any]) -> list[str]:
-    """What of a task's results is of an older version than today's of the task or a method, and of which."""
-    older = [f"the task, v{results['task_version']} of v{task.version}"] * (results["task_version"] != task.version)
+    """The parts of a task's results that an older version of the task or of a method made, and which version."""
+    older = [f"the task v{results['task_version']} (now v{task.version})"] * (results["task_version"] != task.version)
     methods = {entry["method"]: entry["version"] for entry in results["methods"].values()}
     by_version: dict[tuple[int, int], list[str]] = {}
     for name, version in methods.items():
         if name in METHODS and version != METHODS[name].version:
             by_version.setdefault((version, METHODS[name].version), []).append(name)
-    older += [f"{', '.join(names)}: v{was} of v{now}" for (was, now), names in by_version.items()]
+    older += [f"{', '.join(names)} v{was} (now v{now})" for (was, now), names in by_version.items()]
     return older
 
 
