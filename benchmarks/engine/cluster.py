@@ -21,6 +21,7 @@ from deconfounded.benchmarks.engine.worker import Files, Unlike, work
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically
+from deconfounded.envs.support.origin import is_ours
 from deconfounded.experts import policy
 
 TRIES = 5  # of a job, whose worker was lost each time
@@ -172,7 +173,7 @@ def from_outside(job: Job) -> set[Path]:
         weights.append(Path(job.expert).resolve())
     files = sources.of_task(task).union(*(sources.of_reference(one) for one in named if ".py:" in one))
     files |= {file.with_suffix(suffix) for file in weights for suffix in (file.suffix, ".json")}
-    return {file for file in files if not sources.is_ours(file)}
+    return {file for file in files if not is_ours(file)}
 
 
 def absolute(expert: str | None) -> str | None:

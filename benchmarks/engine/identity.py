@@ -21,7 +21,7 @@ import numpy as np
 from deconfounded import envs
 from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.protocols import STANDARD
-from deconfounded.benchmarks.engine.sources import ROOT
+from deconfounded.envs.support.origin import ROOT
 from deconfounded.experts import policy
 
 if TYPE_CHECKING:

@@ -8,7 +8,6 @@ import ast
 import hashlib
 import inspect
 import os
-import sysconfig
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -16,22 +15,15 @@ from xml.etree import ElementTree
 
 from deconfounded import envs
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.origin import LIBRARIES, OURS, is_library, is_ours
 
 MODELS = ("include", "model")  # MJCF elements that name further MJCF
-ROOT = Path(__file__).resolve().parents[2]
-OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
-LIBRARIES = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def last_edit() -> int:
     """The time stamp of the last change of this package's Python files, in ns."""
     return max((file.stat().st_mtime_ns for folder in OURS for file in folder.rglob("*.py")), default=0)
-
-
-def is_ours(file: Path) -> bool:
-    """Whether a file belongs to this package."""
-    return any(file.is_relative_to(folder) for folder in OURS)
 
 
 def closure(files: Iterable[Path]) -> set[Path]:
@@ -129,7 +121,7 @@ def _named(file: Path, changed: int) -> tuple[Path, ...]:
 def of_task(task: envs.Task) -> set[Path]:
     """The files of a task from outside: its classes' modules, what these import, and its MJCF; none for one of ours."""
     classes = {file for cls in type(task).__mro__ if (file := outside.source(cls)) and not is_ours(file)}
-    own = {file for file in classes if not any(file.is_relative_to(folder) for folder in LIBRARIES)}
+    own = {file for file in classes if not is_library(file)}
     if not own:
         return set()
     files = closure(own)

@@ -18,6 +18,7 @@ from deconfounded.benchmarks.output.pictures import colour, colours, encoded, ma
 from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
+from deconfounded.envs.support.origin import ROOT
 
 
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
@@ -138,7 +139,7 @@ PICTURES = {
 
 def certificate(task: str, version: int, run: Path) -> Path | None:
     """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/."""
-    for parent in (run.absolute().parent, sources.ROOT / "docs"):
+    for parent in (run.absolute().parent, ROOT / "docs"):
         picture = parent / "certificates" / f"{task}.png"
         try:
             certified = json.loads(picture.with_suffix(".json").read_bytes())

@@ -37,8 +37,6 @@ def diagnose(
     report: Report = lambda share: None,
 ) -> Diagnosis:
     """Judge expert trials, and exploration if there is any. Raises InputError for data that cannot be judged."""
-    for data in (trials, *[explore] * (explore is not None)):
-        check_trials("diagnose", data)
     if not isinstance(rng, np.random.Generator):
         raise InputError(f"rng was {rng!r}; it must be a generator: np.random.default_rng(0)")
     check(trials, explore, config)
@@ -57,6 +55,7 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
     for kind, data in (("", trials), (" of exploration", explore)):
         if data is None:
             continue
+        check_trials("diagnose", data)
         if len(data) < config.least:
             raise InputError(
                 f"{len(data)} trial{'s' * (len(data) > 1)}{kind} given; at least {config.least} are needed, each"

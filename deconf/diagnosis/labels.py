@@ -16,13 +16,19 @@ def constant(trials: Trials) -> list[int]:
     return [int(i) for i in np.flatnonzero(same)]
 
 
-def of_dynamics(trials: Trials) -> list[int]:
-    """Those columns, if they show how trials differ in their dynamics: without them trials do, and with them not."""
+def decisive(trials: Trials) -> list[int]:
+    """Those columns, if trials differ in their dynamics without them."""
     columns = constant(trials)
     rest = np.delete(trials.obs, columns, axis=-1)
-    if not columns or not rest.shape[-1] or _differ(trials):
+    if not columns or not rest.shape[-1]:
         return []
     return columns if _differ(Trials(rest, trials.action, trials.mask, trials.actions)) else []
+
+
+def of_dynamics(trials: Trials) -> list[int]:
+    """Those columns, if they show how trials differ in their dynamics: without them trials do, and with them not."""
+    columns = decisive(trials)
+    return [] if columns and _differ(trials) else columns
 
 
 def named(trials: Trials, explore: Trials | None) -> list[str]:

@@ -251,7 +251,7 @@ def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
 
 def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
     """Whether trials differ in their dynamics."""
-    measured = fits.own_dynamics(trials, steps)
+    measured, odd = fits.own_dynamics(trials, steps), False
     if measured is None:
         text = "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
     elif measured[0]:
@@ -259,10 +259,11 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
             f"Trials differ in their dynamics: {names[measured[1]]} departs from a fit of all trials in the same way in"
             f" both halves of a trial (rank correlation {measured[0]:.2f})."
         )
-    elif shown := [names[i] for i in labels.of_dynamics(trials)]:
-        text = f"Trials differ in their dynamics, and observations show how: {listed(shown)}, constant in each trial."
-        measured = None
+    elif labelling := [names[i] for i in labels.decisive(trials)]:
+        how = f"observations show how: {listed(labelling)}, constant in each trial"
+        text = f"Trials differ in their dynamics, and {how}."
     elif blind:
+        odd = True
         text = (
             "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
             " what its actions do."
@@ -272,4 +273,4 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
             "No difference in dynamics is seen between trials. The expert's actions can hide one, as they make up for"
             " it; exploration would show it (--explore)."
         )
-    yield Remark("dynamics", text, blind and measured is not None and not measured[0])
+    yield Remark("dynamics", text, odd)

@@ -1,11 +1,10 @@
 """The error for bad input, and how other errors are reported in one line."""
 
-import sysconfig
 import traceback
 from pathlib import Path
 
-PACKAGE, PARTS = Path(__file__).resolve().parents[2], ("envs", "experts", "deconf", "benchmarks")
-STANDARD_LIBRARY = Path(sysconfig.get_path("stdlib")).resolve()
+from deconfounded.envs.support.origin import is_library, is_ours
+
 LONGEST = 1000  # of an error, in characters: what was given may be an array, or a file
 
 
@@ -35,6 +34,5 @@ def error_line(error: BaseException) -> str:
 def _is_users(name: str) -> bool:
     """Whether a file is the user's own: neither of this package nor of a library."""
     file = Path(name).resolve()
-    ours = any(file.is_relative_to(PACKAGE / part) for part in PARTS)
-    installed = {"site-packages", "dist-packages"} & {*file.parts} or file.is_relative_to(STANDARD_LIBRARY)
-    return not name.startswith("<") and not ours and not installed
+    installed = is_library(file) or {"site-packages", "dist-packages"} & {*file.parts}  # also of other environments
+    return not name.startswith("<") and not is_ours(file) and not installed

@@ -23,6 +23,7 @@ from deconfounded.benchmarks.output import aggregation, records
 from deconfounded.benchmarks.studies import table as table_command
 from deconfounded.deconf.methods import dagger
 from deconfounded.envs.support.files import PARTIAL, write_sealed
+from deconfounded.envs.support.origin import ROOT
 from deconfounded.experts import policy
 from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
@@ -48,7 +49,7 @@ class TestIdentity:
         job = BenchmarkJob("slippery_cartpole", tiny_preset(), "naive_rnn", (0,), Path())
 
         def changed(self: Path) -> bytes:
-            return read(self) + (b"x = 1\n" if self == sources.ROOT / name else b"")
+            return read(self) + (b"x = 1\n" if self == ROOT / name else b"")
 
         before = identity.identity(job)
         monkeypatch.setattr(Path, "read_bytes", changed)
