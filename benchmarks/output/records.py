@@ -8,7 +8,7 @@ versions; `aggregation` makes results of them. A file `<task>.jsonl` holds a rec
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -155,18 +155,24 @@ def read(file: Path) -> list[Record]:
     or a second one of the same preset, method and seed.
     """
     try:
-        lines = file.read_bytes().splitlines()
+        content = file.read_bytes()
     except OSError as error:
         raise InputError(f"records {file} cannot be read: {error.strerror}") from None
+    return list(_records(content, file))
+
+
+@lru_cache(maxsize=64)  # one page reads all tasks under each protocol, and scores read the package's beside it
+def _records(content: bytes, file: Path) -> tuple[Record, ...]:
+    """The records in a file's content, which nobody may change."""
     records: dict[str, Record] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(content.splitlines(), 1):
         record = _parse(line, where := f"line {number} of {file}")
         if place(record["task"]) != file.name:
             raise InputError(f"{where} is of {record['task']}, which belongs in {place(record['task'])}")
         if (slot := _slot(record)) in records:
             raise InputError(f"{where} is a second record of {named(record)} with seed {record['seed']}")
         records[slot] = record
-    return list(records.values())
+    return tuple(records.values())
 
 
 def held(file: Path) -> list[Record]:
