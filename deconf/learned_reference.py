@@ -29,13 +29,14 @@ DECOYS = 16  # thetas beside the true one, by which the exponent is chosen
 class LearnedDynamics:
     """p(o' | o, a, theta)^exponent: a network gives the mean of the change, held-out residuals its covariance.
 
-    Changes are in units of their standard deviation; columns that never change are left out.
+    Changes are in units of their standard deviation; columns that never change, or always by the same amount, are
+    left out.
     """
 
     task: Task
     network: MLPRegressor
     inputs: StandardScaler
-    scale: Array  # [O], 0 where a column never changes
+    scale: Array  # [O], 0 where a column is left out
     precision: Array
     exponent: float = 1.0
     r2: float = 0.0  # of the change, on held-out trials
@@ -73,7 +74,8 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
     fitted, held_out = (np.arange(trials) % HELD_OUT > 0), (np.arange(trials) % HELD_OUT == 0)
     obs, action, next_obs, theta = steps(rollouts, fitted)
     scale = (next_obs - obs).std(0)
-    scale[scale < 1e-9] = 0
+    rounding = np.finfo(np.float32).eps * np.abs(obs).max(0)  # all that tells the steps of a clock apart
+    scale[scale < np.maximum(1e-9, rounding)] = 0
     moves = scale > 0
     rows = features(task, obs, action, theta)
     inputs = StandardScaler().fit(rows)

@@ -65,7 +65,13 @@ class GymSimulator(Simulator):
             with part(self.box.name, "step"):
                 values = "obs, reward, terminated, truncated, info"
                 obs, reward, over, cut, _ = self._values("step", env.step(self.box.raw(action[k])), values)
-                after[k] = self._state("step", obs, float(reward), over or cut)
+                try:
+                    paid = float(reward)
+                except (TypeError, ValueError):
+                    raise InputError(
+                        f"step of {self.box.name} gave the reward {reward!r}; it must be a number"
+                    ) from None
+                after[k] = self._state("step", obs, paid, over or cut)
         return after
 
     def _values(self, where: str, values: object, names: str) -> tuple[Any, ...]:

@@ -152,7 +152,10 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         if not callable(expert.call):
             raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")
         env = BatchEnv(task, 2)
-        expert.mean(env.reset(0), env.theta)  # not of zeros, which it may never see
+        obs = env.reset(0)  # not of zeros, which it may never see
+        if not np.allclose(expert.mean(obs, env.theta), expert.mean(obs, env.theta), atol=1e-4):
+            right = "it must give the mean, to which the task's expert_noise is added"
+            raise InputError(f"expert {source} gave two actions for one observation; {right}")
         return expert
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")

@@ -190,8 +190,9 @@ def notes(scores: Scores) -> str:
     held = f"{share}, with few tasks in fewer" if fewest > 1 else ""
     return (
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
-        " come with the package. Regret is the expert's score less the method's, summed over the episodes; less is"
-        " better. Differences are paired by seed; their 95% intervals are Student's, over tasks Welch's."
+        " come with the package, or of the runs on a task that these do not have. Regret is the expert's score less the"
+        " method's, summed over the episodes; less is better. Differences are paired by seed; their 95% intervals are"
+        " Student's, over tasks Welch's."
         f" IQM is the interquartile mean of all runs; its interval is a stratified bootstrap{held}. The interval of P"
         " is a stratified bootstrap too."
     )

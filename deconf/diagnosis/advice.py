@@ -30,8 +30,9 @@ IF_WRONG: dict[tuple[Verdict, int | None], str] = {
 """By verdict and tier: 'If this is wrong, ...'."""
 
 PASSING = (
-    "Past actions tell a clone of the expert's next one, but what they tell passes, and is not in the world: pauses,"
-    " noise that lasts, or a memory of the expert's own. A clone that goes by its own past actions loses nothing by it."
+    "Past actions tell a clone of the expert's next one, but what they tell passes: pauses, noise that lasts, a memory"
+    " of the expert's own, or a speed or another state that no column shows. A clone that goes by its own past actions"
+    " loses nothing by it."
 )
 
 
@@ -48,7 +49,8 @@ CLONE = Next(
 )
 CLONE_HABITS = Next(
     "Clone the expert. A memory of past actions copies pauses, noise and habits too; cut out of the logs what you do"
-    " not want copied, or clone without a memory.",
+    " not want copied. Clone without a memory, by the printed lines, only if your columns show all that the expert acts"
+    " on at a moment, speeds too.",
     "memoryless_bc.train(trials, memoryless_bc.MemorylessConfig(), np.random.default_rng(0))",
 )
 EXPLORE = Next(

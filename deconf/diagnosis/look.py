@@ -245,6 +245,7 @@ def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
             f"What the observation leaves open of the action in a trial ({share:.0%} of the variance) lasts: its"
             f" correlation from step to step is {correlation:.2f}, so that it halves in {half:.0f} steps. Noise that"
             " lasts, AR(1), or the expert's own memory looks like something hidden, and is not in the world."
+            " A speed that no column shows looks so too: add it, if you can."
         )
         yield Remark("lasting", text, True)
 

@@ -73,7 +73,10 @@ def _check_world(task: BlackBox) -> None:
     obs = env.reset(0)
     acted = task.expert_probs if task.n_actions else task.expert_mean
     for action in actions(task, env.n, task.horizon):
-        acted(obs[env.alive], env.theta[env.alive])
+        once, again = (acted(obs[env.alive], env.theta[env.alive]) for _ in range(2))
+        if not np.allclose(once, again, atol=1e-4):
+            right = "it must give the action without noise, and `noise` is added to it"
+            raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
         obs = env.step(action)[0]
         if not env.alive.any():
             return

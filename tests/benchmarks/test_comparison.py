@@ -267,3 +267,9 @@ def test_records_name_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert data is not None
     (made,) = records.of_job(data, "smoke", [], 1)
     assert records.check(json.loads(json.dumps({**made, "sha256": "0" * 64})), "it")["package"] == "0.1.0"
+
+
+def test_notes_say_whose_references() -> None:
+    """Records of the package have no task of a user's own: 0 and 1 are then the runs' (aggregation.references)."""
+    said = comparison.notes({"mine": {"own_task": {0: np.ones(2)}}})
+    assert "of the records that come with the package, or of the runs on a task that these do not have" in said

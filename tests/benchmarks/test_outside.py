@@ -39,6 +39,7 @@ from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
 from tests.tools import deconf, tiny_preset
+from tests.toys import Push
 
 ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
@@ -184,6 +185,14 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     expert = policy.load(task, f"{folder}/linear.py:control")
     result = certify.certify(task, expert, trials=4, grid=3)
     assert result["return_expert"] > 2 * result["return_random"]
+
+
+def test_an_expert_s_mean_has_no_noise(tmp_path: Path) -> None:
+    """The task adds it; a second noise would not be in the density of Eq. (1)."""
+    noisy = "import numpy as np\nrng = np.random.default_rng(0)\ndef act(obs, theta):\n"
+    (tmp_path / "noisy.py").write_text(f"{noisy}    return rng.uniform(-1, 1, (len(obs), 1))")
+    with pytest.raises(envs.InputError, match=r"noisy\.py:act gave two actions for one observation"):
+        policy.load(Push(), f"{tmp_path}/noisy.py:act")
 
 
 TOY = "from tests.toys import Push\nclass Task(Push):\n    name = 'mine'\n"

@@ -26,6 +26,7 @@ from deconfounded.experts.rollout import Rollout, run_trials
 from tests.toys import Push, control
 
 WORLDS = Path(__file__).parents[2] / "docs" / "worlds"
+UNSURE = np.random.default_rng(0)
 EXAMPLES = ("context_pendulum.py:ContextPendulum", "reversed_cart.py:ReversedCart")
 
 
@@ -210,6 +211,16 @@ def wide(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"step": step})(0.0)
 
 
+def paid(reward: Any) -> Callable[..., Any]:
+    """`make` of an environment that gives this reward."""
+
+    def step(self: Slide, action: Any) -> Any:
+        obs, _, *rest = Slide.step(self, action)
+        return obs, reward, *rest
+
+    return lambda self, theta: type("Odd", (Slide,), {"step": step})(0.0)
+
+
 class TestErrors:
     """Each is one line, which says what was given."""
 
@@ -222,11 +233,14 @@ class TestErrors:
         ("make", old_reset, "reset of Sliding takes no seed; it must be reset.seed=None, options=None., as gymn"),
         ("make", reset_of_one, "reset of sliding returned a ndarray; it must return obs, info, as gymnasium.Env"),
         ("make", wide, r"step of sliding gave an observation of shape \(2,\); it must be 1 finite numbers"),
+        ("make", paid(None), "step of sliding gave the reward None; it must be a number"),
+        ("make", paid(np.ones(2)), r"step of sliding gave the reward array\(\[1., 1.\]\); it must be a number"),
         ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),
         ("sample_theta", lambda self, rng: [np.nan], "sample_theta of Sliding gave .nan.; it must be"),
         ("sample_theta", lambda self, rng: [1] * rng.integers(1, 3), "it must be . finite numbers, as at first"),
         ("expert", lambda self, obs, theta: np.zeros(3), r"expert of sliding gave .* must be of shape \(1,\)"),
         ("expert", lambda self, obs, theta: None, "expert of sliding gave None for an observation; it must be of"),
+        ("expert", lambda self, obs, theta: UNSURE.random(1), "expert of sliding gave two actions for one observat"),
         ("steps", 0, "the number of steps of Sliding was 0"),
         ("noise", -1, "noise of Sliding was -1; it must be a number from 0 up"),
         ("names", ("a", "b"), "names of Sliding were .*; they must be 1 different texts"),
@@ -259,6 +273,31 @@ def test_noise_is_of_trials_that_the_mean_was_not_fitted_to(monkeypatch: pytest.
     assert fitted.sum() == 48
     assert len(held_out) > 1
     assert not any((fitted & which).any() for which in held_out)
+
+
+def test_a_clock_is_no_dynamics() -> None:
+    """A share of the horizon changes by the same amount in each step, but for the rounding of float32."""
+
+    def clocked(self: Any, theta: Any) -> Any:
+        def with_time(self: Slide, obs: Any) -> Any:
+            return np.append(obs, self.t / 30)
+
+        def reset(self: Any, **options: Any) -> Any:
+            self.t = 0
+            return with_time(self, Slide.reset(self, **options)[0]), {}
+
+        def step(self: Any, action: Any) -> Any:
+            self.t += 1
+            obs, *rest = Slide.step(self, action)
+            return with_time(self, obs), *rest
+
+        space = spaces.Box(-9, 9, (2,))
+        return type("Clocked", (Slide,), {"reset": reset, "step": step, "observation_space": space})(theta[0])
+
+    task = task_with(make=clocked, expert=lambda self, obs, theta: 2 - obs[:1] - theta, steps=30)
+    dynamics = learn(task, policy.load(task), 32, 0)
+    assert dynamics.scale[1] == 0 < dynamics.scale[0]
+    assert 0 < dynamics.r2 < 1
 
 
 @pytest.mark.slow
