@@ -32,12 +32,15 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.envs import registry
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
+from deconfounded.envs.tasks.bandit import Bandit
 from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
+from tests import toys
 from tests.tools import deconf, tiny_preset
 
 ROOT = Path(__file__).parents[2]
@@ -184,6 +187,19 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     expert = policy.load(task, f"{folder}/linear.py:control")
     result = certify.certify(task, expert, trials=4, grid=3)
     assert result["return_expert"] > 2 * result["return_random"]
+
+
+def test_tasks_that_packages_offer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the name of their entry point; a name of ours is ours."""
+    points = [
+        SimpleNamespace(name="their_drift", value="tests.toys:Drift"),
+        SimpleNamespace(name="bandit", value="no:Way"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "deconfounded.tasks" else [])
+    assert "their_drift" in envs.names()
+    assert envs.names().count("bandit") == 1
+    assert type(envs.get("their_drift")) is toys.Drift
+    assert type(envs.get("bandit")) is Bandit
 
 
 TOY = "from tests.toys import Push\nclass Task(Push):\n    name = 'mine'\n"
