@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from importlib.util import find_spec
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,16 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run in this process draws nothing: pictures take longer than a small run."""
     monkeypatch.setattr("deconfounded.benchmarks.output.run_report.pictures", lambda *_: None)
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The figures that are drawn from now on, as matplotlib has them; none is saved as .png."""
+    from deconfounded.benchmarks.output import pictures
+
+    drawn: list[Any] = []
+    monkeypatch.setattr(pictures, "save_figure", lambda figure, *_: drawn.append(figure))
+    return drawn
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -74,6 +74,16 @@ def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
     return CompletedProcess(args, code, out.getvalue(), err.getvalue())
 
 
+def dots(axes: Any) -> list[tuple[float, float]]:
+    """The points that are drawn in a panel, in the order of drawing."""
+    return [(float(x), float(y)) for line in axes.lines for x, y in zip(*line.get_data(), strict=True)]
+
+
+def bars(axes: Any) -> list[tuple[float, ...]]:
+    """The lines from one end to another in a panel, in the order of drawing: x, y, then x, y."""
+    return [tuple(map(float, line.ravel())) for lines in axes.collections for line in lines.get_segments()]
+
+
 def processes(mark: str, *starts: str) -> list[tuple[int, str]]:
     """Number and command line of those with `mark` (NAME=value) in their environment, whose command line starts so."""
     matching = []

@@ -83,8 +83,7 @@ def _moved(task: envs.MujocoTask, latent: int) -> str:
                 kind, rows = "jnt", low.dof_jntid[rows]
             names = ", ".join(kinds[kind](int(row)).name for row in rows) if kind in kinds else ""
             moved.append(f"`{field}` of {names}" if names else f"`{field}`")
-    if (low.opt.gravity != high.opt.gravity).any():
-        moved.append("gravity")
+    moved += [name for name in ("gravity", "wind") if (getattr(low.opt, name) != getattr(high.opt, name)).any()]
     return "; ".join(moved) or "nothing"
 
 

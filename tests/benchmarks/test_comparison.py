@@ -20,7 +20,7 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
 from deconfounded.benchmarks.output import aggregation, comparison, pictures, records, scoring, statistics
 from deconfounded.envs.support.errors import InputError, error_line
-from tests.tools import tiny_preset
+from tests.tools import bars, dots, tiny_preset
 
 TEXT = """
 from dataclasses import dataclass
@@ -229,6 +229,52 @@ class TestComparison:
         assert "naive_rnn" not in tex.replace(r"\_", "")
         for name in ("comparison.pdf", "comparison.png", "over_tasks.csv", "over_tasks.tex", "tasks.csv"):
             assert (tmp_path / name).stat().st_size > 0
+
+    SCORES = {
+        "a": {"t": {0: np.array([0.1, 0.5]), 1: np.array([0.1, 0.7])}, "u": {0: np.array([0.2, 0.3])}},
+        "b": {"t": {0: np.array([0.4, 0.2]), 1: np.array([0.8, 0.5]), 2: np.array([0.0, 0.9])}},
+        "c": {"t": {0: np.array([0.3, 0.1]), 1: np.array([0.2, 0.1])}},
+    }
+
+    def test_cells_stand_under_their_heads(self) -> None:
+        """By hand, of two others: each difference, and the probability in the last episode alone."""
+        rows = [
+            comparison.of_tasks(self.SCORES, ["a"], ["b", "c"]),
+            comparison.over_tasks(self.SCORES, ["a"], ["b", "c"]),
+        ]
+        tables = comparison.tables(*rows, ["b", "c"])
+        of_t, over = (dict(zip(table[0], table[1], strict=True)) for table in tables.values())
+        expected = {
+            **{"first - b": "-0.50", "last - b": "+0.25", "regret - b": "+0.25"},
+            **{"first - c": "-0.15", "last - c": "+0.50", "regret - c": "-0.35"},
+        }
+        assert (of_t["task"], of_t["method"], of_t["seeds"], of_t["last"]) == ("t", "a", "2", "0.60")
+        for cells in (of_t, over):
+            assert {head: cells[head].partition(" (")[0] for head in expected} == expected
+        better = [over[f"P(better than {other})"].partition(" (")[0] for other in "bc"]
+        assert better == ["0.58", "1.00"]  # of a's .5 and .7 against .2, .5 and .9: three are won, and one is a tie
+        assert over["tasks"] == "2"
+
+    def test_coverage_is_of_the_fewest_seeds(self) -> None:
+        scores = {"a": {"t": dict.fromkeys(range(9), np.zeros(2)), "u": dict.fromkeys(range(4), np.zeros(2))}}
+        assert f"with 4 seeds of many tasks it contains the true value in {statistics.coverage(4):.0%}" in (
+            comparison.notes(scores)
+        )
+
+    def test_a_picture_is_of_the_last_episode(self, figures: list[Any], tmp_path: Path) -> None:
+        """Differences with their intervals, a panel for each other; interquartile means."""
+        rows = [
+            comparison.of_tasks(self.SCORES, ["a"], ["b", "c"]),
+            comparison.over_tasks(self.SCORES, ["a"], ["b", "c"]),
+        ]
+        comparison.picture(*rows, ["b", "c"], tmp_path / "comparison.png")
+        first, second, last = figures[0].axes
+        assert dots(first)[0] == pytest.approx((0.25, 0))
+        assert dots(second)[0] == pytest.approx((0.5, 0))
+        student = 12.7062 * 0.1  # of one degree of freedom, times the standard error
+        assert bars(second)[0] == pytest.approx((0.5 - student, 0, 0.5 + student, 0), abs=1e-4)
+        assert [x for x, _ in dots(last)] == pytest.approx([1.5 / 3, 1.6 / 3, 0.1])
+        assert [label.get_text() for label in last.get_yticklabels()] == ["a", "b", "c"]
 
     def test_records_of_older_versions_are_named(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         kept = records.of_task(published.RECORDS, "curling")

@@ -9,6 +9,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import changed, preset
 from deconfounded.benchmarks.studies import exploration
+from tests.tools import bars, dots
 
 PNG = b"\x89PNG"
 
@@ -70,6 +71,18 @@ def test_median_loss(points: list[dict[str, Any]]) -> None:
     """Over tasks: .1 and .3 with a quarter; .4 of one task with a 16th; none with a 64th."""
     last = exploration.median_losses(points).splitlines()[-1]
     assert [cell.strip() for cell in last.split("|")[1:-1]] == ["deconfounded", "0.20 (2)", "0.40 (1)", ""]
+
+
+def test_panels_of_the_first_and_the_last_episode(
+    points: list[dict[str, Any]], figures: list[Any], tmp_path: Path
+) -> None:
+    """Means over seeds by explored trials, and from the least to the most of them."""
+    exploration.picture(points[:3], tmp_path / "exploration.png")
+    for panel, share, end in zip(figures[0].axes, (0.5, 1), exploration.ENDS, strict=True):
+        assert panel.get_ylabel() == f"score, {end} episode"
+        for dot, expected in zip(dots(panel), [(32, 0.5), (128, 0.8), (512, 0.9)], strict=True):
+            assert dot == pytest.approx((expected[0], share * expected[1]))
+        assert bars(panel)[0] == pytest.approx((32, share * 0.4, 32, share * 0.6))
 
 
 @pytest.mark.parametrize("count", [1, 5])

@@ -129,6 +129,45 @@ def test_paper_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert all((tmp_path / f"{name}.png").stat().st_size > 10_000 for name in ("figure2", "figure3", "tiers"))
 
 
+def test_a_sliding_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the last two steps, and at the start of the one that there is."""
+    monkeypatch.setattr(paper, "WINDOW", 2)
+    np.testing.assert_allclose(paper.smoothed(np.array([[1.0, 3.0, 7.0], [2.0, 0.0, 0.0]])), [[1, 2, 5], [2, 1, 0]])
+
+
+def of_figures(pulls: float, level: float) -> dict[str, Any]:
+    """What a job of the paper's figures keeps of a seed: constant curves at levels of their own."""
+    steps = {key: np.full(100, times * level) for times, key in ((1, "on_expert"), (2, "online"))}
+    curves = {"at": np.array([1, 2]), "loss_curve": np.full(2, 3 * level), "pulls_curve": np.full(2, 4 * level)}
+    return {**steps, **curves, "pulls": np.array(pulls), "meta": {"budget": {}, "train_s": 1.0}}
+
+
+def test_methods_are_held_against_the_policy_they_should_match() -> None:
+    """Pulls of 50 and 53: the standard error of their mean is 1.5. A naive clone should be deluded, and others not."""
+    exact = {name: of_figures(pulls, 0.1) for name, pulls in (("conditional", 33.0), ("interventional", 54.0))}
+    references = {name: {**entry, "pulls": float(entry["pulls"])} for name, entry in exact.items()}
+    finished = [(name, seed, of_figures(50.0 + 3 * seed, 0.2)) for name in ("naive_rnn", "dagger") for seed in (0, 1)]
+    summary = paper.summarise(finished, references)
+    assert (summary["dagger"]["pulls_mean"], summary["dagger"]["pulls_se"]) == (51.5, 1.5)
+    assert (summary["naive_rnn"]["target"], summary["naive_rnn"]["target_pulls"]) == ("conditional", 33)
+    assert (summary["dagger"]["target"], summary["dagger"]["target_pulls"]) == ("interventional", 54)
+    assert summary["dagger"]["max_gap_online"] == pytest.approx(0.2)  # .4 and .2
+
+
+def test_panels_of_figure_3(figures: list[Any], tmp_path: Path) -> None:
+    """(a) on expert trajectories, (b) online, (c) the loss, (d) pulls: each has its own curve, and the exact one."""
+    reference = {"on_expert": np.full(100, 0.5), "online": np.full(100, 0.6), "loss": 0.7, "pulls": 0.8}
+    paper.figure_3([("naive_rnn", 0, of_figures(1.0, 0.1))], {"conditional": reference}, tmp_path / "figure3.png")
+    for panel, letter, own, exact in zip(
+        figures[0].axes, "abcd", (0.1, 0.2, 0.3, 0.4), (0.5, 0.6, 0.7, 0.8), strict=True
+    ):
+        assert panel.get_title().startswith(f"({letter})")
+        learned, dashed = panel.lines
+        assert np.nanmin(learned.get_ydata()) == pytest.approx(own) == np.nanmax(learned.get_ydata())
+        assert np.ptp(dashed.get_ydata()) == pytest.approx(0)
+        assert dashed.get_ydata()[0] == pytest.approx(exact)
+
+
 @pytest.mark.parametrize("edited", ["method", "task", "amount", "layout"])
 def test_a_checkpoint_of_other_code_is_refused(
     edited: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

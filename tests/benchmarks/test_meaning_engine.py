@@ -99,6 +99,36 @@ class Told(Here):
                 say(job, error)
 
 
+class Noting(Here):
+    """It notes the methods whose jobs it runs."""
+
+    def __init__(self) -> None:
+        self.ran: list[str] = []
+
+    def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
+        self.ran += [job.method for job in jobs]
+        super().run(jobs, tick, say)
+
+
+def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
+    """A method whose file is gone; not what it imitates, which is there, nor another method."""
+    made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in ("blind_bc", "random")]
+    engine = Noting()
+    assert scheduler.run_all(made, "cpu", "first", engine)[1] == 0
+    assert engine.ran == ["demonstrations", "blind_bc", "random"]
+    made[0].file(0).unlink()
+    engine.ran.clear()
+    assert scheduler.run_all(made, "cpu", "again", engine)[1] == 1  # there before
+    assert engine.ran == ["blind_bc"]
+
+
+def test_the_time_that_is_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """A quarter took 10 s: 30 s are left."""
+    monkeypatch.setattr(progress.time, "monotonic", iter([0.0, 10.0, 10.0]).__next__)
+    progress.Progress(8, "work", every_s=5).update(2)
+    assert capsys.readouterr().out == "work:  25%, 30 s left\n"
+
+
 RARE = """
 from tests.toys import Push
 

@@ -2,7 +2,9 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import run_trials, thetas
+from deconfounded.experts.trials import Trials
 from tests import toys
 from tests.tools import tiny_preset
 
@@ -349,12 +352,97 @@ def test_features_are_of_every_episode_or_none(first: int, says: str, monkeypatc
         evaluate(context, Remembering(PUSH.action_space), True)
 
 
+def test_the_filmed_trial_is_near_the_upper_end() -> None:
+    """Of the first seed's 20 trials the one whose force is nearest the .85 quantile: the fourth from the top."""
+    context = Context(PUSH, replace(tiny_preset(), eval_trials=20), [0, 1], expert="tests.toys:control")
+    measured, _, clip = evaluate(context, RandomAgent(PUSH.action_space), False, "", True)
+    theta = measured["theta"][:20, 0, 0]
+    assert theta.argsort().argsort()[clip["trial"]] == 16
+    assert [*clip["episode"]] == sorted(clip["episode"])
+    assert {*clip["episode"]} == {0, 1}
+
+
+def test_beliefs_are_read_as_at_the_end_of_training_s_last_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the probe of the second of four episodes, of the first seed, whose trial is filmed."""
+    made: list[int] = []
+
+    def probe(features: Array, theta: Array) -> Any:
+        made.append(number := len(made))
+        return 0.0, lambda known: np.full(len(known), number)
+
+    monkeypatch.setattr(benchmark, "probe", probe)
+    context = Context(PUSH, tiny_preset(), [0, 1], expert="tests.toys:control")
+    clip = evaluate(context, Remembering(PUSH.action_space), True, "", True)[2]
+    assert len(made) == 8
+    assert {*clip["read"]} == {1}
+
+
+class Many(toys.Push):
+    """Push, with four more latents, which do nothing."""
+
+    name = "many"
+    latents = (*toys.Push.latents, *(envs.Latent(f"other_{i}", "", -1.0, 1.0) for i in range(4)))
+
+
+def test_levels_of_many_latents_are_from_all_combinations() -> None:
+    """Some of 32: each latent is at both of its values."""
+    task = Many()
+    expert = CallableExpert(task, lambda obs, theta: toys.control(obs, theta[:, :1]), "control")
+    levels, *_ = certify.stakes(task, expert, 1)
+    assert levels.shape == (certify.MOST, 5)
+    assert (np.ptp(levels, 0) > 0).all()
+
+
+def test_pairs_far_apart_are_so_in_some_latent() -> None:
+    """By half of the range, in quantiles; kinds are far from each other."""
+    some = envs.Latent("a", "", 1.0, 16.0, "loguniform"), envs.Latent("b", "", 0.0, 1.0)
+    kind = envs.Latent("c", "", 0, 2, "categorical")
+    task: Any = SimpleNamespace(latents=some)
+    levels = np.array([[1.0, 0.0], [3.9, 0.4], [4.0, 0.4], [1.0, 0.5]])
+    assert certify.far_pairs(task, levels)[0].tolist() == [False, False, True, True]
+    task = SimpleNamespace(latents=(kind,))
+    assert certify.far_pairs(task, np.array([[0.0], [1.0], [0.0]]))[0].tolist() == [False, True, False]
+
+
+def test_how_well_theta_is_inferred() -> None:
+    """R^2, in units of the truth's variance, which is 1.25; of kinds the share that is right."""
+    latents = envs.Latent("a", "", 0.0, 4.0), envs.Latent("b", "", 0, 2, "categorical")
+    task: Any = SimpleNamespace(latents=latents)
+    truth = np.array([[0.0, 0], [1.0, 1], [2.0, 2], [3.0, 0]])
+    estimate = np.array([[0.0, 0], [1.0, 1], [2.0, 2], [2.0, 1]])
+    assert certify.inferability(task, estimate, truth) == {"a": pytest.approx(1 - 0.25 / 1.25), "b": 0.75}
+
+
 def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1."""
     _, scores, returns = certify.stakes(PUSH, EXPERT, 32)
     assert np.diag(scores) == pytest.approx(1)
     assert returns[0, -1] < 0.6 * returns[0, 0]
     assert returns[-1, 0] < 0.6 * returns[-1, -1]
+
+
+def test_a_picture_of_stakes_has_the_true_theta_in_its_rows(figures: list[Any], tmp_path: Path) -> None:
+    """And beside it each exact policy's own scores, and the evidence of each source."""
+    policies = {
+        name: {"score": [i / 10] * certify.EPISODES} for i, name in enumerate(("interventional", "conditional"))
+    }
+    result = {
+        **{"task": "push", "verdict": "passed", "checks": {"blind_bc": {"measured": 0.3}}, **policies},
+        **{"stakes": {"score": [[1.0, 0.1], [0.2, 0.9]], "levels": [[-1.0], [1.0]]}},
+        **{"evidence_nats_per_step": {"dynamics": 0.5, "actions": 2.0, "delusion_ratio": 4.0}},
+    }
+    certify.picture(result, tmp_path / "push.png")
+    left, middle, right = figures[0].axes[:3]
+    assert (left.get_xlabel(), left.get_ylabel()) == ("theta given", "true theta")
+    assert {text.get_position(): text.get_text() for text in left.texts} == {
+        **{(0, 0): "1.00", (1, 0): "0.10"},  # x is the column
+        **{(0, 1): "0.20", (1, 1): "0.90"},
+    }
+    np.testing.assert_array_equal(left.images[0].get_array(), result["stakes"]["score"])
+    for line, name in zip(middle.lines, policies, strict=False):
+        assert line.get_label() == f"exact {name}"
+        assert [*line.get_ydata()] == policies[name]["score"]
+    assert [bar.get_height() for bar in right.patches] == [0.5, 2.0]
 
 
 def test_a_certificate_s_belief_goes_on_after_an_early_end() -> None:
@@ -378,8 +466,13 @@ def test_a_certificate_s_belief_goes_on_after_an_early_end() -> None:
 
 def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPatch) -> None:
     """0 is its random actions, 1 its expert; checks are of the last episode; a clone that learned nothing is at 0."""
-    monkeypatch.setattr(memoryless_bc, "train", lambda *_: RandomAgent(PUSH.action_space))
+    cloned: list[Trials] = []
+    monkeypatch.setattr(
+        memoryless_bc, "train", lambda trials, *_: (cloned.append(trials), RandomAgent(PUSH.action_space))[1]
+    )
     certificate = certify.certify(PUSH, EXPERT, trials=12, grid=5)
+    scored = run_trials(envs.BatchEnv(PUSH, 12), RandomAgent(PUSH.action_space), certify.EPISODES, certify.SEED).trials
+    assert not np.isin(cloned[0].obs[:, 0, 0], scored.obs[:, 0, 0]).any(), "the clone has seen trials it is scored in"
     for name in ("interventional", "conditional"):
         random_return, expert_return = certificate["return_random"], certificate["return_expert"]
         scores = [(value - random_return) / (expert_return - random_return) for value in certificate[name]["return"]]

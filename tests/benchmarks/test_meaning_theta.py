@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import guest_host, progress, provider
+from deconfounded.benchmarks.engine import catalogue, guest_host, progress, provider
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
@@ -209,3 +209,17 @@ def test_a_guest_does_not_act_on_theta(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(made.provider("theta")) == 4
     with pytest.raises(envs.InputError, match="it asked for acting theta"):
         made.provider("acting theta")
+
+
+def test_nor_does_one_in_this_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Which is how a method is debugged: it gets what it would get as a guest."""
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    (tmp_path / "curious.py").write_text(
+        "from deconfounded.deconf.method import uses\n"
+        "@uses('demonstrations', 'theta')\n"
+        "def fit(given):\n    assert len(given.theta) == 4\n    return given._ask('acting theta')\n"
+    )
+    method = catalogue.METHODS[catalogue.add(f"{tmp_path}/curious.py:fit")]
+    context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
+    with pytest.raises(envs.InputError, match="it asked for acting theta"):
+        guest_host.fit_guest(context, "curious", method)

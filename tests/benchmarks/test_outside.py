@@ -32,14 +32,16 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.envs import registry
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
+from deconfounded.envs.tasks.bandit import Bandit
 from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
+from tests import toys
 from tests.tools import deconf, tiny_preset
-from tests.toys import Push
 
 ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
@@ -192,7 +194,20 @@ def test_an_expert_s_mean_has_no_noise(tmp_path: Path) -> None:
     noisy = "import numpy as np\nrng = np.random.default_rng(0)\ndef act(obs, theta):\n"
     (tmp_path / "noisy.py").write_text(f"{noisy}    return rng.uniform(-1, 1, (len(obs), 1))")
     with pytest.raises(envs.InputError, match=r"noisy\.py:act gave two actions for one observation"):
-        policy.load(Push(), f"{tmp_path}/noisy.py:act")
+        policy.load(toys.Push(), f"{tmp_path}/noisy.py:act")
+
+
+def test_tasks_that_packages_offer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the name of their entry point; a name of ours is ours."""
+    points = [
+        SimpleNamespace(name="their_drift", value="tests.toys:Drift"),
+        SimpleNamespace(name="bandit", value="no:Way"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "deconfounded.tasks" else [])
+    assert "their_drift" in envs.names()
+    assert envs.names().count("bandit") == 1
+    assert type(envs.get("their_drift")) is toys.Drift
+    assert type(envs.get("bandit")) is Bandit
 
 
 TOY = "from tests.toys import Push\nclass Task(Push):\n    name = 'mine'\n"

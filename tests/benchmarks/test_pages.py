@@ -4,7 +4,9 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from unittest.mock import Mock
 
 import imageio.v3 as imageio
 import matplotlib.pyplot as plt
@@ -15,7 +17,7 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
-from deconfounded.benchmarks.output import aggregation, index, records, run_report, scoring, statistics
+from deconfounded.benchmarks.output import aggregation, film, index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
 from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure, still
 from deconfounded.benchmarks.studies import (
@@ -29,6 +31,8 @@ from deconfounded.benchmarks.studies import (
     results,
     tune,
 )
+from tests.tools import bars, dots
+from tests.toys import Push
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -302,6 +306,8 @@ class TestHeadroom:
         assert hard.hard_in({"first": 0.81, "last": 0.9}) == "no"
         text = hard.page([], {"gusty_drone": {"verdict": "passed", "interventional": {"score": [0.5, 0.97]}}})
         assert "| wind, load | passed | 0.50 | 0.97 |  |  |  |  |  |  |" in text
+        row = hard._row(envs.get("gusty_drone"), None, self.METHODS)
+        assert row[5:] == ["0.70 a_mode (2)", "0.90 a (2)", "first", "0.70 a_mode (2)", "0.95 b (3)", "first"]
 
     def test_best_learner(self) -> None:
         """Who sees theta and the exact policies are no learners."""
@@ -314,6 +320,15 @@ class TestHeadroom:
         assert made == [("curling", {"first": (0.85, [0.7, 0.1]), "last": (0.98, [0.95, 0.9])})]
         headroom.picture(made, tmp_path / "headroom.png")
         assert (tmp_path / "headroom.png").stat().st_size > 5000
+
+    def test_each_episode_has_its_panel(self, figures: list[Any], tmp_path: Path) -> None:
+        """The others of the five best, then the best; a line at the ceiling."""
+        headroom.picture([("curling", {"first": (0.85, [0.7, 0.1]), "last": (0.98, [0.95, 0.9])})], tmp_path / "x.png")
+        first, last = figures[0].axes
+        for panel, end, ceiling, best in ((first, "first", 0.85, [0.1, 0.7]), (last, "last", 0.98, [0.9, 0.95])):
+            assert panel.get_title() == f"score in {headroom.ENDS[end]}"
+            assert [x for x, _ in dots(panel)] == best
+            assert bars(panel)[0] == pytest.approx((ceiling, -0.4, ceiling, 0.4))
 
 
 class TestProtocols:
@@ -386,6 +401,22 @@ class TestProtocols:
         assert (tmp_path / "protocols.png").stat().st_size > 10000
         assert protocol_scores.points([], {"unseen": curling}) == []
 
+    def test_each_agent_has_its_line(self, figures: list[Any], tmp_path: Path) -> None:
+        """A hollow dot under the standard protocol, if there is one, and one under this protocol, with its interval."""
+        both = protocol_scores.Mean("a", 3, 0.5, (0.4, 0.7), 0.8), protocol_scores.Mean("b", 3, 0.2, (0.1, 0.3), None)
+        protocol_scores.picture(
+            [("scarce", [("the first episode", both), ("the last episode", both[::-1])])], tmp_path / "x.png"
+        )
+        first = figures[0].axes[0]
+        assert first.get_title() == "scarce: the first episode, 3 tasks"
+        drawn = [[*zip(*line.get_data(), strict=True)] for line in first.lines]
+        of_a = [[(0.8, 0), (0.5, 0)], [(0.8, 0)], [(0.4, 0), (0.7, 0)], [(0.5, 0)]]
+        assert drawn == [*of_a, [(0.1, 1), (0.3, 1)], [(0.2, 1)]]
+        assert [line.get_markerfacecolor() for line in first.lines if len(line.get_xdata()) == 1][:2] == [
+            "w",
+            "tab:blue",
+        ]
+
     def test_table_in_the_making(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A task appears with its references, without which it has no scores; pages can be made before that."""
         for name in ("curling", "slippery_cartpole"):
@@ -442,6 +473,24 @@ class TestIndex:
         assert aggregated["methods"]["x"]["iqm"] == {"value": 0.6, "interval": None, "n": 1}
         won = aggregated["methods"]["x"]["improvement"]
         assert (won["value"], won["n"], won["tasks"]) == (0.5, 2, 1)
+
+    def test_a_row_says_what_its_method_s_entry_does(self) -> None:
+        """Each measure with its own interval; return and Eq. (1) of the last episode; differences by seed."""
+        entry = {
+            **{"seeds": [0, 1], "score": [0.1, 0.6], "score_beyond": [0.7], "budget": {}, "theta_r2": [0.2, 0.3]},
+            **{"score_first": 0.1, "score_last": 0.6, "regret": 1.3, "objective": [-9.0, -5.0], "cpu_s": 7.0},
+            **{"ci95": [0.5, 0.7], "ci95_first": [0.0, 0.2], "ci95_regret": [1.2, 1.4], "band": None},
+            **{"return": [[1.0, 6.0], [1.0, 8.0]]},
+        }
+        last = {"x": {0: 0.5, 1: 0.7}, "deconfounded": {0: 0.9, 1: 0.9}, "naive_rnn": {0: 0.0, 1: 0.0}}
+        row = index.row(envs.get("curling"), "x", entry, last)
+        assert (row["n"], row["value"], row["interval"]) == (2, 0.6, [0.5, 0.7])
+        assert row["first"] == {"value": 0.1, "interval": [0.0, 0.2]}
+        assert row["regret"] == {"value": 1.3, "interval": [1.2, 1.4]}
+        assert (row["scores"], row["trained"]) == ([0.1, 0.6, 0.7], 2)
+        assert (row["return"], row["objective"], row["r2"], row["cpu"]) == (7.0, -5, [0.2, 0.3], 7.0)
+        assert row["held"] == round(100 * scoring.coverage(2))
+        assert {other: each["value"] for other, each in row["minus"].items()} == {"deconfounded": -0.3}
 
     def test_links_and_size(self) -> None:
         """All that the page links to is there, nothing comes from a network; a copy of it alone has every picture."""
@@ -634,6 +683,149 @@ def test_beliefs_are_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "some.png").stat().st_size > 5000
 
 
+def test_each_latent_has_its_panel(figures: list[Any], tmp_path: Path) -> None:
+    """Of two latents and two episodes: the truth, and below it what was believed, each in its own unit."""
+    task, episode = envs.get("slippery_walker"), np.array([0, 0, 1])
+    theta, belief = np.array([[0.1, 5.0], [0.2, 6.0]]), np.array([[0.3, 7.0], [0.4, 8.0], [0.5, 9.0]])
+    run_report.beliefs(task, {"naive_rnn": {"theta": theta, "episode": episode, "belief": belief}}, tmp_path / "x.png")
+    for i, (panel, latent) in enumerate(zip(figures[0].axes, task.latents, strict=True)):
+        assert panel.get_ylabel().startswith(latent.name)
+        lines = {line.get_label(): line for line in panel.lines}
+        assert [*lines["true"].get_ydata()] == [theta[0, i]] * 2
+        assert lines["naive_rnn"].get_ydata().tolist() == belief[:2, i].tolist()
+        assert lines["naive_rnn"].get_xdata() == pytest.approx([0, 1 / task.horizon])
+        later = panel.lines[-1]
+        assert later.get_xydata().tolist() == [[1, belief[2, i]]]
+
+
+class Seen(Push):
+    """Push, with pictures in which there is nothing."""
+
+    def renderer(self, theta: Any) -> Any:
+        return lambda state, action: np.zeros((240, 320, 3), np.uint8)
+
+
+def clip_of_two_episodes() -> dict[str, Any]:
+    """A start and three steps, then a start and one step; the force is at the least, then at the most."""
+    x = np.array([0.5, 0.4, 0.3, 0.2, 1.0, 1.1])
+    state, episode = np.stack([x, 0 * x], -1), np.array([0, 0, 0, 0, 1, 1])
+    return {"state": state, "action": np.zeros((6, 1)), "episode": episode, "theta": np.array([[-1.0], [1.0]])}
+
+
+def test_a_pane_shows_what_was_earned_in_its_episode() -> None:
+    """Summed over its steps; when it is over, its last step goes on to be shown."""
+    pane = film.Pane(Seen(), "expert", clip_of_two_episodes())
+    rewards = np.exp(-np.square([0.4, 0.3, 0.2, 1.1]))
+    np.testing.assert_allclose(pane.earned, [0, *rewards[:3].cumsum(), 0, rewards[3]])
+    assert [pane.row(0, t) for t in (0, 3, 4)] == [(0, False), (3, False), (3, True)]
+    assert [pane.row(1, t) for t in (0, 1, 2)] == [(4, False), (5, False), (5, True)]
+
+
+def test_a_strip_has_each_episode_s_theta() -> None:
+    """The first lies at the lower end, the second at the upper end, each along its half of the strip."""
+    pane, draw = film.Pane(Seen(), "expert", clip_of_two_episodes()), Mock()
+    pane._strip(draw, 0, 100, 1, 0)
+    truths = [call.args[0] for call in draw.line.call_args_list if call.kwargs["fill"] == film.TRUTH]
+    low, high, left, right = 100 + film.STRIP - 8, 124, 8, film.WIDTH - 8
+    middle = (left + right) / 2
+    assert truths == [(left, low, middle, low), (middle, high, right, high)]
+
+
+def test_a_film_of_few_pictures_takes_as_long() -> None:
+    """Two episodes of 3 and 1 steps in pictures 2 steps apart: half as many a second."""
+    task = Seen()
+    whole, short = (film.film(task, {"expert": clip_of_two_episodes()}, most) for most in (100, 2))
+    assert (len(whole.pictures), whole.rate) == (4 + 2, film.frame_rate(task))
+    assert (len(short.pictures), short.rate) == (2 + 1, film.frame_rate(task) / 2)
+
+
+def test_thetas_that_a_probe_reads() -> None:
+    """Of two kinds a share, of three the likeliest; of a log-uniform latent its middle is the geometric mean."""
+    latents = (
+        envs.Latent("two", "", 5, 6, "categorical"),
+        envs.Latent("log", "", 1.0, 16.0, "loguniform"),
+        envs.Latent("three", "", 0, 2, "categorical"),
+    )
+    task: Any = SimpleNamespace(latents=latents)
+    features = np.array([[0.9, 0.1, 0.0, 0.1, 0.7, 0.2], [0.0, 1.0, 1.0, 0.6, 0.1, 0.3]])
+    np.testing.assert_allclose(film.decoded(task, features), [[5.1, 4.0, 1.0], [6.0, 16.0, 0.0]])
+
+
+def test_scores_by_episode(figures: list[Any], tmp_path: Path) -> None:
+    """Of a way of deploying an agent a dotted line in its method's colour; what is beyond training is shaded."""
+    about = {"method": "naive_rnn", "score": [0.1, 0.2], "score_beyond": [0.3]}
+    band = [[0.0, 0.2], [0.1, 0.3], [0.2, 0.4]]
+    methods = {
+        "naive_rnn": {**about, "deployment": "", "band": band},
+        "naive_rnn_mode": {**about, "deployment": "mode", "band": None},
+        "expert": {"method": "expert", "deployment": "", "score": [1.0, 1.0], "band": None},
+    }
+    run_report.adaptation({"task": "curling", "methods": methods}, tmp_path / "adaptation.png")
+    axes = figures[0].axes[0]
+    lines = {line.get_label(): line for line in axes.lines}
+    assert lines["naive_rnn"].get_xydata().tolist() == [[1, 0.1], [2, 0.2], [3, 0.3]]
+    assert [lines[name].get_linestyle() for name in methods] == ["-", ":", "--"]
+    assert lines["naive_rnn"].get_color() == lines["naive_rnn_mode"].get_color() != lines["expert"].get_color()
+    shaded = {(round(y, 9), int(x)) for x, y in axes.collections[0].get_paths()[0].vertices}
+    assert {(y, i + 1) for i, ends in enumerate(band) for y in ends} <= shaded
+    (beyond,) = axes.patches
+    assert (beyond.get_x(), beyond.get_width()) == (2.5, 1.0)
+
+
+def test_each_kind_of_loss_has_its_panel(figures: list[Any], tmp_path: Path) -> None:
+    """Other ways of deploying an agent have no training of their own, and so no line."""
+
+    def entry(method: str, deployment: str = "", **curve: list[float]) -> dict[str, Any]:
+        curves = {kind: {"update": [10, 20], "loss": losses} for kind, losses in curve.items()}
+        return {"method": method, "deployment": deployment, "curve": curves}
+
+    methods = {"a": entry("a", x=[1, 2], y=[3, 4]), "b": entry("b", y=[5, 6]), "a_mode": entry("a", "mode", y=[7, 8])}
+    run_report.learning({"methods": methods}, tmp_path / "learning.png")
+    shown = {
+        panel.get_title(): {line.get_label(): [*line.get_ydata()] for line in panel.lines} for panel in figures[0].axes
+    }
+    assert shown == {"x loss": {"a": [1, 2]}, "y loss": {"a": [3, 4], "b": [5, 6]}}
+
+
+def test_an_older_version_is_told_from_today_s() -> None:
+    task, method = envs.get("curling"), METHODS["naive_rnn"]
+    entry = {"method": "naive_rnn", "version": method.version - 1}
+    made = results.outdated(task, {"task_version": task.version - 1, "methods": {"naive_rnn": entry}})
+    assert made == [
+        f"the task v{task.version - 1} (now v{task.version})",
+        f"naive_rnn v{method.version - 1} (now v{method.version})",
+    ]
+    assert results.outdated(task, {"task_version": task.version, "methods": {}}) == []
+
+
+def test_returns_beside_the_authors_are_of_the_last_episode() -> None:
+    """A mean over seeds; a method that was not run here has an empty cell."""
+    made = {"dagger": {"return": [[1.0, 10.0], [3.0, 20.0]], "score_last": 0.7}}
+    rows = [
+        line.strip("| ").split(" | ")
+        for line in results.controls([(envs.get("ant_goal"), {"methods": made})]).splitlines()
+    ]
+    column, start = rows[0].index("dagger"), next(i for i, row in enumerate(rows) if row[0] == "ant_goal")
+    assert [row[column - bool(i)] for i, row in enumerate(rows[start : start + 3])] == ["-500", "15.00", "0.70"]
+
+
+@pytest.mark.parametrize(
+    ("name", "moved"),
+    [
+        ("loaded_drone", ["wind", "wind", "`body_pos` of load", "`body_pos` of load", "of front_left"]),
+        ("cheetah_speed", ["nothing"]),
+        ("curling", ["`tendon_frictionloss` of ice"]),
+    ],
+)
+def test_a_card_says_what_each_latent_moves(name: str, moved: list[str]) -> None:
+    """Each by itself, in the model or in what surrounds it."""
+    task = envs.get(name)
+    assert isinstance(task, envs.MujocoTask)
+    said = [cards._moved(task, i) for i in range(len(task.latents))]
+    assert all(text.endswith(right) for text, right in zip(said, moved, strict=True)), said
+    assert said[0] == moved[0]
+
+
 def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publish, "BROWSERS", ("no-such-browser",))
     says = r"^no browser was found; install one of no-such-browser$"
@@ -711,8 +903,8 @@ def test_a_clip_of_the_same_film_is_not_encoded_anew(tmp_path: Path) -> None:
     """Its mark says of which film it is; a copy is made only where that differs."""
     frames = np.zeros((6, 16, 16, 3), np.uint8)
     imageio.imwrite(tmp_path / "video.mp4", frames)
-    for name, film in (("one", "a"), ("two", "a"), ("three", "b")):
-        publish.clip(tmp_path / "video.mp4", tmp_path / f"{name}.webp", mark(film))
+    for name, made_of in (("one", "a"), ("two", "a"), ("three", "b")):
+        publish.clip(tmp_path / "video.mp4", tmp_path / f"{name}.webp", mark(made_of))
     one, two, three = ((tmp_path / f"{name}.webp") for name in ("one", "two", "three"))
     assert mark_of(one) == mark_of(two) == mark("a") != mark_of(three)
     before = one.stat().st_mtime_ns

@@ -13,6 +13,7 @@ from deconfounded.benchmarks.output.pictures import label, panels
 from deconfounded.benchmarks.studies import gap, noise, spectrum, validate
 from deconfounded.envs.task import ASSETS
 from deconfounded.experts import policy
+from tests.tools import dots
 
 PNG = b"\x89PNG"
 TIMES = ("0.25", "0.5", "1", "2", "4", "8")
@@ -62,6 +63,26 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
     assert (tmp_path / "spectrum.png").read_bytes().startswith(PNG)
 
 
+def test_scores_above_and_evidence_below(figures: list[Any], tmp_path: Path) -> None:
+    """Of one task: each method's mean, and both sources of evidence."""
+    points: list[dict[str, Any]] = []
+    for _, kind, factor, _ in spectrum.variants("icy_road"):
+        nats = {"dynamics": factor, "actions": 7 * factor}
+        scores = {name: [i + factor, i + factor + 0.2] for i, name in enumerate((*EXACT, *spectrum.LEARNED))}
+        about = {"certificate": {"evidence_nats_per_step": nats, "verdict": "passed"}, "scores": scores}
+        points.append({"task": "icy_road", "kind": kind, "factor": factor, **about})
+    spectrum.picture(points, tmp_path / "spectrum.png")
+    factors = [float(times) for times in TIMES]
+    above, below = figures[0].axes[0], figures[0].axes[2]
+    assert above.get_title() == "icy_road\nprocess noise"
+    for i, (name, line) in enumerate(zip((*EXACT, *spectrum.LEARNED), above.lines, strict=True)):
+        assert line.get_label() == name
+        np.testing.assert_allclose(line.get_xydata(), [(factor, i + factor + 0.1) for factor in factors])
+    for line, (source, by) in zip(below.lines, {"dynamics": 1, "actions": 7}.items(), strict=True):
+        assert line.get_label() == f"of {source}"
+        np.testing.assert_allclose(line.get_ydata(), by * np.array(factors))
+
+
 def test_what_the_certificate_predicted() -> None:
     """Of each point once: the least and the most that deconfounded is ahead; and that there is none."""
     points = [
@@ -99,6 +120,26 @@ def test_predicted_and_measured_gap(tmp_path: Path) -> None:
     assert gap.section(gaps[:2]) == ""
     gap.picture([(each.task.name, *each[1:]) for each in gaps], tmp_path / "gap.png")
     assert (tmp_path / "gap.png").read_bytes().startswith(PNG)
+
+
+def test_a_dot_is_at_its_predicted_and_measured_gap(figures: list[Any], tmp_path: Path) -> None:
+    """Across what was predicted, up what was measured; dots near the origin bear no name."""
+    gap.picture([("a", 0.6, 0.2), ("b", 0.03, 0.02)], tmp_path / "gap.png", "the diagnosis")
+    axes = figures[0].axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()[:8]) == ("predicted: the diagnosis", "measured")
+    assert dots(axes)[-2:] == [(0.6, 0.2), (0.03, 0.02)]
+    assert [(text.get_text(), text.xy[0]) for text in axes.texts] == [("a", 0.6)]
+
+
+def test_dots_of_validation(figures: list[Any], tmp_path: Path) -> None:
+    """Red where the certificate is passed, hollow where the thresholds were set without it."""
+    rows = [
+        {"case": case, "task": case, "certified": certified, "predicted": 0.5, "measured": 0.4}
+        for case, certified in (("bandit", True), (noise.title("icy_road", "process", 2), False))
+    ]
+    validate.picture(rows, tmp_path / "validation.png")
+    styles = [(line.get_color(), line.get_fillstyle()) for line in figures[0].axes[0].lines[-2:]]
+    assert styles == [("tab:red", "full"), ("tab:green", "none")]
 
 
 def test_validation_has_what_the_spectrum_found() -> None:

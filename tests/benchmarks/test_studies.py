@@ -6,14 +6,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import presets, scheduler
-from deconfounded.benchmarks.studies import latency, performance, runs, stepping, tune
+from deconfounded.benchmarks.studies import findings, latency, performance, runs, stepping, tune
+from deconfounded.envs.physics import cores
 from deconfounded.envs.tasks.bandit import Bandit
-from tests.tools import tiny_preset
+from tests.tools import dots, tiny_preset
 
 
 @pytest.mark.slow
@@ -56,6 +58,59 @@ def test_median_of_repeats_after_one_to_warm_up() -> None:
 
     assert stepping.seconds({"slow": slow, "fast": lambda: None}, lambda: now, 3) == {"slow": 2, "fast": 0}
     assert performance.power({1: 3.0, 2: 12.0, 4: 48.0}) == pytest.approx(2)
+
+
+def test_rates_are_in_control_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of runs that take 2 s: all environments' steps, and physics steps of all threads by those of a control step."""
+    task = envs.get("icy_stop")
+    assert isinstance(task, envs.MujocoTask)
+    assert task.substeps == 5
+    monkeypatch.setattr(stepping, "seconds", lambda runs: dict.fromkeys(runs, 2.0))
+    rates = stepping.measure(task, 3)
+    assert rates["closed_loop"] == rates["open_loop"] == 3 * task.horizon / 2
+    assert rates["sync_vector_env"] == 3 * task.horizon / 2  # no more steps than there are
+    assert rates["mj_step"] == 4000 * cores() / 5 / 2
+
+
+def test_panels_of_speed(figures: list[Any], tmp_path: Path) -> None:
+    """Closed loop over open loop, and microseconds of the closed one."""
+    rows = {"1": {"closed_loop": 1e4, "open_loop": 2e4}, "16": {"closed_loop": 1e5, "open_loop": 4e5}}
+    stepping.picture({"icy_stop": rows}, tmp_path / "speed.png")
+    left, right = figures[0].axes
+    assert dots(left) == [(1, 0.5), (16, 0.25)]
+    np.testing.assert_allclose(dots(right), [(1, 100), (16, 10)])
+
+
+def test_seconds_of_an_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a clock that advances 6 s from one report to the next, of three updates each; the first two warm up."""
+    clock = count()
+    monkeypatch.setattr(performance, "time", SimpleNamespace(perf_counter=lambda: 6.0 * next(clock)))
+
+    def fit(context: Any, method: str) -> None:
+        for done in (1, 2, 5, 8, 11):
+            context.monitor.update(done, 11, {"imitation": 0.0})
+
+    monkeypatch.setattr("deconfounded.benchmarks.engine.provider.fit", fit)
+    task = envs.get("bandit")
+    assert performance.update_seconds(task, tiny_preset(), "naive_rnn", 1) == {"imitation": 2.0}
+
+
+def test_a_share_of_the_updates() -> None:
+    """All else stays, and one update is left at least."""
+    config = {"updates": 100, "final_updates": 1, "width": 64, "rounds": 2}
+    assert performance.scaled(config, 0.25) == {**config, "updates": 25}
+
+
+def test_table_of_rates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rates of the closed loop, as a share of the open one, beside others', and how much slower 4096 are than 256."""
+    about = {"mj_step": 7000.0, "sync_vector_env": 800.0, "kib": 3.0}
+    by_size = {
+        n: {"closed_loop": rate, "open_loop": 2 * rate, **about}
+        for n, rate in (("64", 1e4), ("256", 3e4), ("4096", 2e4))
+    }
+    monkeypatch.setattr(findings, "kept", lambda name: {"tasks": {"curling": by_size}})
+    row = findings.rates().splitlines()[2].strip("| ").split(" | ")
+    assert row == ["curling", "10,000", "30,000", "20,000", "0.50", "0.50", "0.50", "7,000", "800", "1.50", "3"]
 
 
 def test_latency_is_in_milliseconds(monkeypatch: pytest.MonkeyPatch) -> None:

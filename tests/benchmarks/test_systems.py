@@ -26,6 +26,7 @@ from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts import datasets, policy
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.sb3 import Sb3VecEnv
+from tests.toys import Push
 
 ROOT = Path(__file__).parents[2]
 CONTROL = "slippery_cartpole"
@@ -263,6 +264,17 @@ class TestAsGymnasiumHasIt:
         for _ in range(horizon):
             infos = vec.step(action)[3]
         assert [info["episode"]["l"] for info in infos] == [horizon, horizon]
+
+    def test_time_limits_of_stable_baselines(self) -> None:
+        """An episode that ran out of time is told from one that ended, whose value is 0."""
+        vec, ended = Sb3VecEnv(Push(), 8, 0), list[tuple[bool, bool]]()
+        vec.reset()
+        for _ in range(3 * Push.horizon):
+            for info in vec.step(np.zeros((8, 1)))[3]:
+                if info:
+                    terminated = Push().terminated(info["terminal_observation"][None])[0]
+                    ended.append((bool(terminated), info["TimeLimit.truncated"]))
+        assert {*ended} == {(True, False), (False, True)}
 
 
 def test_a_checkout_without_symbolic_links(tmp_path: Path) -> None:

@@ -5,14 +5,19 @@ import json
 import re
 from functools import partialmethod
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import torch
 
 from deconfounded import envs
 from deconfounded.benchmarks import diagnose as command
 from deconfounded.benchmarks.console import run_command
-from deconfounded.deconf.diagnosis import advice, diagnose, measures
+from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.diagnosis import advice, diagnose, learned_env, measures
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
@@ -304,6 +309,39 @@ def test_measures(make) -> None:
     alone = measures.measure(expert, None, TINY, np.random.default_rng(0))
     assert {getattr(alone, name) for name in ALONE} == {None}
     assert np.isfinite([alone.memory_gain, alone.stakes, alone.naive, alone.latent]).all()
+
+
+def test_figures_of_rollouts() -> None:
+    """A naive clone goes where a wrong latent leads, and errs by three quarters as much; the other imitator is right.
+
+    Episodes of the expert itself end after 5 of 10 steps.
+    """
+    noise, made = np.random.default_rng(0), list[Any]()
+
+    class Env:
+        def __init__(self, right: Any) -> None:
+            self.right = right
+
+        def rollout(self, actor: Any, rngs: Any) -> learned_env.Rollout:
+            made.append(actor)
+            kind = type(actor).__name__
+            wrong = kind == "AgentActor" or (kind == "LatentPolicy" and actor is not self.right)
+            error = {"AgentActor": 0.75, "PosteriorSampler": 0.25}.get(kind, float(wrong))
+            paths = torch.tensor(noise.normal(5 * wrong, 1, (1, 64, 10, 1)), dtype=torch.float32)
+            return learned_env.Rollout(torch.tensor([error]), paths, torch.full((1, 64), 5.0))
+
+    explanation: Any = SimpleNamespace(latents=torch.linspace(-1, 1, 8)[None, :, None], dynamics=None, policy=None)
+    episodes = Batch.of(
+        Trials(noise.normal(size=(64, 1, 11, 1)), np.zeros((64, 1, 10, 1)), np.ones((64, 1, 10), bool)), 1
+    )
+    make: Any = Env
+    figures = measures._rollouts(explanation, make, Mock(), episodes, TINY, [np.random.default_rng(0)])
+    stakes, paired_stakes, unlike, length, naive, inferring, *by_actions = figures
+    assert min(stakes, paired_stakes) > 2
+    assert unlike < 2
+    assert length == 0.5
+    assert (naive, inferring) == pytest.approx((0, 1), abs=0.1)
+    assert by_actions == pytest.approx([0.25, 0.75])
 
 
 @pytest.mark.slow

@@ -79,6 +79,18 @@ def test_even_steps_predict_odd_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not odd[..., ::2].any()
 
 
+@pytest.mark.parametrize(("per_theta", "nats"), [(2, 1.0), (1, 0.5)])
+def test_evidence_is_against_a_trial_under_another_theta(per_theta: int, nats: float) -> None:
+    """Pairs of trials share a latent, 0 or 1; a wrong one costs a nat a step, and two trials before it is wrong."""
+    latents = torch.tensor([0.0, 0, 1, 1]).repeat(4)[None, :, None]
+    batch = Batch.of(world(0.2, False, 16, 0), 1)
+
+    def log_prob(data: Batch, given: torch.Tensor) -> torch.Tensor:
+        return -(given - latents[:, :, None]).square()[..., 0]
+
+    assert latent._evidence(log_prob, batch, latents, per_theta) == nats
+
+
 @pytest.mark.slow
 def test_how_much_trials_and_episodes_differ() -> None:
     """theta lasts for a trial, for an episode, or is in no dynamics; and of a few trials nobody knows."""

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -199,6 +200,19 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert set(odd(remarks)) - {"repeat"} == kinds
     assert words in said(remarks, kind)
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
+
+
+def test_amounts_in_remarks_are_those_of_the_data() -> None:
+    """The steps with a code, the share of actions at an end of the range, and how long what lasts takes to halve."""
+    coded = with_codes(driven())
+    count = int((coded.obs[:, :, :-1, 2] == -9999).sum())
+    assert f"observation 2 is -9999 in {count:,} steps" in said(look(coded), "code")
+    action = np.where(np.arange(T) % 4 == 0, 1.0, 0.2)[:, None] * np.ones((B, E, T, 1))
+    assert "(25% at an end of the range)" in said(look(changed(driven(), action=action)), "range")
+    text = said(look(driven(0.95, 0.3)), "lasting")
+    lasts = re.search(r"step to step is (0\.\d+), so that it halves in (\d+) steps", text)
+    assert lasts is not None
+    assert float(lasts[1]) ** int(lasts[2]) == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize(

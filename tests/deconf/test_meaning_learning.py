@@ -174,6 +174,12 @@ def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
     assert rates[-1] == pytest.approx(0, abs=1e-9)
 
 
+def test_later_rounds_get_more_updates() -> None:
+    """In proportion to the labels that there are; at least one."""
+    assert dagger_method.by_round(100, 4) == [10, 20, 30, 40]
+    assert dagger_method.by_round(2, 3) == [1, 1, 1]
+
+
 def test_dagger_learns_what_the_expert_would_have_done(monkeypatch: pytest.MonkeyPatch) -> None:
     """Roll-outs whose actions are .5, and labels of -.5: the loss is of the labels, evidence of the actions."""
     seen: list[tuple[Tensor, Tensor]] = []

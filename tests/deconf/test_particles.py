@@ -235,3 +235,16 @@ def test_discrete_actions_and_a_latent_that_is_not_categorical() -> None:
     assert settings.configs["interventional"] == {"grid": 0}
     agent = fit(Context(task, replace(settings, eval_trials=4), (0,), Monitor()), "interventional")
     assert len(agent.grid.theta) == 21
+
+
+@pytest.mark.parametrize(("static", "share"), [(False, 1 - 0.9**4), (True, 0.0)])
+def test_particles_switch_in_the_steps_that_an_early_end_left_out(static: bool, share: float) -> None:
+    """Of an episode of seven steps three took place: one particle in ten moves in each of the other four."""
+    env = envs.BatchEnv(Switch(), N)
+    belief = Particles(env, expert(env.task), conditional=False, static=static)
+    belief.begin(N)
+    belief.reset(Streams([np.random.default_rng(0)]))
+    belief._set(np.arange(N), np.full((N, FEW, 1), 0.3))
+    belief._steps = 3
+    belief.reset(Streams([np.random.default_rng(1)]))
+    assert (belief._u != 0.3).mean() == pytest.approx(share, abs=0.03)

@@ -19,6 +19,7 @@ from deconfounded.envs.blackbox import BlackBox, task_of
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.streams import Array, Mask
+from deconfounded.envs.world import DrawnLatent
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
@@ -260,10 +261,11 @@ class TestErrors:
 
 def test_noise_is_of_trials_that_the_mean_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its covariance, and the exponent too."""
-    used, original = list[Mask](), learned_reference.steps
+    used, given, original = list[Mask](), list[list[Rollout]](), learned_reference.steps
 
     def steps(rollouts: list[Rollout], which: Mask) -> tuple[Array, Array, Array, Array]:
         used.append(which)
+        given.append(rollouts)
         return original(rollouts, which)
 
     monkeypatch.setattr(learned_reference, "steps", steps)
@@ -273,6 +275,16 @@ def test_noise_is_of_trials_that_the_mean_was_not_fitted_to(monkeypatch: pytest.
     assert fitted.sum() == 48
     assert len(held_out) > 1
     assert not any((fitted & which).any() for which in held_out)
+    assert len(given[0]) == 3
+    assert len({*np.concatenate([rollout.theta[:, 0, 0] for rollout in given[0]])}) == 3 * 64, "fresh thetas in each"
+
+
+def test_quantiles_of_draws() -> None:
+    """The share of draws below, and half of those that are equal: of 0, 0, 1 and 2."""
+    latent = DrawnLatent("x", "", 0.0, 2.0, values=(0.0, 0.0, 1.0, 2.0))
+    np.testing.assert_allclose(latent.cdf(np.array([0.0, 1.0, 2.0])), [2 / 8, 5 / 8, 7 / 8])
+    np.testing.assert_array_equal(latent.ppf(np.array([0.0, 0.49, 0.5, 0.99])), [0, 0, 1, 2])
+    np.testing.assert_array_equal(latent.ppf(latent.cdf(np.array([0.0, 1.0, 2.0]))), [0, 1, 2])
 
 
 def test_a_clock_is_no_dynamics() -> None:

@@ -229,6 +229,25 @@ def test_a_weak_leg_gets_larger_commands() -> None:
         np.testing.assert_allclose(task.expert_mean(obs, theta), expected)
 
 
+def test_bearings_point_to_the_goal() -> None:
+    """Without noise: from half a metre ahead, of a goal a metre to the left of there, and of one 1.5 m behind."""
+    task = envs.get("ant_goal")
+    assert isinstance(task, MujocoTask)
+    place = np.array([[0.5, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]] * 2)
+    state, goals = task.state(root=(place, 0)), np.array([[0.5, 1.0], [-1.0, 0.0]])
+    seen = task.observe(task.sense(state, goals, np.zeros((2, 3))))[:, -3:]
+    np.testing.assert_allclose(seen, [[1.0, 0.0, 1.0], [1.5, -1.0, 0.0]], atol=1e-9)
+
+
+def test_a_push_of_a_stone_costs_a_little() -> None:
+    """A thousandth at full strength, by its square, and nothing at none."""
+    task = envs.get("curling")
+    assert isinstance(task, MujocoTask)
+    moving = task.state(slide=([-2.0] * 3, 1.0))
+    made = task.reward(moving, np.array([[1.0], [0.0], [-1.0]]), moving, np.full((3, 1), 0.05))
+    np.testing.assert_allclose(made, [-0.001, -0.00025, 0], atol=1e-12)
+
+
 def test_a_stone_is_worth_most_at_the_tee() -> None:
     """At rest 7 m past the hog line it is worth 1, and 1.7 m off exp(-.5); before the hog line nothing."""
     task = envs.get("curling")

@@ -18,6 +18,7 @@ from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets
 from deconfounded.experts.datasets.table import Odd
+from deconfounded.experts.datasets.tabular import parquet_columns
 from deconfounded.experts.datasets.units import RawAgent, Units
 from deconfounded.experts.trials import Trials
 
@@ -331,6 +332,16 @@ class TestNames:
         columns["stamp"] = [2**62 + i for i in range(len(made))]
         log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), trial="run", obs=["x"], action=["u"])
         assert log.names == tuple(map(str, names))
+
+    @pytest.mark.parametrize(("unit", "per_second"), [("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)])
+    def test_times_are_in_seconds(self, unit: str, per_second: int, tmp_path: Path) -> None:
+        """From the first of a file on, and durations from their least, whatever unit they are kept in."""
+        pyarrow = pytest.importorskip("pyarrow")
+        ticks = [per_second * second for second in (10, 12, 15)]
+        kinds = pyarrow.timestamp(unit), pyarrow.duration(unit)
+        columns = {name: pyarrow.array(ticks, kind) for name, kind in zip(("at", "took"), kinds, strict=True)}
+        read = parquet_columns(write_parquet(tmp_path / "times.parquet", columns))
+        assert {name: x.tolist() for name, x in read.items()} == {"at": [0, 2, 5], "took": [0, 2, 5]}
 
     def test_times_of_several_files(self, tmp_path: Path) -> None:
         """A trial that is named by when it began: times are not counted from each file's own first."""
