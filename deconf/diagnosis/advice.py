@@ -1,6 +1,9 @@
 """What a diagnosis says: verdicts and their headlines, what a wrong verdict would look like, and what to do next."""
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
+
+from deconfounded.deconf.diagnosis.remark import listed
 
 Verdict = Literal["confounded", "not confounded", "nothing at stake", "cannot tell"]
 HEADLINES: dict[Verdict, str] = {
@@ -49,10 +52,22 @@ CLONE = Next(
 )
 CLONE_HABITS = Next(
     "Clone the expert. A memory of past actions copies pauses, noise and habits too; cut out of the logs what you do"
-    " not want copied. Clone without a memory, by the printed lines, only if your columns show all that the expert acts"
-    " on at a moment, speeds too.",
+    " not want copied. A clone without a memory (the printed lines) copies none of them, if your columns show all that"
+    " the expert acts on at a moment, speeds too.",
     "memoryless_bc.train(trials, memoryless_bc.MemorylessConfig(), np.random.default_rng(0))",
 )
+
+
+def clone_with_memory(columns: Sequence[str]) -> Next:
+    """Advice where a clone without a memory lacks a part of the state, on which these columns depend."""
+    advice = (
+        f"Clone the expert, with a memory: what your system does next ({listed(columns)}) depends on the step before"
+        " too, as where a speed is not observed, or actions take effect late. A clone without a memory knows nothing of"
+        " that. A memory copies pauses, noise and habits too; cut out of the logs what you do not want copied."
+    )
+    return Next(advice, CLONE.fit)
+
+
 EXPLORE = Next(
     "Explore by a policy that does not see what is hidden, and learn from what the world answers (Tier 2, Algorithm 1)."
     " The printed lines learn from your log of exploration alone; trials in which the agent itself acts do better.",

@@ -1,4 +1,4 @@
-"""What is odd about single columns: heavy tails, codes for missing values, angles that wrap, labels of trials."""
+"""What is odd about single columns: tails, codes for missing values, angles that wrap, two units, labels of trials."""
 
 from collections.abc import Iterator
 
@@ -11,6 +11,7 @@ from deconfounded.experts.datasets.logs import Log
 
 HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
 CODES = {sign * (10**digits - 1.0) for digits in range(2, 8) for sign in (-1, 1)} | {-32768.0, 32767.0, 65535.0}
+UNITS, APART, FEWEST = 20.0, 5.0, 3  # times as widely spread; from the nearest of the others; trials of each unit
 TURNS, CLOSE, JUMPS = (2 * np.pi, 360.0), 0.05, 3  # of angles; share by which a range may differ; times that it jumps
 
 
@@ -58,6 +59,29 @@ def angles(log: Log, steps: Steps) -> Iterator[Remark]:
                 " a fast motion; give its sine and cosine in its place."
             )
             yield Remark("angle", text, True)
+
+
+def units(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Columns that are spread far more widely in some trials than in all others, as where they are in another unit."""
+    columns = zip(log.units.obs + log.units.action, [*steps.obs.T, *steps.action.T], strict=True)
+    for name, x in columns if not log.actions else zip(log.units.obs, steps.obs.T, strict=True):
+        variance = fits.by_trial(x**2, steps.trial, len(log)) - fits.by_trial(x, steps.trial, len(log)) ** 2
+        spread = np.sqrt(variance.clip(0))
+        order = np.argsort(spread)
+        order = order[spread[order] > 1e-6 * max(float(x.std()), 1e-12)]  # in the others it does not move
+        if len(order) < 2 * FEWEST:
+            continue
+        apart = spread[order[1:]] / spread[order[:-1]]
+        groups = np.split(order, [int(apart.argmax()) + 1])
+        few = min(groups, key=len)
+        ratio = float(np.median(spread[groups[1]]) / np.median(spread[groups[0]]))
+        if len(few) >= FEWEST and apart.max() >= APART and ratio >= UNITS:
+            more = "more" if few is groups[1] else "less"
+            text = (
+                f"{name} varies {ratio:.0f} times {more} in {len(few)} of {len(order)} trials than in the others:"
+                f" another unit? These are {listed([log.names[i] for i in np.sort(few)])}."
+            )
+            yield Remark("unit", text, True)
 
 
 def of_trials(log: Log) -> Iterator[Remark]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deconfounded.deconf.core.data import Batch
-from deconfounded.deconf.diagnosis import fits, labels
+from deconfounded.deconf.diagnosis import fits, labels, state
 from deconfounded.deconf.diagnosis.held_out import Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import in_range
@@ -47,7 +47,7 @@ def diagnose(
 
     for generator in rng.spawn(config.refits):
         refits.append(measure(trials, explore, config.amounts, generator, part))
-    return judge(refits, None if explore is None else len(explore), labels.named(trials, explore))
+    return judge(refits, None if explore is None else len(explore), labels.named(trials, explore), state.named(explore))
 
 
 def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> None:

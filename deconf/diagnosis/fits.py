@@ -85,19 +85,21 @@ def copies(trials: Trials) -> tuple[list[list[int]], ...]:
     return tuple([numbers for numbers in by_hash.values() if len(numbers) > 1] for by_hash in groups)
 
 
-def _standard(x: Array) -> Array:
+def standardised(x: Array) -> Array:
+    """Columns [N, F] with mean 0 and standard deviation 1; 0 where a column hardly varies."""
     std, rounding = x.std(0), 1e-9 * np.abs(x).max(0, initial=0)  # of a column that hardly varies
     return (x - x.mean(0)) / np.where(std > rounding, std, np.inf)
 
 
 def features(x: Array) -> Array:
     """Standardised columns [N, F], and their products where columns are few."""
-    x = _standard(x)
+    x = standardised(x)
     pairs = combinations_with_replacement(range(x.shape[1]), 2) if x.shape[1] <= FEW else ()
     return np.stack([*x.T, *(x[:, i] * x[:, j] for i, j in pairs)], 1)
 
 
-def _one_hot(action: Array, n_actions: int) -> Array:
+def one_hot(action: Array, n_actions: int) -> Array:
+    """Actions [..., A]; those of n_actions discrete ones as zeros and a one [..., n_actions - 1]."""
     return np.eye(n_actions)[action[..., 0].astype(int)][..., 1:] if n_actions else action
 
 
@@ -107,11 +109,11 @@ def residual(y: Array, x: Array, trial: Numbers) -> tuple[Array, bool]:
     own = float(np.median(np.bincount(trial, minlength=count))) >= ENOUGH * (x.shape[1] + 1)
     centred = [np.stack([c - by_trial(c, trial, count)[trial] for c in part.T], 1) for part in (y, x)]
     if not own:
-        return centred[0] - centred[1] @ _solved(centred[1], centred[0]), False
+        return centred[0] - centred[1] @ ridge(centred[1], centred[0]), False
     left = centred[0].copy()
     for rows in _by_trial(trial):
         if len(rows) > x.shape[1] + 1:
-            left[rows] -= centred[1][rows] @ _solved(centred[1][rows], centred[0][rows])
+            left[rows] -= centred[1][rows] @ ridge(centred[1][rows], centred[0][rows])
             left[rows] *= np.sqrt(len(rows) / (len(rows) - x.shape[1] - 1))
     return left, True
 
@@ -120,7 +122,7 @@ def unexplained(y: Array, x: Array, trial: Numbers) -> float:
     """The share of the variance of y, within trials, that is left."""
     count = int(trial.max()) + 1
     total = sum(float(((c - by_trial(c, trial, count)[trial]) ** 2).sum()) for c in y.T)
-    return float((residual(y, _standard(x), trial)[0] ** 2).sum()) / max(total, 1e-12)
+    return float((residual(y, standardised(x), trial)[0] ** 2).sum()) / max(total, 1e-12)
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Window:
         valid[:, :, most:] = trials.mask[:, :, most:]
         b, e, t = np.nonzero(valid)
         obs = {lag: trials.obs[b, e, t - lag].astype(float) for lag in range(-1, most + 1)} if length > most else {}
-        return Window(obs, _one_hot(trials.action[b, e, t].astype(float), trials.actions), b)
+        return Window(obs, one_hot(trials.action[b, e, t].astype(float), trials.actions), b)
 
     def __len__(self) -> int:
         return len(self.action)
@@ -155,8 +157,8 @@ def lasting(trials: Trials, steps: Steps) -> tuple[float, float, float] | None:
     The third is the correlation with what is left at the most alike observation of another time: of a poor fit it is
     high, of noise low. None where trials are too short for fits of their own, which take a latent out.
     """
-    action = _one_hot(steps.action, trials.actions)
-    inputs = _standard(steps.obs)
+    action = one_hot(steps.action, trials.actions)
+    inputs = standardised(steps.obs)
     rest = action - smooth(inputs.clip(-CLIP, CLIP), action)
     for x in (features(steps.obs), inputs):
         left, own = residual(rest, x, steps.trial)
@@ -194,9 +196,9 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     count = len(trials)
     if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
         return None
-    action = _one_hot(steps.action, trials.actions)
-    change, inputs = steps.then - steps.obs, _standard(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
-    basis = _basis(inputs, FINE)
+    action = one_hot(steps.action, trials.actions)
+    change, inputs = steps.then - steps.obs, standardised(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
+    basis = random_features(inputs, FINE)
     left = change - basis @ _fitted(basis, change)
     unit = 1.48 * np.median(np.abs(left), 0)
     kept = np.flatnonzero(unit > 1e-4 * np.maximum(change.std(0), 1e-9))
@@ -267,11 +269,11 @@ def trial_means(basis: Array, y: Array, trial: Numbers, follows: NDArray[np.bool
 
 def smooth(x: Array, y: Array) -> Array:
     """A smooth function of standardised x [N, F], fitted to y [N, K] in all trials: ridge on random features."""
-    basis = _basis(x, HIDDEN)
+    basis = random_features(x, HIDDEN)
     return basis @ _fitted(basis, y)
 
 
-def _basis(x: Array, count: int) -> Array:
+def random_features(x: Array, count: int) -> Array:
     """Standardised x [N, F], their squares, and `count` random features."""
     rng = np.random.default_rng(0)
     weight = rng.standard_normal((x.shape[1], count)) * rng.choice([0.3, 1.0], count) / x.shape[1] ** 0.25
@@ -282,12 +284,12 @@ def _basis(x: Array, count: int) -> Array:
 def _fitted(basis: Array, y: Array) -> Array:
     """Coefficients of a fit to some of the steps."""
     part = np.random.default_rng(0).permutation(len(y))[:FITTED]
-    return _solved(basis[part], y[part], RIDGE)
+    return ridge(basis[part], y[part], RIDGE)
 
 
-def _solved(x: Array, y: Array, ridge: float = 1e-9) -> Array:
+def ridge(x: Array, y: Array, penalty: float = 1e-9) -> Array:
     """Coefficients [F, K] of a linear fit of y [N, K] by x [N, F]."""
-    return np.asarray(np.linalg.solve(x.T @ x + ridge * len(x) * np.eye(x.shape[1]), x.T @ y), float)
+    return np.asarray(np.linalg.solve(x.T @ x + penalty * len(x) * np.eye(x.shape[1]), x.T @ y), float)
 
 
 def _by_trial(trial: Numbers) -> list[Numbers]:

@@ -17,6 +17,7 @@ from deconfounded.deconf.diagnosis.advice import (
     VARY_LATENT,
     Next,
     Verdict,
+    clone_with_memory,
 )
 from deconfounded.deconf.diagnosis.measures import Findings
 from deconfounded.deconf.diagnosis.thresholds import (
@@ -38,18 +39,26 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure, with_tier
 from deconfounded.envs.support.errors import InputError
 
 
-def judge(refits: Sequence[Findings], explored: int | None = None, labels: Sequence[str] = ()) -> Diagnosis:
+def judge(
+    refits: Sequence[Findings],
+    explored: int | None = None,
+    labels: Sequence[str] = (),
+    incomplete: Sequence[str] = (),
+) -> Diagnosis:
     """The verdict, and why. It cannot tell where less than half of the refits, judged alone, lead to the same tier.
 
     That is, both "not confounded" and "nothing at stake" say that a clone loses nothing. explored: trials of
-    exploration. labels: observations that show how trials differ in their dynamics, see `labels.py`. Raises InputError
-    if a figure is not finite.
+    exploration. labels: observations that show how trials differ in their dynamics, see `labels.py`. incomplete: those
+    that depend on more than columns show, see `state.py`; they decide what to clone with, and no verdict. Raises
+    InputError if a figure is not finite.
     """
     diagnosis = _judge(refits, explored, labels)
     alone = [_judge([refit], explored, labels) for refit in refits]
     if diagnosis.tier is not None and 2 * sum(split.tier == diagnosis.tier for split in alone) < len(refits):
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
+    if diagnosis.next is CLONE_HABITS and incomplete and _alike(diagnosis.figures):
+        diagnosis = replace(diagnosis, next=clone_with_memory(incomplete))
     dissent = [split for split in alone if split.tier != diagnosis.tier]
     dissenting = dict.fromkeys(with_tier(split.verdict, split.tier) for split in dissent)
     return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(dissenting))
@@ -72,12 +81,17 @@ def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
     return figures
 
 
+def _alike(figures: dict[str, Figure]) -> bool:
+    """Whether trials do not differ in their dynamics: what a latent explains is then where a trial went."""
+    differ = figures.get("dynamics_differ")
+    return differ is not None and differ.high == 0
+
+
 def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[str]) -> Diagnosis:
     figures = _figures(refits)
     names = ("memory_gain", "stakes", "paired_stakes", "model_deviation", "naive", "latent", "gap", "gap_by_actions")
     memory, stakes, paired, model, naive, latent, gap, by_actions = (figures[name] for name in names)
-    in_exploration, differ = figures.get("exploration_evidence"), figures.get("dynamics_differ")
-    alike = differ is not None and differ.high == 0  # what a latent explains is then where a trial went
+    in_exploration, alike = figures.get("exploration_evidence"), _alike(figures)
     at_stake = any(figure.value >= STAKES and figure.low > 1 for figure in (stakes, paired))
     harmless = max(stakes.high, paired.high) < STAKES and model.value < MAX_MODEL_DEVIATION
     reasons = [

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.deconf.diagnosis import columns, fits, labels
+from deconfounded.deconf.diagnosis import columns, fits, labels, state
 from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.deconf.diagnosis.remark import LISTED, Remark, listed
 from deconfounded.experts.datasets.logs import Log
@@ -45,6 +45,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
         _states,
         columns.extremes,
         columns.angles,
+        columns.units,
         *[_repeats] * (not blind),
     ):
         remarks += describe(log, steps)
@@ -269,6 +270,11 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
             "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
             " what its actions do."
         )
+        if unshown := [names[i] for i in state.incomplete(trials)]:
+            text += (
+                f" But what comes next ({listed(unshown)}) depends on the step before too, as where a speed is not"
+                " observed, or actions take effect late: a clone needs a memory, or that speed as a column."
+            )
     else:
         text = (
             "No difference in dynamics is seen between trials. The expert's actions can hide one, as they make up for"

@@ -26,9 +26,19 @@ def error_line(error: BaseException) -> str:
         return text
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
-    frames = traceback.extract_tb(error.__traceback__)
-    frame = ([frame for frame in frames if _is_users(frame.filename)] or frames)[-1]
-    return f"{text} ({type(error).__name__}, {Path(frame.filename).name}:{frame.lineno})"
+    return (
+        f"{text} ({type(error).__name__}, {users_line(error) or _line(traceback.extract_tb(error.__traceback__)[-1])})"
+    )
+
+
+def users_line(error: BaseException) -> str:
+    """The innermost line of the user's own files that an error went through, file.py:12; "" if there is none."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_users(frame.filename)]
+    return _line(frames[-1]) if frames else ""
+
+
+def _line(frame: traceback.FrameSummary) -> str:
+    return f"{Path(frame.filename).name}:{frame.lineno}"
 
 
 def _is_users(name: str) -> bool:

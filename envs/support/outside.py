@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from deconfounded.envs.support.errors import InputError, error_line
+from deconfounded.envs.support.errors import InputError, error_line, users_line
 
 SENT = "DECONFOUNDED_OUTSIDE"  # environment variable of a cluster worker: the folder that plug-in files were sent to
 PREFIX = "outside_"  # of the module names of plug-in files
@@ -34,12 +34,14 @@ def find(kind: str, reference: str) -> Any:
         raise InputError(f"{kind} {reference!r}: there is no file {where}")
     try:
         module = _run(here(Path(where))) if where.endswith(".py") else importlib.import_module(where)
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(f"{error} ({line})" if (line := users_line(error)) else str(error)) from error
     except (Exception, SystemExit) as error:
         raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
     if not hasattr(module, name):
-        names = [key for key in vars(module) if not key.startswith("_")]
+        public = {key: value for key, value in vars(module).items() if not key.startswith("_")}
+        own = [key for key, value in public.items() if getattr(value, "__module__", "") == module.__name__]
+        names = own or [*public]  # else what it imports, which may be meant
         raise InputError(f"{kind} {reference!r}: {where} has no {name!r}; it has {', '.join(names)}")
     return getattr(module, name)
 

@@ -430,9 +430,3 @@ def test_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
 def _tiny_init(self: DiagnoseConfig, refits: int = 2) -> None:
     for key, value in {"refits": refits, "least": 24, "amounts": TINY}.items():
         object.__setattr__(self, key, value)
-
-
-def test_a_clone_without_a_memory_needs_speeds() -> None:
-    """A cart whose speed no column shows looks like noise that lasts; a memoryless clone of its driver oscillates."""
-    assert "speed or another state that no column shows" in advice.PASSING
-    assert "only if your columns show all that the expert acts on at a moment, speeds too" in advice.CLONE_HABITS.advice

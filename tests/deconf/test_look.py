@@ -137,6 +137,13 @@ def with_a_heading(trials: Trials) -> Trials:
     return more(trials, turned % 360)
 
 
+def with_two_units(trials: Trials) -> Trials:
+    """Every third trial has its first observation in another unit."""
+    obs = trials.obs.copy()
+    obs[::3, ..., 0] *= 57.3
+    return changed(trials, obs=obs)
+
+
 def with_a_label(trials: Trials) -> Trials:
     return more(trials, np.broadcast_to(np.arange(B)[:, None, None] % 2, (B, E, T + 1)))
 
@@ -181,6 +188,12 @@ PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a
     "tails": (lambda: with_heavy_tails(driven()), {"tails"}, "tails", "arcsinh((observation 2 - "),
     "code": (lambda: with_codes(driven()), {"code"}, "code", "observation 2 is -9999 in "),
     "angle": (lambda: with_a_heading(driven()), {"angle"}, "angle", "observation 2 jumps by about 360 in "),
+    "units": (
+        lambda: with_two_units(driven()),
+        {"unit", "outlier"},
+        "unit",
+        f"times more in 16 of {B} trials than in the others: another unit? These are 0, 3, 6",
+    ),
     "label": (
         lambda: with_a_label(driven()),
         {"label"},
@@ -213,6 +226,16 @@ def test_amounts_in_remarks_are_those_of_the_data() -> None:
     lasts = re.search(r"step to step is (0\.\d+), so that it halves in (\d+) steps", text)
     assert lasts is not None
     assert float(lasts[1]) ** int(lasts[2]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_units_of_actions_and_what_is_no_other_unit() -> None:
+    """A latent may change how widely trials vary, by a few times; some trials may be at rest."""
+    action, obs = driven().action.copy(), driven().obs.copy()
+    action[::2] *= 0.01
+    assert "action 0 varies" in said(look(changed(driven(), action=action)), "unit")
+    obs[..., 0] *= np.where(np.arange(B) % 2, 1, 10.0)[:, None, None]
+    obs[::4, ..., 1] = 0.5
+    assert "unit" not in odd(look(changed(driven(), obs=obs)))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,74 @@
+"""Whether observations show the whole state: a speed that is not logged, an action that acts late."""
+
+import numpy as np
+import pytest
+
+from deconfounded.deconf.diagnosis import advice, state
+from deconfounded.deconf.diagnosis.judgement import judge
+from deconfounded.deconf.diagnosis.look import look
+from deconfounded.experts.trials import Trials
+from tests.deconf.test_diagnose import CLEAR, SILENT
+from tests.deconf.test_lookalikes import world
+
+
+def cart(speed: bool, late: bool = False, discrete: bool = False) -> Trials:
+    """Random pushes of a cart; speed: whether it is observed; late: pushes act a step later."""
+    rng, b, steps = np.random.default_rng(0), 64, 40
+    pushes = rng.integers(0, 3, (b, steps)) - 1.0 if discrete else rng.uniform(-1, 1, (b, steps))
+    path, v = np.zeros((b, 1, steps + 1, 2)), np.zeros(b)
+    for t in range(steps):
+        push = pushes[:, t - 1] * (t > 0) if late else pushes[:, t]
+        v = 0.9 * v + 0.2 * push + 0.05 * rng.standard_normal(b)
+        path[:, 0, t + 1] = np.stack([0.9 * path[:, 0, t, 0] + v + 0.05 * rng.standard_normal(b), v], 1)
+    obs = path if speed else path[..., :1]
+    action = pushes[:, None, :, None] + discrete
+    return Trials(obs, action, np.ones((b, 1, steps), bool), 3 if discrete else 0)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_a_speed_that_is_not_observed(discrete: bool) -> None:
+    assert state.incomplete(cart(speed=False, discrete=discrete)) == [0]
+    assert state.incomplete(cart(speed=True, discrete=discrete)) == []
+
+
+def test_an_action_that_acts_late() -> None:
+    assert 1 in state.incomplete(cart(speed=True, late=True))
+
+
+@pytest.mark.parametrize("kind", ["ar1", "memory", "pause", "habits", "idle"])
+def test_what_experts_do_is_no_state_of_the_world(kind: str) -> None:
+    assert state.incomplete(world(kind, 96, 1, explores=True)) == []
+
+
+def test_too_little_to_say() -> None:
+    trials = cart(speed=False)
+    assert state.incomplete(Trials(trials.obs[:12], trials.action[:12], trials.mask[:12])) == []
+    assert state.named(None) == []
+
+
+def test_steps_that_did_not_take_place_do_not_count() -> None:
+    trials = cart(speed=False)
+    mask = trials.mask.copy()
+    mask[:, :, 20:] = False
+    obs = trials.obs.copy()
+    obs[:, :, 21:] = 1e6
+    assert state.incomplete(Trials(obs, trials.action, mask)) == [0]
+
+
+def test_a_clone_without_a_memory_is_not_advised_there() -> None:
+    """Only where trials do not differ in their dynamics: the step before tells of a latent too."""
+    habits = [CLEAR._replace(**{**SILENT, "trait_gain": 0.05})] * 3
+    assert judge(habits).next is advice.CLONE_HABITS
+    advised = judge(habits, incomplete=["y"])
+    assert (advised.verdict, advised.tier) == ("nothing at stake", 1)
+    assert advised.next.fit == advice.CLONE.fit
+    assert "(y) depends on the step before" in advised.next.advice
+    passing = [CLEAR._replace(naive=0.98, latent=1.0)] * 3
+    assert judge(passing, incomplete=["y"]).next is advice.CLONE_HABITS
+    assert judge([CLEAR] * 3, incomplete=["y"]).next is advice.EXPLORE
+
+
+def test_a_look_at_exploration_says_so() -> None:
+    for speed in (False, True):
+        [remark] = [remark for remark in look(cart(speed), blind=True) if remark.kind == "dynamics"]
+        assert ("(observation 0) depends on the step before" in remark.text) is not speed
