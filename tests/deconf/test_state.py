@@ -47,12 +47,28 @@ def test_too_little_to_say() -> None:
 
 
 def test_steps_that_did_not_take_place_do_not_count() -> None:
+    """What stands there goes back and forth, which the step before would tell."""
+    trials = cart(speed=True)
+    mask, obs = trials.mask.copy(), trials.obs.copy()
+    mask[:, :, 25:] = False
+    obs[:, :, 26:] = obs[:, :, 10:25]
+    obs[:, :, 26::2] *= -1
+    assert state.incomplete(Trials(obs, trials.action, mask)) == []
+
+
+def test_the_step_before_adds_to_the_present() -> None:
+    """Most of the motion is a smooth function of the present push; of what it leaves the speed is a large part."""
     trials = cart(speed=False)
-    mask = trials.mask.copy()
-    mask[:, :, 20:] = False
     obs = trials.obs.copy()
-    obs[:, :, 21:] = 1e6
-    assert state.incomplete(Trials(obs, trials.action, mask)) == [0]
+    obs[:, :, 1:, 0] += 3 * trials.action[..., 0] ** 2
+    assert state.incomplete(Trials(obs, trials.action, trials.mask)) == [0]
+
+
+def test_many_columns_of_noise_tell_nothing() -> None:
+    """Fits to few steps would seem to, on the steps to which they are fitted."""
+    rng = np.random.default_rng(0)
+    obs, action = rng.standard_normal((16, 1, 81, 60)), rng.uniform(-1, 1, (16, 1, 80, 8))
+    assert state.incomplete(Trials(obs, action, np.ones((16, 1, 80), bool))) == []
 
 
 def test_a_clone_without_a_memory_is_not_advised_there() -> None:
