@@ -7,6 +7,7 @@ from deconfounded.deconf.diagnosis import fits
 from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.trials import Trials
 
+FEWEST, ENOUGH = 16, 8  # trials; steps for each feature of a fit: near one, its errors say nothing
 LEAST = 0.1  # share of variance that the step before has to explain; nothing hidden has about 0, or less
 
 
@@ -14,18 +15,18 @@ def incomplete(trials: Trials) -> list[int]:
     """Observations whose next value depends on the step before, too, as where a speed is not observed, or a delay.
 
     What a fit of the present observation and action leaves of the change is predicted by the step before. Each half of
-    the trials is predicted by fits to the other half. Where trials differ in their dynamics, the step before tells of
-    that too, so that nothing follows there.
+    the trials is predicted by fits to the other half. Of too few steps nothing is said. Where trials differ in their
+    dynamics, the step before tells of that too, so that nothing follows there.
     """
     b, e, t = np.nonzero(trials.mask[:, :, 1:] & trials.mask[:, :, :-1])
-    if len(trials) < 16 or len(b) < 2 * fits.FINE:
-        return []
     kept = np.isin(b, np.arange(0, len(trials), 1 + len(b) // (2 * fits.FITTED)))  # fits to so many steps suffice
     b, e, t = b[kept], e[kept], t[kept]
     before, now, then = (trials.obs[b, e, t + i].astype(float) for i in range(3))
     acted, action = (fits.one_hot(trials.action[b, e, t + i].astype(float), trials.actions) for i in range(2))
     present = fits.random_features(_clipped(np.concatenate([now, action], 1)), fits.FINE)
     both = np.concatenate([present, _clipped(np.concatenate([now - before, acted], 1))], 1)
+    if len(trials) < FEWEST or len(b) < ENOUGH * both.shape[1]:
+        return []
     left, less = (_held_out(x, then - now, b % 2 == 0) for x in (present, both))
     unit = 1.48 * np.median(np.abs(left), 0)
     varies = unit > 1e-4 * np.maximum((then - now).std(0), 1e-9)

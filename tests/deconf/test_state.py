@@ -11,9 +11,9 @@ from tests.deconf.test_diagnose import CLEAR, SILENT
 from tests.deconf.test_lookalikes import world
 
 
-def cart(speed: bool, late: bool = False, discrete: bool = False) -> Trials:
+def cart(speed: bool, late: bool = False, discrete: bool = False, b: int = 128) -> Trials:
     """Random pushes of a cart; speed: whether it is observed; late: pushes act a step later."""
-    rng, b, steps = np.random.default_rng(0), 64, 40
+    rng, steps = np.random.default_rng(0), 40
     pushes = rng.integers(0, 3, (b, steps)) - 1.0 if discrete else rng.uniform(-1, 1, (b, steps))
     path, v = np.zeros((b, 1, steps + 1, 2)), np.zeros(b)
     for t in range(steps):
@@ -41,18 +41,16 @@ def test_what_experts_do_is_no_state_of_the_world(kind: str) -> None:
 
 
 def test_too_little_to_say() -> None:
-    trials = cart(speed=False)
-    assert state.incomplete(Trials(trials.obs[:12], trials.action[:12], trials.mask[:12])) == []
+    assert state.incomplete(cart(speed=False, b=32)) == []
     assert state.named(None) == []
 
 
 def test_steps_that_did_not_take_place_do_not_count() -> None:
     """What stands there goes back and forth, which the step before would tell."""
-    trials = cart(speed=True)
+    trials = cart(speed=True, b=256)
     mask, obs = trials.mask.copy(), trials.obs.copy()
-    mask[:, :, 25:] = False
-    obs[:, :, 26:] = obs[:, :, 10:25]
-    obs[:, :, 26::2] *= -1
+    mask[:, :, 36:] = False
+    obs[:, :, 37:] = 3 * np.array([1, -1, 1, -1])[:, None]
     assert state.incomplete(Trials(obs, trials.action, mask)) == []
 
 
@@ -64,11 +62,12 @@ def test_the_step_before_adds_to_the_present() -> None:
     assert state.incomplete(Trials(obs, trials.action, trials.mask)) == [0]
 
 
-def test_many_columns_of_noise_tell_nothing() -> None:
-    """Fits to few steps would seem to, on the steps to which they are fitted."""
+def test_noise_of_many_columns_tells_nothing() -> None:
+    """Nor do fits that have nearly as many features as steps, whose errors are of any size."""
     rng = np.random.default_rng(0)
-    obs, action = rng.standard_normal((16, 1, 81, 60)), rng.uniform(-1, 1, (16, 1, 80, 8))
-    assert state.incomplete(Trials(obs, action, np.ones((16, 1, 80), bool))) == []
+    for steps in (80, 400):
+        obs, action = rng.standard_normal((16, 1, steps + 1, 60)), rng.uniform(-1, 1, (16, 1, steps, 8))
+        assert state.incomplete(Trials(obs, action, np.ones((16, 1, steps), bool))) == []
 
 
 def test_a_clone_without_a_memory_is_not_advised_there() -> None:
