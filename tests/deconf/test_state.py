@@ -46,11 +46,11 @@ def test_too_little_to_say() -> None:
 
 
 def test_steps_that_did_not_take_place_do_not_count() -> None:
-    """What stands there goes back and forth, which the step before would tell."""
+    """What stands there goes on, or turns, which the step before would tell."""
     trials = cart(speed=True, b=256)
     mask, obs = trials.mask.copy(), trials.obs.copy()
     mask[:, :, 36:] = False
-    obs[:, :, 37:] = 3 * np.array([1, -1, 1, -1])[:, None]
+    obs[:, :, 37:] = 3 * np.array([1, 1, -1, -1])[:, None]
     assert state.incomplete(Trials(obs, trials.action, mask)) == []
 
 
