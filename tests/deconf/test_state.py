@@ -49,8 +49,8 @@ def test_steps_that_did_not_take_place_do_not_count() -> None:
     """What stands there goes on, or turns, which the step before would tell."""
     trials = cart(speed=True, b=256)
     mask, obs = trials.mask.copy(), trials.obs.copy()
-    mask[:, :, 36:] = False
-    obs[:, :, 37:] = 3 * np.array([1, 1, -1, -1])[:, None]
+    mask[:, :, 20:] = False
+    obs[:, :, 21:] = np.tile([1, 1, -1, -1], 5)[:, None]
     assert state.incomplete(Trials(obs, trials.action, mask)) == []
 
 
