@@ -26,9 +26,8 @@ def error_line(error: BaseException) -> str:
         return text
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.msg} ({type(error).__name__}, {Path(error.filename).name}:{error.lineno})"
-    return (
-        f"{text} ({type(error).__name__}, {users_line(error) or _line(traceback.extract_tb(error.__traceback__)[-1])})"
-    )
+    line = users_line(error) or _line(traceback.extract_tb(error.__traceback__)[-1])
+    return f"{text} ({type(error).__name__}, {line})"
 
 
 def users_line(error: BaseException) -> str:
