@@ -176,7 +176,9 @@ def observations_share_no_memory(task: Task) -> None:
     first, _ = env.reset(seed=0)
     copy = first.copy()
     for _ in range(3):
-        env.step(env.action_space.sample())
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:  # as where an episode is one step
+            env.reset()
     same(first, copy, "the first observation before and after three steps")
 
 

@@ -92,6 +92,13 @@ def test_contract(example: str, check: str) -> None:
         pytest.skip(str(why))
 
 
+@pytest.mark.filterwarnings("error::UserWarning")
+def test_an_episode_of_one_step() -> None:
+    """Nothing is stepped after its end, of which a warning would tell."""
+    for check in ("observations_share_no_memory", "time_limit", "adapters_agree"):
+        CONTRACT[check](task_with(steps=1))
+
+
 def test_it_is_a_task() -> None:
     """By its name, as other tasks are; its amounts are those of control, and its theta is in no info."""
     task = envs.get(f"{WORLDS}/{EXAMPLES[1]}")
