@@ -63,8 +63,10 @@ def angles(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def units(log: Log, steps: Steps) -> Iterator[Remark]:
     """Columns that are spread far more widely in some trials than in all others, as where they are in another unit."""
-    columns = zip(log.units.obs + log.units.action, [*steps.obs.T, *steps.action.T], strict=True)
-    for name, x in columns if not log.actions else zip(log.units.obs, steps.obs.T, strict=True):
+    columns = list(zip(log.units.obs, steps.obs.T, strict=True))
+    if not log.actions:
+        columns += zip(log.units.action, steps.action.T, strict=True)
+    for name, x in columns:
         variance = fits.by_trial(x**2, steps.trial, len(log)) - fits.by_trial(x, steps.trial, len(log)) ** 2
         spread = np.sqrt(variance.clip(0))
         order = np.argsort(spread)

@@ -19,7 +19,8 @@ def incomplete(trials: Trials) -> list[int]:
     dynamics, the step before tells of that too, so that nothing follows there.
     """
     b, e, t = np.nonzero(trials.mask[:, :, 1:] & trials.mask[:, :, :-1])
-    kept = np.isin(b, np.arange(0, len(trials), 1 + len(b) // (2 * fits.FITTED)))  # fits to so many steps suffice
+    apart = 1 + len(b) // (2 * fits.FITTED)  # trials: fits to so many steps suffice
+    kept = b % apart == 0
     b, e, t = b[kept], e[kept], t[kept]
     before, now, then = (trials.obs[b, e, t + i].astype(float) for i in range(3))
     acted, action = (fits.one_hot(trials.action[b, e, t + i].astype(float), trials.actions) for i in range(2))
@@ -27,7 +28,7 @@ def incomplete(trials: Trials) -> list[int]:
     both = np.concatenate([present, _clipped(np.concatenate([now - before, acted], 1))], 1)
     if len(trials) < FEWEST or len(b) < ENOUGH * both.shape[1]:
         return []
-    left, less = (_held_out(x, then - now, b % 2 == 0) for x in (present, both))
+    left, less = (_held_out(x, then - now, b // apart % 2 == 0) for x in (present, both))
     unit = 1.48 * np.median(np.abs(left), 0)
     varies = unit > 1e-4 * np.maximum((then - now).std(0), 1e-9)
     unit = np.where(varies, unit, np.inf)

@@ -45,6 +45,12 @@ def test_too_little_to_say() -> None:
     assert state.named(None) == []
 
 
+def test_some_of_many_trials() -> None:
+    """Every second, or third, of which half are held out in turn."""
+    for b in (1100, 2200):
+        assert state.incomplete(cart(speed=False, b=b)) == [0]
+
+
 def test_steps_that_did_not_take_place_do_not_count() -> None:
     """What stands there goes on, or turns, which the step before would tell."""
     trials = cart(speed=True, b=256)
