@@ -15,12 +15,17 @@ UNITS, APART, FEWEST = 20.0, 5.0, 3  # times as widely spread; from the nearest 
 TURNS, CLOSE, JUMPS = (2 * np.pi, 360.0), 0.05, 3  # of angles; share by which a range may differ; times that it jumps
 
 
-def extremes(log: Log, steps: Steps) -> Iterator[Remark]:
-    """Columns with codes for missing values, or with heavy tails, and what mends them."""
+def _continuous(log: Log, steps: Steps) -> list[tuple[str, Array]]:
+    """Names and values of observations, and of continuous actions, in the units of the log."""
     columns = list(zip(log.units.obs, steps.obs.T, strict=True))
     if not log.actions:
-        columns += list(zip(log.units.action, log.units.unscaled(steps.action).T, strict=True))
-    for name, x in columns:
+        columns += zip(log.units.action, log.units.unscaled(steps.action).T, strict=True)
+    return columns
+
+
+def extremes(log: Log, steps: Steps) -> Iterator[Remark]:
+    """Columns with codes for missing values, or with heavy tails, and what mends them."""
+    for name, x in _continuous(log, steps):
         if (code := _code(x)) is not None:
             rest = x[x != code]
             text = (
@@ -63,10 +68,7 @@ def angles(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def units(log: Log, steps: Steps) -> Iterator[Remark]:
     """Columns that are spread far more widely in some trials than in all others, as where they are in another unit."""
-    columns = list(zip(log.units.obs, steps.obs.T, strict=True))
-    if not log.actions:
-        columns += zip(log.units.action, steps.action.T, strict=True)
-    for name, x in columns:
+    for name, x in _continuous(log, steps):
         variance = fits.by_trial(x**2, steps.trial, len(log)) - fits.by_trial(x, steps.trial, len(log)) ** 2
         spread = np.sqrt(variance.clip(0))
         order = np.argsort(spread)

@@ -91,6 +91,17 @@ def standardised(x: Array) -> Array:
     return (x - x.mean(0)) / np.where(std > rounding, std, np.inf)
 
 
+def clipped(x: Array) -> Array:
+    """Columns [N, F] standardised, without extremes."""
+    return standardised(x).clip(-CLIP, CLIP)
+
+
+def usual_size(left: Array, change: Array) -> Array:
+    """The usual size [O] of what a fit leaves of the change [N, O]; inf where next to nothing is left."""
+    unit = 1.48 * np.median(np.abs(left), 0)
+    return np.where(unit > 1e-4 * np.maximum(change.std(0), 1e-9), unit, np.inf)
+
+
 def features(x: Array) -> Array:
     """Standardised columns [N, F], and their products where columns are few."""
     x = standardised(x)
@@ -197,11 +208,11 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
         return None
     action = one_hot(steps.action, trials.actions)
-    change, inputs = steps.then - steps.obs, standardised(np.concatenate([steps.obs, action], 1)).clip(-CLIP, CLIP)
+    change, inputs = steps.then - steps.obs, clipped(np.concatenate([steps.obs, action], 1))
     basis = random_features(inputs, FINE)
     left = change - basis @ _fitted(basis, change)
-    unit = 1.48 * np.median(np.abs(left), 0)
-    kept = np.flatnonzero(unit > 1e-4 * np.maximum(change.std(0), 1e-9))
+    unit = usual_size(left, change)
+    kept = np.flatnonzero(np.isfinite(unit))
     _, episode, step = np.nonzero(trials.mask)
     second = episode % 2 if trials.mask.shape[1] > 1 else step >= trials.mask.sum((1, 2))[steps.trial] / 2
     group = 2 * steps.trial + second

@@ -24,16 +24,14 @@ def incomplete(trials: Trials) -> list[int]:
     b, e, t = b[kept], e[kept], t[kept]
     before, now, then = (trials.obs[b, e, t + i].astype(float) for i in range(3))
     acted, action = (fits.one_hot(trials.action[b, e, t + i].astype(float), trials.actions) for i in range(2))
-    present = fits.random_features(_clipped(np.concatenate([now, action], 1)), fits.FINE)
-    both = np.concatenate([present, _clipped(np.concatenate([now - before, acted], 1))], 1)
+    present = fits.random_features(fits.clipped(np.concatenate([now, action], 1)), fits.FINE)
+    both = np.concatenate([present, fits.clipped(np.concatenate([now - before, acted], 1))], 1)
     if len(trials) < FEWEST or len(b) < ENOUGH * both.shape[1]:
         return []
     left, less = (_held_out(x, then - now, b // apart % 2 == 0) for x in (present, both))
-    unit = 1.48 * np.median(np.abs(left), 0)
-    varies = unit > 1e-4 * np.maximum((then - now).std(0), 1e-9)
-    unit = np.where(varies, unit, np.inf)
+    unit = fits.usual_size(left, then - now)
     rest, better = ((np.clip(x / unit, -fits.CLIP, fits.CLIP) ** 2).sum(0) for x in (left, less))
-    return [int(i) for i in np.flatnonzero(varies & (better < (1 - LEAST) * rest))]
+    return [int(i) for i in np.flatnonzero(better < (1 - LEAST) * rest)]
 
 
 def named(explore: Trials | None) -> list[str]:
@@ -42,10 +40,6 @@ def named(explore: Trials | None) -> list[str]:
         return []
     names = (explore if isinstance(explore, Log) else Log.of(explore)).units.obs
     return [names[i] for i in incomplete(explore)]
-
-
-def _clipped(x: fits.Array) -> fits.Array:
-    return fits.standardised(x).clip(-fits.CLIP, fits.CLIP)
 
 
 def _held_out(x: fits.Array, y: fits.Array, first: NDArray[np.bool_]) -> fits.Array:

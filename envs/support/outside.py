@@ -35,7 +35,9 @@ def find(kind: str, reference: str) -> Any:
     try:
         module = _run(here(Path(where))) if where.endswith(".py") else importlib.import_module(where)
     except InputError as error:
-        raise InputError(f"{error} ({line})" if (line := users_line(error)) else str(error)) from error
+        if not (line := users_line(error)):
+            raise
+        raise InputError(f"{error} ({line})") from error
     except (Exception, SystemExit) as error:
         raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
     if not hasattr(module, name):

@@ -395,9 +395,9 @@ def test_levels_of_many_latents_are_from_all_combinations() -> None:
 
 def test_pairs_far_apart_are_so_in_some_latent() -> None:
     """By half of the range, in quantiles; kinds are far from each other."""
-    some = envs.Latent("a", "", 1.0, 16.0, "loguniform"), envs.Latent("b", "", 0.0, 1.0)
+    continuous = envs.Latent("a", "", 1.0, 16.0, "loguniform"), envs.Latent("b", "", 0.0, 1.0)
     kind = envs.Latent("c", "", 0, 2, "categorical")
-    task: Any = SimpleNamespace(latents=some)
+    task: Any = SimpleNamespace(latents=continuous)
     levels = np.array([[1.0, 0.0], [3.9, 0.4], [4.0, 0.4], [1.0, 0.5]])
     assert certify.far_pairs(task, levels)[0].tolist() == [False, False, True, True]
     task = SimpleNamespace(latents=(kind,))

@@ -781,10 +781,10 @@ def test_each_kind_of_loss_has_its_panel(figures: list[Any], tmp_path: Path) -> 
 
     methods = {"a": entry("a", x=[1, 2], y=[3, 4]), "b": entry("b", y=[5, 6]), "a_mode": entry("a", "mode", y=[7, 8])}
     run_report.learning({"methods": methods}, tmp_path / "learning.png")
-    shown = {
+    panels = {
         panel.get_title(): {line.get_label(): [*line.get_ydata()] for line in panel.lines} for panel in figures[0].axes
     }
-    assert shown == {"x loss": {"a": [1, 2]}, "y loss": {"a": [3, 4], "b": [5, 6]}}
+    assert panels == {"x loss": {"a": [1, 2]}, "y loss": {"a": [3, 4], "b": [5, 6]}}
 
 
 def test_an_older_version_is_told_from_today_s() -> None:
