@@ -90,9 +90,7 @@ def run(
     from deconfounded.benchmarks.engine.job_files import prepare
     from deconfounded.benchmarks.engine.scheduler import run_jobs
     from deconfounded.benchmarks.output import diagnosis as page
-    from deconfounded.deconf.diagnosis import labels, state
-    from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check
-    from deconfounded.deconf.diagnosis.judgement import judge
+    from deconfounded.deconf.diagnosis.diagnose import VERSION, DiagnoseConfig, check, conclude
 
     config, start = DiagnoseConfig(), time.time()
     remarks = look.look(trials, explore)
@@ -116,8 +114,7 @@ def run(
         if failed := run_jobs([refit for refit in refits if refit.findings() is None], "diagnosis", engine.run):
             raise failed[0]
     found = [findings for refit in refits if (findings := refit.findings()) is not None]
-    of_columns = labels.named(trials, explore), state.named(explore)
-    diagnosis = judge(found, None if explore is None else len(explore), *of_columns)
+    diagnosis = conclude(found, trials, explore)
     about |= {"columns": columns, "units": asdict(trials.units), "look": [remark._asdict() for remark in remarks]}
     about |= {"command": command, "machine": identity.machine("cpu"), "wall_s": round(time.time() - start)}
     return diagnosis, page.write(diagnosis, about, folder)

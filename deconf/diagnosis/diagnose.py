@@ -3,6 +3,7 @@
 `measures.measure` computes the figures on several splits of the trials; `judgement.judge` judges them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -47,7 +48,13 @@ def diagnose(
 
     for generator in rng.spawn(config.refits):
         refits.append(measure(trials, explore, config.amounts, generator, part))
-    return judge(refits, None if explore is None else len(explore), labels.named(trials, explore), state.named(explore))
+    return conclude(refits, trials, explore)
+
+
+def conclude(refits: Sequence[Findings], trials: Trials, explore: Trials | None) -> Diagnosis:
+    """The verdict on the figures of splits of these trials, with what their columns show."""
+    explored = None if explore is None else len(explore)
+    return judge(refits, explored, labels.named(trials, explore), state.named(explore))
 
 
 def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> None:

@@ -16,7 +16,7 @@ from deconfounded.benchmarks import look as look_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
-from deconfounded.deconf.diagnosis import diagnose, fits, judgement
+from deconfounded.deconf.diagnosis import diagnose, fits
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -362,8 +362,8 @@ def test_from_csv_to_a_verdict(
 ) -> None:
     """In one command; a look comes first, in print, page and json; and the lines that it prints run as they stand."""
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
-    judge = judgement.judge
-    monkeypatch.setattr(judgement, "judge", lambda *given: replace(judge(*given), next=advices.EXPLORE))
+    judge = diagnose.judge
+    monkeypatch.setattr(diagnose, "judge", lambda *given: replace(judge(*given), next=advices.EXPLORE))
     monkeypatch.chdir(tmp_path)
     short = driven()
     short = Trials(short.obs[:24, :, :9], short.action[:24, :, :8], short.mask[:24, :, :8])
