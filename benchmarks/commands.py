@@ -1,9 +1,10 @@
 """Commands that train methods share this: arguments, their checks, the engine, and the description of a run."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,8 +117,12 @@ def run(
     methods: Sequence[str],
     folder: Path,
     where: "Engine",
+    check: "Callable[[envs.Task, dict[str, Any], Finished], None]" = lambda task, about, references: None,
 ) -> "tuple[Finished, dict[str, Any], list[Exception]]":
-    """Run what is not finished in the folder; returns all that is, what the folder is for, and errors of jobs."""
+    """Run what is not finished in the folder; returns all that is, what the folder is for, and errors of jobs.
+
+    check: is called with the results of random actions and of the expert before anything is trained, and may raise.
+    """
     from deconfounded.benchmarks.engine.job_files import know_guests, prepare
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
@@ -141,7 +146,8 @@ def run(
             )
             for name in methods
         ]
-        finished, resumed, failed = run_all(jobs, args.device, f"{task.name}, {args.preset}", where)
+        label, checked = f"{task.name}, {args.preset}", partial(check, task, described)
+        finished, resumed, failed = run_all(jobs, args.device, label, where, checked)
     return finished, {**described, "resumed": resumed}, failed
 
 

@@ -93,7 +93,9 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
         for task in tasks:
             folder = folders[task.name]
             try:
-                finished, about, errors = commands.run(BenchmarkJob, task, args, methods, folder, where)
+                finished, about, errors = commands.run(
+                    BenchmarkJob, task, args, methods, folder, where, run_report.check_references
+                )
                 if not errors or {name for name, *_ in finished} >= set(REFERENCES):
                     text = run_report.write(task, about, finished, folder)
                     print(text if args.debug else f"{text} -> {folder / 'report.html'}")  # --debug keeps none

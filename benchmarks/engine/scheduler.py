@@ -79,10 +79,17 @@ class Engine(ABC):
         """
 
 
-def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tuple[Finished, int, list[Exception]]:
+def run_all(
+    every: Sequence[Job],
+    device: str,
+    label: str,
+    engine: Engine,
+    check: Callable[[Finished], None] = lambda references: None,
+) -> tuple[Finished, int, list[Exception]]:
     """Run what has no file yet; returns all that is in the folder now, how many files were there before, and failures.
 
-    every: a job for each method, with all seeds, in one folder.
+    every: a job for each method, with all seeds, in one folder. check: is called with the results of random actions and
+    of the expert before anything is trained, and may raise an error.
     """
     folder, left = every[0].folder, [list[int]() for _ in every]
     for job, missing in zip(every, left, strict=True):
@@ -104,16 +111,25 @@ def run_all(every: Sequence[Job], device: str, label: str, engine: Engine) -> tu
         for seed, job in sorted(imitated.items())
         if not job.context().has_demonstrations(seed)
     ]
-    failed, errors = list[Exception](), folder.parent / "errors"
-    for jobs, what in ((first, f"{label}, demonstrations"), (parts, label)):
-        failed += run_jobs(jobs, what, engine.run, errors)
+    first += [job for job in parts if job.method in catalogue.REFERENCES]
+    later = [job for job in parts if job.method not in catalogue.REFERENCES]
+    errors = folder.parent / "errors"
+    failed = run_jobs(first, f"{label}, demonstrations and references", engine.run, errors)
+    if not failed:
+        check([entry for entry in results(every[0], folder) if entry[0] in catalogue.REFERENCES])
+    failed += run_jobs(later, label, engine.run, errors)
     for job in () if failed else every:
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
-    done = written(every[0], folder)
-    finished = [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
+    finished = results(every[0], folder)
     made = {(job.method, seed) for job, missing in zip(every, left, strict=True) for seed in missing}
     return finished, sum((method, seed) not in made for method, seed, _ in finished), failed
+
+
+def results(like: Job, folder: Path) -> Finished:
+    """What jobs left in the folder: method, seed and arrays of each file that fits."""
+    done = written(like, folder)
+    return [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
 
 
 def written(like: Job, folder: Path) -> list[Job]:
@@ -154,7 +170,7 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
                 outcome += f"; its traceback: {file}"
         progress.line(f"{job.method}, {listed(job.seeds)}: {outcome}")
 
-    run(jobs, progress.update, say)
+    run(sorted(jobs, key=lambda job: -job.ticks), progress.update, say)
     progress.close()
     return failed
 

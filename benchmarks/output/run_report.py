@@ -21,6 +21,12 @@ from deconfounded.envs.support.files import write_atomically, write_json
 from deconfounded.envs.support.origin import ROOT
 
 
+def check_references(task: envs.Task, about: dict[str, Any], finished: Finished) -> None:
+    """Raises InputError if no score can be made with these results of random actions and of the expert."""
+    made = records.of_run(finished, about["preset"], about["set"], task.episodes)
+    aggregation.references(made[0], made)
+
+
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
     """Everything that a folder shows, from what its jobs left there; returns the table. No training happens here.
 

@@ -115,11 +115,22 @@ def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
     made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in ("blind_bc", "random")]
     engine = Noting()
     assert scheduler.run_all(made, "cpu", "first", engine)[1] == 0
-    assert engine.ran == ["demonstrations", "blind_bc", "random"]
+    assert engine.ran == ["random", "demonstrations", "blind_bc"]
     made[0].file(0).unlink()
     engine.ran.clear()
     assert scheduler.run_all(made, "cpu", "again", engine)[1] == 1  # there before
     assert engine.ran == ["blind_bc"]
+
+
+def test_long_jobs_come_first(tmp_path: Path) -> None:
+    """So that no core waits for the last one; random actions and the expert before all."""
+    wanted = ("blind_bc", "expert", "interventional", "random")
+    made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in wanted]
+    checked: list[str] = []
+    engine = Noting()
+    scheduler.run_all(made, "cpu", "", engine, lambda done: checked.extend([*engine.ran, *(name for name, *_ in done)]))
+    assert engine.ran == ["expert", "random", "demonstrations", "interventional", "blind_bc"]
+    assert checked == ["expert", "random", "demonstrations", "expert", "random"]
 
 
 def test_the_time_that_is_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -74,6 +74,35 @@ def deconf_process(folder: Path, *args: str) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environ, timeout=300)
 
 
+FLAT = """
+import numpy as np
+
+from tests.toys import Push
+
+class Flat(Push):
+    name = "flat"
+    observation = {"x": (-9.0, 9.0), "velocity": (-9.0, 9.0)}
+
+    def reward(self, state, action, next_state, theta):
+        return np.ones(len(state))
+
+    def terminated(self, state):
+        return state[:, 0] > 1e9
+"""
+
+
+def test_nothing_is_trained_where_the_expert_is_no_better(tmp_path: Path) -> None:
+    """Of a reward that is the same whatever one does; random actions and the expert are rolled out before."""
+    (tmp_path / "own.py").write_text(FLAT)
+    small = ("--preset", "smoke", "--set", "eval_trials=4", "expert_trials=4")
+    own = ("--task", "own.py:Flat", "--expert", "tests.toys:control")
+    done = deconf(tmp_path, "run", *own, "--methods", "blind_bc", *small)
+    assert done.returncode == 2
+    assert "flat: the expert returns 7 an episode, random actions 7; scores need an expert" in done.stderr
+    made = {file.name for file in (tmp_path / "results").rglob("*.npz")}
+    assert made == {"demonstrations-0.npz", "expert-0.npz", "random-0.npz"}
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_run_play_score(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
