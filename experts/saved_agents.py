@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import json
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +42,27 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     except Exception as error:  # any error of the class's own `state`
         right = "its state() must return a dictionary for json and one of arrays"
         raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
+    _check_loadable(cls, json.dumps(settings), content)
     check_folder(folder)
     if code is not None:
         write_atomically(folder / CODE, code)
     write_atomically(folder / ARRAYS, content)
     write_atomically(file, described)
+
+
+def _check_loadable(cls: type[Agent], settings: str, content: bytes) -> None:
+    """Raises InputError unless `from_state` makes an agent of the same settings, as JSON, and arrays."""
+    try:
+        again, named = cls.from_state(json.loads(settings), from_bytes(content)).state()
+        saved = from_bytes(content)
+        same = json.loads(json.dumps(again)) == json.loads(settings) and named.keys() == saved.keys()
+        same = same and all(np.array_equal(named[key], x, equal_nan=True) for key, x in saved.items())
+        why = "" if same else "it makes an agent of another state"
+    except Exception as error:  # any error of the class's own methods
+        why = error_line(error)
+    if why:
+        right = "it must undo what state() gives"
+        raise InputError(f"{cls.__qualname__} cannot be saved: from_state() fails ({why}); {right}")
 
 
 def describe(folder: Path) -> dict[str, Any]:

@@ -808,6 +808,33 @@ class Odd(Still):
             saved_agents.save(agent, tmp_path / "kept")
         assert not (tmp_path / "kept").exists()
 
+    @pytest.mark.parametrize(
+        ("loaded", "says"),
+        [
+            ("cls(arrays['a'])", r"from_state\(\) fails \(a \(KeyError, odd.py:\d+\)\); it must undo what state"),
+            ("cls(arrays['size'])", "it makes an agent of another state"),
+            ("cls(-arrays['size'] * settings.pop('sign'))", "it makes an agent of another state"),
+            ("cls(arrays['size'] * settings.pop('sign'))", ""),
+        ],
+    )
+    def test_an_agent_that_would_not_come_back(self, loaded: str, says: str, tmp_path: Path) -> None:
+        """It is not saved, as nobody could load it; the last is fine."""
+        text = f"""
+class Odd(Still):
+    def __init__(self, value): self.value = value
+    def state(self): return {{"sign": int(np.sign(self.value))}}, {{"size": np.array(abs(self.value))}}
+    @classmethod
+    def from_state(cls, settings, arrays): return {loaded}
+"""
+        (tmp_path / "odd.py").write_text(HEAD + text)
+        agent = outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")(-0.25)
+        if says:
+            with pytest.raises(envs.InputError, match=says):
+                saved_agents.save(agent, tmp_path / "kept")
+        else:
+            saved_agents.save(agent, tmp_path / "kept")
+        assert (tmp_path / "kept").exists() == (not says)
+
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
         """It is kept with its code, and does not need the file it came from."""
         text = """
