@@ -1,7 +1,8 @@
 """Is a task confounded, and by how much? `deconf certify --task slippery_cartpole`
 
 Four measurements: how much evidence of theta the dynamics and the expert's actions hold, what the exact policies score,
-what it costs an expert to assume a wrong theta, and what a clone without memory scores. Only the last one is trained.
+what it costs an expert to assume a wrong theta, and what a clone without memory scores. Only the last one is trained,
+and the dynamics of a task without a likelihood.
 """
 
 import time
@@ -18,7 +19,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.scoring import normalise
+from deconfounded.benchmarks.output.scoring import check_references, normalise
 from deconfounded.deconf.exact import Grid, grid_of
 from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, needs_particles
 from deconfounded.envs.streams import Array
@@ -158,9 +159,7 @@ def certify(
     best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
     recorder.note()
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
-    if one <= zero:
-        remedy = "train it first" if task.has_likelihood else "it must be better"
-        raise envs.InputError(f"the expert of {task.name} returns {one:.4g}, random actions {zero:.4g}; {remedy}")
+    check_references(task.name, zero, one)
     done(STAGES[0])
     policies = {"interventional": returns(exact_agent(env, expert, False, thetas))}
     static = {}

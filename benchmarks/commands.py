@@ -25,8 +25,11 @@ if TYPE_CHECKING:  # torch takes seconds: what only checks its arguments goes wi
     from deconfounded.benchmarks.engine.scheduler import Engine
 
 
-def parser(description: str | None, methods: str, seeds: int | None = None) -> Parser:
-    """Arguments of a run; methods: help on what they may be; seeds: how many by default, if not the preset's."""
+def parser(description: str | None, methods: str, seeds: int | None = None, resumes: bool = False) -> Parser:
+    """Arguments of a run; methods: help on what they may be; seeds: how many by default, if not the preset's.
+
+    resumes: whether it goes on in a folder that holds a part of it only if it is given --resume.
+    """
     made = Parser(description, "--device")
     presets = "; ".join(f"{name}: {text}" for name, text in PRESETS.items())
     made.add_argument("--preset", default="default", help=presets)
@@ -36,7 +39,8 @@ def parser(description: str | None, methods: str, seeds: int | None = None) -> P
     cluster = "run on a Ray cluster: HOST:PORT, or auto for this machine's"
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")
-    made.add_argument("--resume", action="store_true", help="run what is not finished in the output folder")
+    if resumes:
+        made.add_argument("--resume", action="store_true", help="run what is not finished in the output folder")
     made.set_defaults(expert=None, salt="", track=None, debug=False, protocol=STANDARD)  # of run.py alone
     return made
 
@@ -123,11 +127,10 @@ def run(
 
     check: is called with the results of random actions and of the expert before anything is trained, and may raise.
     """
-    from deconfounded.benchmarks.engine.job_files import know_guests, prepare
+    from deconfounded.benchmarks.engine.job_files import prepare
     from deconfounded.benchmarks.engine.presets import changed, preset
     from deconfounded.benchmarks.engine.scheduler import run_all
 
-    know_guests(folder / "jobs")  # whose amounts are settings too
     settings = changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set)
     seeds = args.seeds or settings.seeds
     catalogue.check(args.preset, (), seeds, ())

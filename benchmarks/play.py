@@ -74,9 +74,7 @@ def main() -> None:
     named = (f"{lat.name} {value:g} {lat.unit}".strip() for lat, value in pairs)
     print(f"{task.name}, {', '.join(named)}: returns {' '.join(f'{one:.2f}' for one in returns)}")
     if args.video is not None:
-        import imageio.v2 as imageio
+        from deconfounded.benchmarks.output import film
 
-        from deconfounded.benchmarks.output.film import frame_rate
-
-        imageio.mimsave(args.video, frames, fps=frame_rate(task), macro_block_size=8)
+        film.save(frames, film.frame_rate(task), args.video)
         print(f"-> {args.video}")

@@ -1,6 +1,6 @@
 """Fetch an agent or a data set from the Hugging Face hub: `deconf pull OWNER/NAME --out agent`
 
-A data set is datasets/OWNER/NAME. The files' checksums are compared; nothing of an agent is run. To load an agent runs
+A data set is datasets/OWNER/NAME. An agent's checksums are compared, and nothing of it is run. To load an agent runs
 the code of its class, which this command names: read it, or trust its owner.
 """
 

@@ -31,7 +31,9 @@ from deconfounded.experts import policy
 
 def main() -> None:
     """The experiment on one page."""
-    parser = commands.parser(__doc__, "`all`, or some of those that --list names; your own is path/file.py:fit")
+    parser = commands.parser(
+        __doc__, "`all`, or some of those that --list names; your own is path/file.py:fit", resumes=True
+    )
     parser.add_argument("--task", help="which task; see --list; your own is path/file.py:Class")
     several = f"several tasks, a folder each: names, or {', '.join(published.GROUPS)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help=several)

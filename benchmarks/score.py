@@ -25,7 +25,7 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
     """
     if not ranges:
         return task
-    if not task.has_likelihood:
+    if not task.draws_by_latents:
         raise envs.InputError(f"--range was {ranges[0]!r}; {task.name} draws theta by its own sample_theta alone")
     latents = {latent.name: latent for latent in task.latents}
     for text in ranges:
@@ -45,13 +45,18 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
 
 
 def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: int, where: envs.Task) -> dict[str, Any]:
-    """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode."""
+    """Returns [trials, episodes] of agent, expert and random actions under the same thetas; scores by episode.
+
+    Raises InputError if the expert is no better than random actions.
+    """
     from deconfounded.benchmarks.output import scoring
 
     env = envs.BatchEnv(where, trials)
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
-    by_trial = scoring.normalise(returns["agent"], returns["random"].mean(), returns["expert"].mean())
+    references = (returns["random"].mean(), returns["expert"].mean())
+    scoring.check_references(task.name, *references)
+    by_trial = scoring.normalise(returns["agent"], *references)
     interval = scoring.bootstrap(by_trial[:, -1])
     return {
         "score": by_trial.mean(0).round(4).tolist(),

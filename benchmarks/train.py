@@ -2,6 +2,7 @@
 
 import os
 import platform
+import tempfile
 import time
 from pathlib import Path
 
@@ -44,12 +45,14 @@ def main() -> None:
     progress = Progress(args.steps, "training")
     weights = train(task, args.steps, args.seed, progress.update)
     progress.close()
+    content, env = to_bytes(weights), envs.BatchEnv(task, 256)
+    with tempfile.TemporaryDirectory() as scratch:  # what is there already stays until all is ready
+        (aside := Path(scratch) / file.name).write_bytes(content)
+        agents = ExpertAgent(env, policy.load(task, aside)), RandomAgent(task.action_space)
+    returns, random = (run_trials(env, agent, 1, seed=args.seed).returns for agent in agents)
     number = policy.version(task, file) + 1
     file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
-    write_atomically(file, to_bytes(weights))
-    env = envs.BatchEnv(task, 256)
-    agents = ExpertAgent(env, policy.load(task, file)), RandomAgent(task.action_space)
-    returns, random = (run_trials(env, agent, 1, seed=args.seed).returns for agent in agents)
+    write_atomically(file, content)
     card = {
         "task": task.name,
         "task_version": task.version,

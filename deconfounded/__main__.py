@@ -9,12 +9,14 @@ import sys
 from deconfounded.benchmarks.console import ROOT, end, quiet_pipe, run_command, stop_at_once
 
 STUDIES = "benchmarks.studies."  # of a checkout alone: they make this repository's own pages
+EXTRAS = {"train": "train", "foreign": "foreign", "site": "docs"}  # of commands that need more than bench
 NOTHING = "nothing was written"
 RESUMED = "what was finished is kept, and --resume goes on"
 REPEATED = "what was finished is kept, and the same command goes on"
+WRITTEN = "what was written so far stays; run it again"
 COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "run": ("benchmarks.run", "train, deploy and score methods on a task", RESUMED),
-    "train": ("benchmarks.train", "train a task's expert (PPO)", NOTHING),
+    "train": ("benchmarks.train", "train a task's expert (PPO)", WRITTEN),
     "check": ("benchmarks.check", "does a task meet the contract? its tests", NOTHING),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?", NOTHING),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from logs alone", REPEATED),
@@ -26,18 +28,18 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "data": ("benchmarks.data", "write demonstrations or explorations as a Minari data set", NOTHING),
     "push": ("benchmarks.push", "share an agent or a Minari data set on the Hugging Face hub", NOTHING),
     "pull": ("benchmarks.pull", "fetch an agent or a data set from the hub", NOTHING),
-    "report": ("benchmarks.report", "make a run's report again, without training", NOTHING),
-    "compare": ("benchmarks.compare", "compare methods over seeds and tasks: tables and figures for a paper", NOTHING),
+    "report": ("benchmarks.report", "make a run's report again, without training", WRITTEN),
+    "compare": ("benchmarks.compare", "compare methods over seeds and tasks: tables and figures for a paper", WRITTEN),
     "verify": ("benchmarks.verify", "run a record's seed again, and compare", NOTHING),
     "version": ("benchmarks.version", "versions, machine and GL, for a bug report", NOTHING),
-    "table": ("benchmarks.studies.table", "make the records that are missing or stale", RESUMED),
-    "publish": ("benchmarks.studies.publish", "write the pages of docs/ again, with a finished run too", NOTHING),
+    "table": ("benchmarks.studies.table", "make the records that are missing or stale", REPEATED),
+    "publish": ("benchmarks.studies.publish", "write the pages of docs/ again, with a finished run too", WRITTEN),
     "site": ("benchmarks.studies.site", "build the documentation site", NOTHING),
     "paper": ("benchmarks.studies.paper", "figures 2 and 3 of the paper", RESUMED),
-    "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", REPEATED),
+    "performance": ("benchmarks.studies.performance", "what the benchmark costs: steps a second, CPU seconds", WRITTEN),
     "tune": ("benchmarks.studies.tune", "the baselines' tuning", REPEATED),
-    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: scores under more and less noise", RESUMED),
-    "exploration": ("benchmarks.studies.exploration", "scores against the amount of exploration", RESUMED),
+    "spectrum": ("benchmarks.studies.spectrum", "where delusion begins: scores under more and less noise", REPEATED),
+    "exploration": ("benchmarks.studies.exploration", "scores against the amount of exploration", REPEATED),
 }
 
 
@@ -62,7 +64,7 @@ def main(*first: str) -> None:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("deconfounded"):
             raise
-        extra = name if name in ("train", "foreign") else "data" if error.name in ("minari", "h5py", "pyarrow") else "bench"
+        extra = EXTRAS.get(name) or ("data" if error.name in ("minari", "h5py", "pyarrow") else "bench")
         end(f"error: {error.name} is not installed; `pip install deconfounded-imitation[{extra}]` brings it")
 
 

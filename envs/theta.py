@@ -31,6 +31,11 @@ class ThetaModel:
         return u
 
     @property
+    def draws_by_latents(self) -> bool:
+        """Whether theta is drawn from its latents' ranges, and not by a `sample_theta` of the task's own."""
+        return type(self).sample_theta is ThetaModel.sample_theta
+
+    @property
     def drifts(self) -> bool:
         """Whether theta changes between the episodes of a trial."""
         return any(lat.drift for lat in self.latents)

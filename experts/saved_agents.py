@@ -20,6 +20,10 @@ ARRAYS = "agent.safetensors"
 CODE = "agent.py"  # source of an agent from outside, kept beside its arrays
 
 
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
 def save(agent: Agent, folder: Path, **about: Any) -> None:
     """Save an agent: its class by name, its settings, its arrays; about: further entries of agent.json.
 
@@ -33,10 +37,12 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
         code = source.read_bytes()
     settings, named = agent.state()
     about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
+    if code is not None:
+        about["code"] = _sha256(code)
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
         content = to_bytes(named)
-        described = as_json(file, sealed({**about, "arrays": hashlib.sha256(content).hexdigest()}))
+        described = as_json(file, sealed({**about, "arrays": _sha256(content)}))
     except InputError:
         raise
     except Exception as error:  # any error of the class's own `state`
@@ -66,13 +72,15 @@ def _check_loadable(cls: type[Agent], settings: str, content: bytes) -> None:
 
 
 def describe(folder: Path) -> dict[str, Any]:
-    """Read agent.json. Raises InputError if there is none, or it is damaged."""
+    """Read agent.json. Raises InputError if there is none, or it is damaged, or the agent's code is another one."""
     try:
         about = read_sealed(folder / "agent.json")
     except OSError:
         raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
     if [type(about.get(key)) for key in ("class", "settings", "arrays")] != [str, dict, str]:
         raise InputError(f"{folder / 'agent.json'} is of no agent; run the benchmark again")
+    if "code" in about and (not (code := folder / CODE).is_file() or _sha256(code.read_bytes()) != about["code"]):
+        raise InputError(f"{code} is missing, damaged, or of another agent; run the benchmark again")
     return about
 
 
@@ -82,7 +90,7 @@ def arrays(folder: Path, about: dict[str, Any]) -> bytes:
         content = (folder / ARRAYS).read_bytes()
     except OSError as error:
         raise InputError(f"{folder / ARRAYS} cannot be read: {error.strerror}") from None
-    if hashlib.sha256(content).hexdigest() != about["arrays"]:
+    if _sha256(content) != about["arrays"]:
         raise InputError(f"{folder / ARRAYS} is damaged, or of another agent; run the benchmark again")
     return content
 

@@ -139,9 +139,6 @@ class DemonstrationJob(Job):
     def ticks(self) -> int:
         return 20
 
-    def file(self, seed: int) -> Path:
-        return self.folder / f"demonstrations-{seed}.npz"
-
     def run(self) -> str:
         start = time.time()
         trials = self.context().demonstrations

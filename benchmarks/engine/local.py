@@ -100,7 +100,7 @@ class Local(Engine):
                 process.kill()
             self.__exit__()
             if isinstance(error, BrokenProcessPool):
-                raise envs.InputError("a worker process was killed (out of memory?); --resume goes on") from None
+                raise envs.InputError("a worker process was killed (out of memory?); run it again") from None
             raise
 
 

@@ -45,7 +45,7 @@ def why_not(protocol: str, task: envs.Task) -> str:
     """Why a task cannot be under a protocol of PROTOCOLS; empty if it can."""
     if protocol != "unseen":
         return ""
-    if not task.has_likelihood or type(task).sample_theta is not envs.Task.sample_theta:
+    if not task.draws_by_latents:
         return "it draws theta by its own sample_theta"
     if task.drifts or task.switches:
         return "its theta moves, and would leave the middle"

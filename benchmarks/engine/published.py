@@ -1,6 +1,7 @@
 """What comes with the package, in a checkout and installed alike: certificates of tasks, and records of methods."""
 
 import json
+from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import ROOT
@@ -9,11 +10,16 @@ CERTIFICATES, RECORDS = ROOT / "docs" / "certificates", ROOT / "docs" / "records
 GROUPS = ("certified", "suite", "hard")  # names for several tasks
 
 
+def certificate(name: str, suffix: str = ".json") -> Path:
+    """Where a task's certificate is kept, or its picture (.png)."""
+    return CERTIFICATES / ("hard" if name in envs.HARD else "") / f"{name}{suffix}"
+
+
 def certified() -> list[str]:
     """Names of the suite's tasks whose certificate is passed."""
 
     def passed(name: str) -> bool:
-        file = CERTIFICATES / f"{name}.json"
+        file = certificate(name)
         return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
 
     return [name for name in envs.SUITE if passed(name)]

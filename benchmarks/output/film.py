@@ -2,6 +2,7 @@
 
 import base64
 import io
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from PIL import Image, ImageDraw
 
 from deconfounded import envs
 from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.agent import Agent
 from deconfounded.experts.rollout import run_trials
 
@@ -149,13 +151,21 @@ def film(task: envs.Task, clips: Clips, most: int = FRAMES) -> Film:
     return Film(pictures, frame_rate(task) / stride)
 
 
+def save(pictures: Sequence[NDArray[Any]], rate: float, file: Path) -> None:
+    """Pictures [H, W, 3], so many a second, as .mp4; written in one step."""
+    with tempfile.TemporaryDirectory() as scratch:
+        made = Path(scratch) / "film.mp4"
+        imageio.mimsave(made, list(pictures), fps=rate, quality=7, macro_block_size=2)
+        write_atomically(file, made.read_bytes())
+
+
 def write(task: envs.Task, clips: Clips, file: Path) -> None:
     """The film as .mp4. Raises InputError where no GL works."""
-    imageio.mimsave(file, film(task, clips).pictures, fps=frame_rate(task), quality=7, macro_block_size=2)
+    save(film(task, clips).pictures, frame_rate(task), file)
 
 
 def record(env: envs.BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None) -> dict[str, Any]:
-    """The clip of an agent's first trial; theta [N, L]: None: drawn from p(theta)."""
+    """The clip of an agent, of the trial that `Recorder` films; theta [N, L]: None: drawn from p(theta)."""
     from deconfounded.benchmarks.engine.benchmark import Recorder
 
     recorder = Recorder(agent, env, filmed=True)

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import sources
+from deconfounded.benchmarks.engine import published, sources
 from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.job_files import Finished
@@ -18,7 +18,6 @@ from deconfounded.benchmarks.output.pictures import colour, colours, encoded, ma
 from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
-from deconfounded.envs.support.origin import ROOT
 
 
 def check_references(task: envs.Task, about: dict[str, Any], finished: Finished) -> None:
@@ -50,7 +49,9 @@ def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Pa
 
 
 def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folder: Path) -> None:
-    """Curves, and a video where a GL works."""
+    """Curves, and a video where a GL works; those of earlier results are gone, whatever becomes of the new ones."""
+    for name in (*PICTURES, "video.mp4"):
+        (folder / name).unlink(missing_ok=True)
     adaptation(results, folder / "adaptation.png")
     learning(results, folder / "learning.png")
     clips: film.Clips = {}
@@ -145,8 +146,8 @@ PICTURES = {
 
 def certificate(task: str, version: int, run: Path) -> Path | None:
     """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/."""
-    for parent in (run.absolute().parent, ROOT / "docs"):
-        picture = parent / "certificates" / f"{task}.png"
+    beside = run.absolute().parent / "certificates" / f"{task}.png"
+    for picture in (beside, published.certificate(task, ".png")):
         try:
             certified = json.loads(picture.with_suffix(".json").read_bytes())
             if (certified["task"], certified["task_version"]) == (task, version) and picture.is_file():

@@ -16,6 +16,13 @@ from deconfounded.envs.streams import Array
 VERSION = 2  # raised when the same records come to other figures
 
 
+def check_references(task: str, random: float, expert: float) -> None:
+    """Raises InputError unless the expert's mean return is above that of random actions."""
+    if not expert > random:
+        says = f"the expert returns {expert:.4g} an episode, random actions {random:.4g}"
+        raise envs.InputError(f"{task}: {says}; scores need an expert that is better")
+
+
 def normalise(returns: Array, random: float, expert: float) -> Array:
     """Returns of any shape -> scores; 0 = random actions, 1 = the expert."""
     return (returns - random) / (expert - random)
@@ -99,19 +106,18 @@ def mean_budget(budgets: Sequence[dict[str, int]]) -> dict[str, int]:
 
 
 def summarise(
-    by_method: dict[str, list[dict[str, Any]]], episodes: int, references: tuple[float, float] | None = None
+    by_method: dict[str, list[dict[str, Any]]], episodes: int, references: tuple[float, float]
 ) -> dict[str, Any]:
     """Records by method, random and expert among them -> the `methods` entry of results.json.
 
     `episodes` is the length of the trials trained on; what agents did in later ones, if any, is told apart.
-    references: the returns that have score 0 and 1; None: those of random and expert here.
+    references: the returns that have score 0 and 1.
     """
 
     def stacked(name: str, key: str) -> Array:
         return np.array([record[key] for record in by_method[name]])
 
-    own = (float(stacked(name, "returns")[:, :episodes].mean()) for name in REFERENCES)
-    random, expert = references or tuple(own)
+    random, expert = references
     methods = {}
     for name, seeds in by_method.items():
         returns = stacked(name, "returns")
@@ -159,10 +165,11 @@ def outcome(methods: dict[str, Any]) -> str:
         scores = [f"{name} ({two_decimals(methods[name]['score_last'])})" for name in names]
         return " and ".join(filter(None, [", ".join(scores[:-1]), scores[-1]]))
 
-    seeds = max(len(entry["seeds"]) for entry in methods.values())
-    basis = f"Scores of the last episode, {'of one seed' if seeds == 1 else f'means of {seeds} seeds'}."
     judged = [name for name, entry in methods.items() if entry["tier"] in "123" and not entry["deployment"]]
     judged.sort(key=lambda name: -methods[name]["score_last"])
+    named = [*judged, *(name for name in EXACT if name in methods)] or methods
+    seeds = fewest_to_most([len(methods[name]["seeds"]) for name in named])
+    basis = f"Scores of the last episode, {'of one seed' if seeds == '1' else f'means of {seeds} seeds'}."
     if not judged or not set(EXACT) <= set(methods):
         text = (
             f"{listed(*judged)}, where the expert has 1; no"
@@ -266,7 +273,7 @@ def plain_table(head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Seq
     """
     columns, out = list(zip(head, *rows, strict=True)), list[str]()
     width = shutil.get_terminal_size((10_000, 24)).columns  # a file has room
-    for name in dropped:
+    for name in (name for name in dropped if name in head):
         if sum(max(map(len, column)) + 2 for column in columns) - 2 <= width:
             break
         columns = [column for column in columns if column[0] != name]

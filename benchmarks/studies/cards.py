@@ -2,14 +2,16 @@
 
 import inspect
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import published
 from deconfounded.envs.patches import PatchedTask
+from deconfounded.envs.support.files import write_json
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 TIERS = {None: "none: no imitator can succeed", 2: "2: exploration is enough", 3: "3: queries of the expert are needed"}
@@ -26,6 +28,19 @@ def kept(name: str) -> Any:
     return json.loads(file.read_bytes()) if file.is_file() else None
 
 
+def changed(file: Path, change: Callable[[Any], Any]) -> Any:
+    """Change what a .json file holds, in one step, and return it; meanwhile other programs wait to do so.
+
+    change: what it holds (None: there is none) -> what it is to hold.
+    """
+    from filelock import FileLock
+
+    with FileLock(file.with_suffix(".lock")):
+        made = change(json.loads(file.read_bytes()) if file.is_file() else None)
+        write_json(file, made)
+    return made
+
+
 def nats(certificate: dict[str, Any]) -> list[str]:
     """Evidence of theta a step, along expert trajectories: from dynamics, from actions."""
     evidence = (certificate["evidence_nats_per_step"][kind] for kind in ("dynamics", "actions"))
@@ -39,7 +54,7 @@ def certified(names: Sequence[str] = envs.SUITE) -> dict[str, dict[str, Any]]:
 
 def certificate_of(name: str) -> str:
     """Where in docs/ a task's certificate is kept, and its picture, without the end of their names."""
-    return f"certificates/{'hard/' * (name in envs.HARD)}{name}"
+    return published.certificate(name, "").relative_to(DOCS).as_posix()
 
 
 def certificates(held: dict[str, Any]) -> str:

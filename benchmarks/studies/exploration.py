@@ -4,7 +4,6 @@ Each method that explores or queries the expert, with all of its preset's trials
 Records in docs/ stand for the first. Interrupted, it goes on where it was; points of former runs are kept.
 """
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +17,8 @@ from deconfounded.benchmarks.engine.protocols import STEPWISE
 from deconfounded.benchmarks.output.pictures import colour, panels
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import runs
-from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
-from deconfounded.envs.support.files import check_folder, write_json
+from deconfounded.benchmarks.studies.cards import DOCS, changed, markdown_table
+from deconfounded.envs.support.files import check_folder
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -131,14 +130,16 @@ def measured(made: "list[Record]", method: str, share: int) -> Point:
 
 
 def added(file: Path, point: Point) -> dict[Key, Point]:
-    """The points of a file, with one more or in place of the one before; other programs may add to it, too."""
-    from filelock import FileLock
+    """The points of a file, with one more or in place of the one before."""
 
-    with FileLock(file.with_suffix(".lock")):
-        every = [*json.loads(file.read_bytes()), point] if file.is_file() else [point]
-        points = {(p["task"], p["method"], p["share"]): p for p in every}
-        write_json(file, [points[key] for key in sorted(points)])
-    return points
+    def by_key(points: list[Point]) -> dict[Key, Point]:
+        return {(p["task"], p["method"], p["share"]): p for p in points}
+
+    def more(before: list[Point] | None) -> list[Point]:
+        points = by_key([*(before or ()), point])
+        return [points[key] for key in sorted(points)]
+
+    return by_key(changed(file, more))
 
 
 def main() -> None:

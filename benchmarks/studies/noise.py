@@ -1,4 +1,4 @@
-"""Tasks of the suite under more or less noise, for spectrum.py: `noisier.py:TiltedCartpoleProcess4`, `...Expert05`.
+"""Tasks of the suite under more or less noise, for spectrum.py: `noise:TiltedCartpoleProcess4`, `...Expert05`.
 
 Process noise is that of every joint, times a factor; the expert's is its action noise. Bodies, thetas, rewards and the
 experts' networks are the suite's own.

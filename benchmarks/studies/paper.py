@@ -253,7 +253,7 @@ def figure_3(finished: Finished, references: dict[str, dict[str, Any]], file: Pa
 
 
 def main() -> None:
-    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10).parse_args()
+    args = commands.parser(__doc__, f"`all`, or some of {', '.join(LEARNERS)}", seeds=10, resumes=True).parse_args()
     methods = commands.check(args, LEARNERS, SHOWN)
     task = envs.get("bandit")
     folder = args.out or Path("results") / f"paper-{args.preset}"

@@ -6,8 +6,8 @@ pass of the RNN) and by the values of the exact policies' grid, each with the po
 an update of S seeds in one program over those of one seed: S means that stacking gains nothing, 1 that the other seeds
 come for free. training: CPU seconds of one seed of each learned method (set OMP_NUM_THREADS=1). latency: milliseconds
 of an agent's step in one environment, by method (minutes). cost: score in the last episode against CPU seconds, for
-each learned method, with shares of the default preset's updates; where the curve is flat, a smaller share does. Each
-part writes a .json, and most a .png.
+each learned method, with shares of the default preset's updates; where the curve is flat, a smaller share does. The
+last three leave out deconfounded_gru, which takes long. Each part writes a .json, and most a .png.
 """
 
 import argparse
@@ -187,7 +187,7 @@ def cost(args: argparse.Namespace) -> None:
     from deconfounded.benchmarks.output.index import last_scores
 
     for task in args.tasks or map(envs.get, COST):
-        full, measured = preset("default", task, args.device), dict[str, Any]()
+        full, measured = preset("default", task, "cpu"), dict[str, Any]()
         for share in SHARES:
             settings = replace(full, configs={name: scaled(config, share) for name, config in full.configs.items()})
             own = args.out / f"cost-{task.name}" / f"{share:g}"
@@ -220,7 +220,7 @@ def training(args: argparse.Namespace) -> None:
     from deconfounded.deconf.core.monitor import Monitor
 
     task, measured = envs.get(GRID), dict[str, float]()
-    settings = preset("default", task, args.device)
+    settings = preset("default", task, "cpu")
     for method in LEARNED:
         start = time.process_time()
         fit(Context(task, settings, (0,), Monitor()), method)
@@ -250,7 +250,8 @@ PARTS = {
 
 
 def main() -> None:
-    parser = Parser(__doc__, "--device")
+    parser = Parser(__doc__)
+    parser.add_argument("--device", default="cpu", help="torch device, of seeds alone; the other parts are of a CPU")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
     named = f"of speed and cost; default: all with physics, and {', '.join(COST)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=(), help=named)

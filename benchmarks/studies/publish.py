@@ -57,7 +57,7 @@ def clip(video: Path, file: Path, mark: str) -> None:
 def copy(source: Path, file: Path) -> None:
     """Copy a picture, unless the one that is there was made of the same."""
     if not mark_of(source) or mark_of(source) != mark_of(file):
-        shutil.copy(source, file)
+        write_atomically(file, source.read_bytes())
 
 
 def check_certificate(file: Path, task: envs.Task) -> None:
@@ -71,7 +71,7 @@ def check_certificate(file: Path, task: envs.Task) -> None:
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         right = False
     if not right:
-        raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run certify.py again")
+        raise envs.InputError(f"{file} is no certificate of {task.name} v{task.version}; run `deconf certify` again")
 
 
 def keep(run: Path) -> None:
@@ -111,7 +111,7 @@ def keep(run: Path) -> None:
         else:
             (DOCS / f"{task.name}.webp").unlink(missing_ok=True)
     for file in certificates:
-        shutil.copy(file, DOCS / "certificates")
+        write_atomically(DOCS / "certificates" / file.name, file.read_bytes())
 
 
 def _filled(file: Path, tables: dict[str, str]) -> str:

@@ -210,7 +210,7 @@ def _scores(name: str, found: index.Found) -> str:
     return f"{text} {scoring.INTERVALS}\n\n{markdown_table(head, rows)}" if rows else "There are no records."
 
 
-def _behind(name: str, found: index.Found, most: int = 3) -> str:
+def _behind(name: str, found: index.Found) -> str:
     """The tasks on which a method is furthest behind the exact interventional policy."""
     gaps = list[tuple[float, str]]()
     for task, made in found:
@@ -218,7 +218,7 @@ def _behind(name: str, found: index.Found, most: int = 3) -> str:
             score, exact = (of[one]["score_last"] for one in (name, "interventional"))
             words = f"`{task.name}`, {scoring.two_decimals(score)} of {scoring.two_decimals(exact)}"
             gaps.append((score - exact, words))
-    worst = "; ".join(words for gap, words in sorted(gaps)[:most] if gap < 0)
+    worst = "; ".join(words for gap, words in sorted(gaps)[:3] if gap < 0)
     return f"Furthest behind the exact interventional policy, in the last episode: {worst}." if worst else ""
 
 

@@ -60,13 +60,18 @@ def table(points: list[Point]) -> str:
     rows = [
         (
             *(task, kind, f"{point['factor']:g}", *nats(point["certificate"]), point["certificate"]["verdict"]),
-            *(two_decimals(np.mean(point["scores"][method])) for method in (*EXACT, *LEARNED)),
+            *(two_decimals(np.mean(point["scores"][method])) for method in _methods(points)),
         )
         for task, kind, of in _columns(points)
         for point in of
     ]
     certified = ("dynamics, nats a step", "actions, nats a step", "certificate")
-    return markdown_table(("task", "noise", "times", *certified, *EXACT, *LEARNED), rows)
+    return markdown_table(("task", "noise", "times", *certified, *_methods(points)), rows)
+
+
+def _methods(points: list[Point]) -> list[str]:
+    """Those that every point has scores of."""
+    return [name for name in (*EXACT, *LEARNED) if all(name in point["scores"] for point in points)]
 
 
 def picture(points: list[Point], file: Path, mark: str = "") -> None:
@@ -76,7 +81,7 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
     with panels(file, 2, len(columns), size=(4.1 * len(columns), 6.2), dpi=100, mark=mark, **shared) as grid:
         for (task, kind, of), (above, below) in zip(columns, grid.T, strict=True):
             factors = [point["factor"] for point in of]
-            for method in (*EXACT, *LEARNED):
+            for method in _methods(points):
                 scores = [np.array(point["scores"][method]) for point in of]
                 hue, style = colour(method), "--" if method in EXACT else "o-"
                 above.plot(factors, [x.mean() for x in scores], style, color=hue, label=method)

@@ -15,8 +15,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES, check_names
 from deconfounded.benchmarks.studies import runs
-from deconfounded.benchmarks.studies.cards import DOCS
-from deconfounded.envs.support.files import write_json
+from deconfounded.benchmarks.studies.cards import DOCS, changed
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset
@@ -78,10 +77,12 @@ def kept(file: Path) -> list[dict[str, Any]]:
 
 def keep(row: dict[str, Any], file: Path) -> None:
     """Among the file's rows, in place of the one of the same method and setting."""
-    rows = {(held["method"], held["setting"]): held for held in kept(file)}
-    rows[row["method"], row["setting"]] = row
-    ordered = sorted(rows.values(), key=lambda row: list(TRIED).index(row["method"]))
-    write_json(file, {"seeds": SEEDS, "rows": ordered})
+
+    def more(before: dict[str, Any] | None) -> dict[str, Any]:
+        rows = {(held["method"], held["setting"]): held for held in (*(before or {"rows": ()})["rows"], row)}
+        return {"seeds": SEEDS, "rows": sorted(rows.values(), key=lambda row: list(TRIED).index(row["method"]))}
+
+    changed(file, more)
 
 
 def main() -> None:

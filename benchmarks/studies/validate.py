@@ -19,10 +19,9 @@ from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.output.scoring import two_decimals
 from deconfounded.benchmarks.studies import gap, noise, runs, spectrum, unconfounded
-from deconfounded.benchmarks.studies.cards import DOCS, kept, markdown_table
+from deconfounded.benchmarks.studies.cards import DOCS, certificate_of, changed, kept, markdown_table
 from deconfounded.deconf.diagnosis.advice import VARY_LATENT
 from deconfounded.deconf.diagnosis.verdict import Diagnosis, with_tier
-from deconfounded.envs.support.files import write_json
 from deconfounded.envs.task import ASSETS
 
 CASES: dict[str, str | None] = {
@@ -116,7 +115,7 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
 def certificate(task: envs.Task, source: str | None, folder: Path) -> bool:
     """Whether it is passed: docs/ says so of the suite and of its variants; of others it is made here."""
     if task.name in envs.SUITE:
-        made = kept(f"certificates/{task.name}")
+        made = kept(certificate_of(task.name))
     elif of := point(task):
         made = of["certificate"]
     else:
@@ -173,6 +172,16 @@ def picture(rows: list[dict[str, Any]], file: Path, mark: str = "") -> None:
     gap.picture(points, file, "the diagnosis", mark)
 
 
+def keep(row: dict[str, Any], order: list[str]) -> None:
+    """Among the rows in docs/, in place of the one of the same case."""
+
+    def more(before: list[dict[str, Any]] | None) -> list[dict[str, Any]]:
+        rows = {held["case"]: held for held in (*(before or ()), row)}
+        return [rows[case] for case in order if case in rows]
+
+    changed(DOCS / f"{KEPT}.json", more)
+
+
 def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--tasks", nargs="+", metavar="NAME", help="some of the cases; default: all")
@@ -209,8 +218,7 @@ def main() -> None:
             "figures": {key: figure._asdict() for key, figure in diagnosis.figures.items()},
             **about,
         }
-        rows = {row["case"]: row for row in kept(KEPT) or ()} | {name: row}
-        write_json(DOCS / f"{KEPT}.json", [rows[case] for case in cases if case in rows])
+        keep(row, list(cases))
         print(f"{task.name}: {diagnosis.verdict}, {'right' if row['right'] else 'WRONG'}")
     picture(kept(KEPT), DOCS / f"{KEPT}.png")
     print(f"{summary(kept(KEPT))} -> {DOCS / KEPT}.png")

@@ -420,7 +420,7 @@ class TestScore:
                 }
                 for seed, value in enumerate(by_seed)
             ]
-        methods = scoring.summarise(by_method, 2)
+        methods = scoring.summarise(by_method, 2, (10.0, 30.0))
         assert methods["other"]["objective"] == [-25, -25]
         assert methods["other"]["score"] == [0.75, 0.75]
         assert methods["other"]["return"] == [[24.0, 24.0], [26.0, 26.0]]

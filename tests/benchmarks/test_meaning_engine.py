@@ -35,7 +35,7 @@ def test_a_killed_worker_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixtu
         run_command(lambda: scheduler.run_jobs([job], "killed", engine.run))
     assert ended.value.code == 2
     said = capsys.readouterr()
-    assert said.err == "error: a worker process was killed (out of memory?); --resume goes on\n"
+    assert said.err == "error: a worker process was killed (out of memory?); run it again\n"
     assert "random, seed 0" not in said.out
 
 

@@ -23,7 +23,7 @@ from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
 from deconfounded.deconf.exact import Grid
 from deconfounded.deconf.methods import memoryless_bc
-from deconfounded.envs.streams import Array
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import run_trials, thetas
@@ -85,6 +85,23 @@ def test_a_kept_agent_s_score() -> None:
     assert result["score"][0] < 0.3 < 0.8 < result["score"][1]
     half = 1.96 * by_trial[:, 1].std() / 8
     assert result["ci95_last"] == pytest.approx((by_trial[:, 1].mean() - half, by_trial[:, 1].mean() + half), abs=0.02)
+
+
+class Lower(toys.Push):
+    """Push, which draws the lower half of its thetas by a function of its own."""
+
+    def sample_theta(self, rng: Streams) -> Array:
+        return -np.abs(super().sample_theta(rng))
+
+
+def test_no_score_where_it_would_mean_nothing() -> None:
+    """Not if the expert is worse than random actions, nor of a range that the task's own `sample_theta` ignores."""
+    away = CallableExpert(PUSH, lambda obs, theta: np.sign(obs[:, :1]), "away")
+    with pytest.raises(envs.InputError, match=r"push: the expert returns .*; scores need an expert that is better"):
+        score_command.rescore(RandomAgent(PUSH.action_space), PUSH, away, 64, 7, PUSH)
+    assert score_command.with_ranges(PUSH, ["force=0:.5"]).latents[0].high == 0.5
+    with pytest.raises(envs.InputError, match="draws theta by its own sample_theta alone"):
+        score_command.with_ranges(Lower(), ["force=0:.5"])
 
 
 class Replayed(Agent):
@@ -295,13 +312,15 @@ def test_episodes_beyond_training_move_no_score() -> None:
     seeds = {"random": [0.0, 0.0, 9.0, 9.0], "expert": [10.0, 10.0, 50.0, 50.0]}
     by_method = {name: [record(name, returns)] * 2 for name, returns in seeds.items()}
     by_method["other"] = [record("other", [2.0, 4.0, 30.0, 40.0]), record("other", [2.0, 6.0, 30.0, 40.0])]
-    summary = scoring.summarise(by_method, 2)["other"]
+    beside = [{**each, "task": "mine", "episodes": 2} for of in by_method.values() for each in of]
+    references = aggregation.references(beside[0], beside)
+    summary = scoring.summarise(by_method, 2, references)["other"]
     assert (summary["score"], summary["score_last"], summary["score_beyond"]) == ([0.2, 0.5], 0.5, [3.0, 4.0])
     assert summary["ci95"] == pytest.approx([0.4, 0.6])
     assert (summary["score_first"], summary["ci95_first"]) == (0.2, pytest.approx([0.2, 0.2]))
     assert summary["regret"] == pytest.approx(0.8 + 0.5)
     assert summary["ci95_regret"] == pytest.approx([0.8 + 0.4, 0.8 + 0.6])
-    assert scoring.summarise(by_method, 2)["expert"]["regret"] == 0
+    assert scoring.summarise(by_method, 2, references)["expert"]["regret"] == 0
 
 
 def test_rows_csv_is_row_by_row_what_came_of_it() -> None:

@@ -856,6 +856,10 @@ def fit(given): return Constant(-0.25)
         assert saved_agents.describe(tmp_path / "kept")["class"] == "agent.py:Constant"
         again = deconfounded.load(tmp_path / "kept")
         np.testing.assert_array_equal(run_trials(context.env, again, 1, 3).returns, expected)
+        with (tmp_path / "kept" / "agent.py").open("a") as file:
+            file.write("print('runs')\n")
+        with pytest.raises(envs.InputError, match=r"agent\.py is missing, damaged, or of another agent"):
+            deconfounded.load(tmp_path / "kept")
 
 
 class TestSentences:

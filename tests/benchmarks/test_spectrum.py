@@ -61,6 +61,11 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
         assert [float(cell) for cell in row[6:]] == pytest.approx([float(row[2]) + 0.1] * 5, abs=0.0051)
     spectrum.picture(points, tmp_path / "spectrum.png")
     assert (tmp_path / "spectrum.png").read_bytes().startswith(PNG)
+    for point in points:  # as of `--methods naive_rnn dagger`
+        del point["scores"]["deconfounded"]
+    assert spectrum.table(points).splitlines()[0].endswith("| conditional | interventional | naive_rnn | dagger |")
+    spectrum.picture(points, tmp_path / "some.png")
+    assert (tmp_path / "some.png").read_bytes().startswith(PNG)
 
 
 def test_scores_above_and_evidence_below(figures: list[Any], tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ import gymnasium
 import numpy as np
 
 from deconfounded.benchmarks.studies.foreign.world import World
-from deconfounded.envs.streams import Array, Mask, Obs
-from deconfounded.experts.agent import Agent
+from deconfounded.envs.streams import Array
 
 GEAR, LOAD, GUST, DT = 200.0, 40.0, 1.0, 0.02  # N m an action of 1; N m; rad/s a step; s
 STIFFNESS, DAMPING = 50.0, 14.0  # of the expert's error dynamics: 1/s^2, 1/s
@@ -54,26 +53,3 @@ class Arm(World):
         error = np.array([shoulder, elbow]) - angle
         error[0] = (error[0] + np.pi) % (2 * np.pi) - np.pi
         return (STIFFNESS * error - DAMPING * speed + speed - theta) / GEAR  # inertia and friction of a joint are 1
-
-
-class Filter(Agent):
-    """The linear-Gaussian filter of the loads, and the expert at their mean.
-
-    A joint's speed is v' = v + DT (GEAR a + theta - v) + gust, with a in [-1, 1] and theta ~ N(0, LOAD^2 / 3).
-    """
-
-    def __init__(self, world: Arm) -> None:
-        self.world = world
-
-    def begin(self, n: int) -> None:
-        self._total, self._precision = np.zeros((n, 2)), np.full((n, 1), 3 / LOAD**2)
-
-    def act(self, obs: Obs) -> Array:
-        mean = self._total / self._precision
-        return np.stack([self.world.expert(*pair) for pair in zip(obs.astype(float), mean, strict=True)]).clip(-1, 1)
-
-    def observe(self, obs: Obs, action: Array, next_obs: Obs, alive: Mask) -> None:
-        before, after = obs[:, 6:8].astype(float), next_obs[:, 6:8]
-        change = after - before - DT * (GEAR * action - before)
-        self._total += alive[:, None] * DT * change / GUST**2
-        self._precision += alive[:, None] * DT**2 / GUST**2

@@ -1,6 +1,6 @@
 """Is a diagnosis right on simulators of others? `deconf foreign`
 
-In each world (cases.py) agents are trained and their returns measured; then its logs are diagnosed. docs/diagnose/
+In each world (cases.py) agents are trained and their returns measured, and its logs are diagnosed. docs/diagnose/
 foreign.json has a row each. It needs `pip install .[foreign]`; interrupted, it goes on where it was.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, check_names
-from deconfounded.benchmarks.studies.cards import DOCS, kept
+from deconfounded.benchmarks.studies.cards import DOCS, changed
 from deconfounded.benchmarks.studies.foreign.cases import CASES, EXPLORED, SEED, TRIALS, Case
 from deconfounded.benchmarks.studies.foreign.report import KEPT
 from deconfounded.benchmarks.studies.foreign.world import (
@@ -161,12 +161,16 @@ def diagnosed(case: Case, folder: Path) -> str:
 
 def write(case: Case, **measured: Any) -> None:
     """Put what was measured in the case's row."""
-    rows = {row["case"]: row for row in kept(KEPT) or ()}
     versions = identity.versions() | {name: metadata.version(name) for name in SIMULATORS}
     about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": versions}
     row = {"case": case.name, "world": case.reference, "tier": case.tier, "unseen": case.unseen}
-    rows[case.name] = rows.get(case.name, {}) | row | measured | about
-    write_json(DOCS / f"{KEPT}.json", [rows[case.name] for case in CASES if case.name in rows])
+
+    def more(before: list[dict[str, Any]] | None) -> list[dict[str, Any]]:
+        rows = {held["case"]: held for held in before or ()}
+        rows[case.name] = rows.get(case.name, {}) | row | measured | about
+        return [rows[each.name] for each in CASES if each.name in rows]
+
+    changed(DOCS / f"{KEPT}.json", more)
 
 
 def main() -> None:
