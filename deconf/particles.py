@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from deconfounded.deconf.core.deployment import Way, acted_on
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.envs import BatchEnv, Task
+from deconfounded.envs.latent import folded
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
@@ -126,8 +127,7 @@ class Particles:
 
     def _set(self, rows: NDArray[np.int64], u: Array) -> None:
         """Replace the particles of trials `rows` by those of quantiles u [M, K, L], folded into [0, 1)."""
-        u = np.abs(u) % 2
-        self._u[rows] = u = np.minimum(u, 2 - u).clip(max=1 - 1e-9)
+        self._u[rows] = u = folded(u).clip(max=1 - 1e-9)
         theta = np.stack([lat.ppf(u[..., i]) for i, lat in enumerate(self.task.latents)], -1)
         share = self._simulated
         changed = (theta != self.theta[rows])[:, share].any(-1)

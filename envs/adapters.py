@@ -79,11 +79,11 @@ class GymEnv(gym.Env[Any, Any]):
         self._pictures, self._warned = _Pictures(self.batch), False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
-        super().reset(seed=seed)
         self._warned = False
         if seed is None and not options and 0 < self._episode < self.episodes:
             options = {"keep_theta": True}
         obs = self.batch.reset(seed, options)[0]
+        super().reset(seed=None if seed is None else int(np.ravel(seed)[0]))
         self._episode = self._episode + 1 if (options or {}).get("keep_theta", False) else 1
         return obs, {}
 

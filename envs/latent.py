@@ -13,6 +13,12 @@ from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
 
 
+def folded(u: Array) -> Array:
+    """Quantiles [...] of a walk that is reflected at 0 and 1, from those of one that is not."""
+    u = np.abs(u) % 2
+    return np.minimum(u, 2 - u)
+
+
 @dataclass(frozen=True)
 class Latent:
     """One hidden physical parameter and its distribution p(theta).
@@ -83,8 +89,7 @@ class Latent:
 
     def drifted(self, theta: Array, normal: Array) -> Array:
         """Theta [...] of a trial's next episode, by standard normal draws of the same shape."""
-        u = np.abs(self.cdf(theta) + self.drift * normal) % 2  # the reflected walk is a periodic one, folded
-        return self.ppf(np.minimum(u, 2 - u)).clip(self.low, self.high)
+        return self.ppf(folded(self.cdf(theta) + self.drift * normal)).clip(self.low, self.high)
 
     def transition(self, k: int) -> Array:
         """Transition matrix [K, K] of `grid(k)`: P(bin of value j in the next episode | value i).

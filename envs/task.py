@@ -175,7 +175,7 @@ class Task(ThetaModel, ABC):
 
     @property
     def gym_id(self) -> str:
-        """Gymnasium's id of the task, such as deconf/SlipperyCartpole-v0."""
+        """Gymnasium's id of the task, such as deconf/SlipperyCartpole-v1."""
         return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
 
     def without_switches(self) -> Self:

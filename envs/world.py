@@ -91,6 +91,8 @@ def facts(cls: type[World]) -> Facts:
     observations, space = env.observation_space.shape[0], env.action_space  # type: ignore[index]
     env.close()
     assert isinstance(space, spaces.Box | spaces.Discrete)
+    if isinstance(space, spaces.Discrete) and noise > 1:
+        raise InputError(f"noise of {name} was {noise!r}; of discrete actions it is a share, from 0 to 1")
     return Facts(world, world.episodes, world.steps, float(noise), draws, latents, observations, space)
 
 

@@ -177,8 +177,10 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
         weight, bias = weights.get(f"{i}.weight"), weights.get(f"{i}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:
             raise InputError(f"expert weights at {file} lack a whole layer {i}; {remedy}")
-        if weight.shape[1] != width or not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            raise InputError(f"layer {i} of {file} takes {weight.shape[1]} finite inputs, not {width}; {remedy}")
+        if weight.shape[1] != width:
+            raise InputError(f"layer {i} of {file} takes {weight.shape[1]} inputs, not {width}; {remedy}")
+        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            raise InputError(f"layer {i} of {file} holds NaN or infinity; {remedy}")
         if weight.dtype.kind != "f" or bias.dtype.kind != "f":
             raise InputError(f"layer {i} of {file} is of {weight.dtype} and {bias.dtype}, not of float32; {remedy}")
         width = len(bias)
@@ -187,15 +189,20 @@ def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
     return weights
 
 
+def _is_closed(task: Task, source: str | Path | None) -> bool:
+    return bool(task.n_actions) or (source is None and task.has_closed_expert)
+
+
 def fingerprint(task: Task, source: str | Path | None = None) -> str:
-    """SHA-256 of a file of weights, by default the task's own, or `closed form`."""
-    file = path(task) if source is None else Path(source)
-    return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else "closed form"
+    """SHA-256 of a file of weights, by default the task's own, or `closed form`. Raises OSError if there is no file."""
+    if _is_closed(task, source):
+        return "closed form"
+    return hashlib.sha256((path(task) if source is None else Path(source)).read_bytes()).hexdigest()
 
 
 def version(task: Task, source: str | Path | None = None) -> int:
     """Version of an expert, raised by hand when its actions change: in the weights' card, or a closed form's task's."""
-    if task.n_actions or (source is None and task.has_closed_expert):
+    if _is_closed(task, source):
         return task.version
     stated = _card(path(task) if source is None else Path(source)).get("version")
     return stated if isinstance(stated, int) else 0

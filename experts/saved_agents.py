@@ -35,12 +35,12 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
         raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
     if cls.__module__.startswith(outside.PREFIX) and (source := outside.source(cls)) is not None:
         code = source.read_bytes()
-    settings, named = agent.state()
-    about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", "settings": settings, **about}
+    about = {"class": f"{cls.__module__ if code is None else CODE}:{cls.__qualname__}", **about}
     if code is not None:
         about["code"] = _sha256(code)
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
+        about["settings"], named = agent.state()
         content = to_bytes(named)
         described = as_json(file, sealed({**about, "arrays": _sha256(content)}))
     except InputError:
@@ -48,7 +48,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     except Exception as error:  # any error of the class's own `state`
         right = "its state() must return a dictionary for json and one of arrays"
         raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
-    _check_loadable(cls, json.dumps(settings), content)
+    _check_loadable(cls, json.dumps(about["settings"]), content)
     check_folder(folder)
     if code is not None:
         write_atomically(folder / CODE, code)

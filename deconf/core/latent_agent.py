@@ -21,15 +21,15 @@ from deconfounded.deconf.equations import imitation_loss
 class DeconfoundedAgent(LearnedAgent):
     """Algorithm 2, posterior sampling.
 
-    online: its belief in the course of a trial; None: that is the model's own. way: how it takes theta_hat from its
+    online: its belief in the course of a trial; None: that is the model's own. `way`: how it takes theta_hat from its
     belief (`core/deployment.py`).
     """
 
-    def __init__(
-        self, model: LatentModel, policy: ActionHead, online: OnlineBelief | None = None, way: Way = "step"
-    ) -> None:
+    way: Way = "step"
+
+    def __init__(self, model: LatentModel, policy: ActionHead, online: OnlineBelief | None = None) -> None:
         super().__init__(policy)
-        self.model, self.online, self.way = model, online, way
+        self.model, self.online = model, online
 
     @staticmethod
     def new(kind: str, latent: int, width: int, scales: Scales, draws: Draws) -> "DeconfoundedAgent":

@@ -13,8 +13,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.layers import Linear, Mlp
-
-HEAVY = 30.0  # excess kurtosis of labels: a normal distribution has 0, Laplace's 3
+from deconfounded.deconf.core.sizes import HEAVY
 
 
 def per_seed(statistic: Tensor, like: Tensor) -> Tensor:
@@ -168,9 +167,11 @@ class Whitener(nn.Module):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, features: int, draws: Draws, updates: int = 300, momentum: float = 0.05) -> None:
+    updates_left = 300
+    momentum = 0.05
+
+    def __init__(self, features: int, draws: Draws) -> None:
         super().__init__()
-        self.updates_left, self.momentum = updates, momentum
         self.register_buffer("mean", torch.zeros(len(draws), features, device=draws.device))
         self.register_buffer("variance", torch.ones(len(draws), features, device=draws.device))
 

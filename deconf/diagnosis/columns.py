@@ -4,12 +4,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from deconfounded.deconf.core.sizes import HEAVY
 from deconfounded.deconf.diagnosis import fits, labels
 from deconfounded.deconf.diagnosis.fits import Array, Steps
 from deconfounded.deconf.diagnosis.remark import Remark, listed
 from deconfounded.experts.datasets.logs import Log
 
-HEAVY = 30.0  # excess kurtosis: a normal distribution has 0, Laplace's 3
 CODES = {sign * (10**digits - 1.0) for digits in range(2, 8) for sign in (-1, 1)} | {-32768.0, 32767.0, 65535.0}
 UNITS, APART, FEWEST = 20.0, 5.0, 3  # times as widely spread; from the nearest of the others; trials of each unit
 TURNS, CLOSE, JUMPS = (2 * np.pi, 360.0), 0.05, 3  # of angles; share by which a range may differ; times that it jumps

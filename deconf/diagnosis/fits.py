@@ -214,7 +214,8 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     unit = usual_size(left, change)
     kept = np.flatnonzero(np.isfinite(unit))
     _, episode, step = np.nonzero(trials.mask)
-    second = episode % 2 if trials.mask.shape[1] > 1 else step >= trials.mask.sum((1, 2))[steps.trial] / 2
+    taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
+    second = episode % 2 if trials.mask.shape[1] > 1 else taken >= trials.mask.sum((1, 2))[steps.trial] / 2
     group = 2 * steps.trial + second
     both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
     if not len(kept) or both.sum() < 16:

@@ -70,7 +70,7 @@ def from_dynamics(
     draws: Draws,
     monitor: Monitor,
 ) -> Explanation:
-    """Explain the dynamics by a latent, Eq. (6), and clone a policy given it. Of both pairs, the second is held out.
+    """Explain the dynamics by a latent, and clone a policy given it. Of both pairs, the second is held out.
 
     The dynamics are learned from exploration: expert trials hold nearly one action for each observation and latent, so
     that the effects of the two cannot be separated. (Trained on both, a model of `swapped_lander` ignored the engine.)
@@ -113,7 +113,7 @@ def _latents(model: LatentModel, batch: Batch, draws: Draws) -> Tensor:
     return model.for_cloning(_belief(model, batch), draws)
 
 
-def _per_step(batch: Batch, latents: Tensor) -> Tensor:
+def each_step(batch: Batch, latents: Tensor) -> Tensor:
     """Each trial's latent [1, B, D] at each of its steps."""
     return latents[:, :, None].expand(-1, -1, batch.mask.shape[2], -1)
 
@@ -154,7 +154,7 @@ def in_range(expert: Batch, explored: Batch) -> Batch:
 @torch.no_grad()
 def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
     """Its dynamics, with noise of the residuals' size in these trials: falls and the like inflate that of training."""
-    head, latents = copy.deepcopy(model.dynamics), _per_step(data, _latents(model, data, draws))
+    head, latents = copy.deepcopy(model.dynamics), each_step(data, _latents(model, data, draws))
     if not model.inputs.signature.binary:
         residual = head.change(data.next_obs - data.obs) - head(data.obs, data.action, latents)[..., 0, :]
         variance = masked_mean(residual.square().flatten(1, 2).mT, data.mask.flatten(1)[:, None])
@@ -168,7 +168,7 @@ def _evidence(log_prob: LogProb, data: Batch, latents: Tensor, per_theta: int) -
 
     Nats a step. The other trial is `per_theta` before.
     """
-    own, other = (log_prob(data, _per_step(data, x)) for x in (latents, latents.roll(per_theta, 1)))
+    own, other = (log_prob(data, each_step(data, x)) for x in (latents, latents.roll(per_theta, 1)))
     return typical(own - other, data)
 
 
@@ -192,7 +192,7 @@ def _train_policy(
     policy = ActionHead(model.inputs.obs_width + model.latent, config.width, model.inputs.scales, draws)
     agent, best, kept = DeconfoundedAgent(model, policy), Best(held_out), policy.state_dict()
     optimizer = Adam([policy], config.learning_rate, config.updates)
-    log_prob, per_step = _log_action(model, policy), _per_step(held_out, latents)
+    log_prob, per_step = _log_action(model, policy), each_step(held_out, latents)
     for update in range(config.updates):
         optimizer.step(agent.loss(data, belief, config.batch, draws))
         if best.check(update + 1, config.updates, lambda: log_prob(held_out, per_step)):

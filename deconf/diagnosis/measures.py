@@ -46,7 +46,7 @@ RESOLVED = 0.5  # correlation of halves of trials that must be visible, if trial
 
 @dataclass(frozen=True)
 class Amounts:
-    """Hyperparameters of one split; offline: of Eq. (7); exploring: of Eq. (6).
+    """Hyperparameters of one split; offline: of Eq. (7); exploring: of Algorithm 1.
 
     candidates: number of latents in rollouts, drawn from the data's. rollouts: trials of each rollout in the learned
     dynamics.
@@ -71,7 +71,7 @@ class Amounts:
             cloning=replace(self.cloning, width=WIDE),
             naive=replace(self.naive, width=WIDE),
             offline=replace(self.offline, width=WIDE, latent=LARGE_LATENT),
-            exploring=replace(self.exploring, width=WIDE, latent=LARGE_LATENT),
+            exploring=replace(self.exploring, width=WIDE),
         )
 
 

@@ -16,6 +16,7 @@ from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
 from deconfounded.deconf.diagnosis.held_out import typical
+from deconfounded.deconf.diagnosis.latent import each_step
 from deconfounded.deconf.diagnosis.learned_env import LatentPolicy
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
@@ -66,11 +67,6 @@ def _draw(data: Batch, draws: Draws) -> Batch:
     return Batch(obs, action, next_obs, data.mask.gather(2, order))
 
 
-def _per_step(trait: Tensor, steps: Batch) -> Tensor:
-    """Each trial's trait [S, B, D] at each of its steps."""
-    return trait[:, :, None].expand(-1, -1, steps.mask.shape[2], -1)
-
-
 def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessConfig, draws: Draws) -> Trait:
     """Train an encoder on halves of the trials, clone policies given its traits, and measure the gain."""
     scales = Scales.of(signature, train)
@@ -88,7 +84,7 @@ def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessC
         parts = [_draw(half, draws) for half in halves(train.draw_trials(TRIALS, draws))]
         context, rest = parts if update % 2 else parts[::-1]
         trait = encoder(context)
-        loss = imitation_loss(log_prob(policy, rest, _per_step(blurred(trait), rest)).flatten(1), rest.mask.flatten(1))
+        loss = imitation_loss(log_prob(policy, rest, each_step(rest, blurred(trait))).flatten(1), rest.mask.flatten(1))
         optimizer.step(loss + 1e-3 * trait.square().mean((1, 2)))
     with torch.no_grad():
         traits = encoder(train)
@@ -100,7 +96,7 @@ def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessC
             optimizer.step(imitation_loss(log_prob(clone, steps, blurred(trait)), steps.mask))
     with torch.no_grad():
         early, late = halves(held_out)
-        trait = _per_step(encoder(early), late)
+        trait = each_step(late, encoder(early))
         return Trait(own, traits, typical(log_prob(own, late, trait) - log_prob(other, late, trait), late))
 
 

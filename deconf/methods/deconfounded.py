@@ -199,7 +199,7 @@ def large(config: DeconfoundedConfig) -> dict[str, Any]:
 
 
 USES = ("demonstrations", "exploration")
-SHARED: dict[str, Any] = {  # with deconfounded_gru and deconfounded_discrete
+SHARED: dict[str, Any] = {  # with the variants of this method
     "smoke": {"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 100},
     "smoke_bandit": {"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 800},
     "deployments": deployments("episode", "mode"),  # the mean of a Gaussian is its mode

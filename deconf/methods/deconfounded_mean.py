@@ -20,7 +20,7 @@ from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scaler, Scales
-from deconfounded.deconf.core.sizes import LARGE_LATENT, Configuration
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.equations import gaussian_kl, imitation_loss, masked_mean, reparametrise
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -196,7 +196,6 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     ),
     smoke={"rounds": 2, "imitation_updates": 100, "final_updates": 400, "inference_updates": 20},
     smoke_bandit={"rounds": 1, "imitation_updates": 400, "final_updates": 800, "inference_updates": 400},
-    large=lambda config: {"latent": LARGE_LATENT},
 )
 def fit(given: Given) -> MeanAgent:
     """Train in rounds of exploration, inference and imitation."""

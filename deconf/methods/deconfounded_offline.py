@@ -40,7 +40,7 @@ LAST = 512  # least synthetic trials for the belief in the course of a trial
 class OfflineConfig(Configuration):
     """Hyperparameters for each seed. Eq. (7) trains first; updates by Eq. (6) do not change its networks.
 
-    beta to synthetic: of Eq. (6), for observations that are 0 or 1.
+    beta to synthetic: of synthetic trials; of observations that are not 0 or 1, online_updates and synthetic alone.
     """
 
     width: int = 64

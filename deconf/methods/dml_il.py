@@ -166,7 +166,10 @@ class DmlAgent(LearnedAgent):
 
 
 def sources(batch: Batch, lag: int) -> Tensor:
-    """The step [S, B, T] where h_{t-k} ends: `lag` steps before each, but not before its episode's first."""
+    """The step [S, B, T] where h_{t-k} ends: `lag` steps before each, but not before its episode's first.
+
+    An episode begins where the observation is not the one that the step before led to.
+    """
     steps = torch.arange(batch.mask.shape[2], device=batch.mask.device).expand_as(batch.mask)
     first = (batch.obs[:, :, 1:] != batch.next_obs[:, :, :-1]).any(-1) * steps[:, :, 1:]
     return torch.maximum(steps - lag, torch.cat([steps[:, :, :1], first], 2).cummax(2).values)

@@ -18,7 +18,7 @@ from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 
 @dataclass(frozen=True)
 class ExactConfig(Configuration):
-    """grid: values of each latent that is not categorical; 0, as for bandits, whose are most often: the default."""
+    """grid: the k of `Task.theta_grid`: values of a single latent; 0, as for bandits, most often: the default."""
 
     grid: int = 21
 

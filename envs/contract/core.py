@@ -149,6 +149,10 @@ def seed_kinds(task: Task) -> None:
     for wrong in ([1], -1):
         with refused(f"seed {wrong} of two environments", "seed was"):
             batch.reset(wrong)
+    env = GymEnv(task)
+    same(env.reset(seed=np.int64(3))[0], first[0], "first observations of seed 3 in a batch and in a GymEnv")  # type: ignore[arg-type]
+    with refused("seed -1 of a GymEnv", "seed was"):
+        env.reset(seed=-1)
 
 
 def forced_theta_moves_nothing_else(task: Task) -> None:

@@ -82,10 +82,10 @@ def far_thetas(task: Task) -> Array:
         return np.unique(task.theta_grid(3), axis=0)
     grids = [lat.grid(5) for lat in task.latents]
     if len(grids) > 3:  # one latent at a time
-        middle, turns = np.array([grid[2] for grid in grids]), range(len(grids))
+        middle, turns = np.array([grid[len(grid) // 2] for grid in grids]), range(len(grids))
         turned = [np.where(np.arange(len(grids)) == i, grids[i][end], middle) for i in turns for end in (0, -1)]
         return np.array([middle, *turned])
-    return np.array(list(product(*(grid[:: max(1, (len(grid) - 1) // 2)] for grid in grids))))
+    return np.array(list(product(*(grid[sorted({0, len(grid) // 2, len(grid) - 1})] for grid in grids))))
 
 
 def streams(*seeds: int) -> Streams:

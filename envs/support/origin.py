@@ -4,7 +4,7 @@ import sysconfig
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
+OURS = tuple(ROOT / name for name in ("deconfounded", "envs", "experts", "deconf", "benchmarks", "assets"))
 LIBRARIES = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
 
 

@@ -31,7 +31,7 @@ Source = str | Path | Sequence[str | Path]
 """A file, the folder of a data set, or several files of the same columns."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Log(Trials):
     """Trials of a log: what columns are called, in which units, names of trials, and notes on what was read."""
 
@@ -121,7 +121,7 @@ def trials_of(sources: list[list[Table]], roles: Roles) -> list[Log]:
     horizon = max(table.horizon for table in tables)
     logs = []
     for group, episodes in zip(sources, read, strict=True):
-        own = roles.trial is None and all(table.trial is None for table in group)
+        own = all(part.single for part in episodes)
         logs.append(_log(group, episodes, units, said, horizon, own))
     return logs
 

@@ -39,7 +39,7 @@ class _RecordingEnv(BatchEnv):
 def collect(
     task: Task, n: int, agent: Callable[[BatchEnv], Agent], seed: int
 ) -> tuple[Trials, Array, list[list[list[Array]]]]:
-    """Trials of an agent in n environments, their theta [N, E, L], and the reward and ends of each step.
+    """Trials of an agent in n environments, their theta (`Rollout`), and the reward and ends of each step.
 
     agent: a function from the environments to the Agent.
     """
@@ -156,7 +156,7 @@ def read_minari(source: Path | str) -> Table:
 
 
 def read_theta(source: Path | str) -> Array | None:
-    """Thetas [B, E, L] of a data set that `write` wrote, for scoring alone; None if it has none."""
+    """Thetas of a data set that `write` wrote, as of a `Rollout`, for scoring alone; None if it has none."""
     _, metadata, _ = _opened(source)
     if not all({"trial", "episode", "theta"} <= set(entry) for entry in metadata):
         return None
@@ -222,7 +222,7 @@ def _rows(what: str, values: Any, space: spaces.Space[Any], n: int, observed: bo
     axes = (0, 1) if observed else (1,)
     box = isinstance(space, spaces.Box) and len(space.shape) in axes
     if not box and not (isinstance(space, spaces.Discrete) and space.start == 0):
-        right = "Box of one axis or none" if observed else "Box(-1, 1, (A,))"
+        right = "Box of one axis or none" if observed else "Box of one axis"
         raise InputError(f"{what} are of {space}; they must be of {right}, or Discrete from 0 up")
     if np.shape(values) != (n, *space.shape):  # type: ignore[misc]
         raise InputError(f"{what} have shape {np.shape(values)}; it must be {(n, *space.shape)}")  # type: ignore[misc]

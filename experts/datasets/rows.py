@@ -33,12 +33,16 @@ class Episode(NamedTuple):
 
 
 class Episodes(NamedTuple):
-    """Episodes of a table, names of observations and actions, and notes on what is odd."""
+    """Episodes of a table, names of observations and actions, and notes on what is odd.
+
+    single: whether each is a trial of its own, as no column says what a trial is.
+    """
 
     episodes: list[Episode]
     obs: tuple[str, ...]
     action: tuple[str, ...]
     notes: list[str]
+    single: bool
 
 
 def episodes_of(table: Table, roles: Roles) -> Episodes:
@@ -94,7 +98,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
         ]
         hint = f" ({', '.join(shared[:5])} might say: --trial)" if shared else ""
         notes.append(f"No column says what a trial is: every episode counts as a trial of its own{hint}.")
-    return Episodes(episodes, obs_names, action_names, notes)
+    return Episodes(episodes, obs_names, action_names, notes, trial is None)
 
 
 def _actions(table: Table, names: tuple[str, ...]) -> tuple[NDArray[Any], NDArray[np.bool_]]:

@@ -99,5 +99,5 @@ class RawAgent(AgentWrapper):
         return RawAgent(inner.from_state(settings["settings"], arrays), units)
 
     def save(self, folder: Path | str) -> None:
-        """Save the agent in a folder, for `deconfounded.load`."""
+        """Save the agent in a folder, for `deconfounded.load`; a class in a file of the user's own must stay there."""
         saved_agents.save(self, Path(folder))

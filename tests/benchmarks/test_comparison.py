@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
 from deconfounded.benchmarks.output import aggregation, comparison, pictures, records, scoring, statistics
-from deconfounded.envs.support.errors import InputError, error_line
+from deconfounded.envs.support.errors import InputError, error_line, users_line
 from tests.tools import bars, dots, tiny_preset
 
 TEXT = """
@@ -136,7 +136,9 @@ def test_tracebacks_are_kept_until_it_works(tmp_path: Path, monkeypatch: pytest.
 
 def test_an_error_s_line_is_of_the_user_s_file(tmp_path: Path) -> None:
     """And a long one is cut."""
-    (tmp_path / "own.py").write_text("import json\ndef f():\n    json.loads('{')\n")
+    (tmp_path / "own.py").write_text(
+        "import json\ndef f():\n    json.loads('{')\nimport deconfounded\ndef g():\n    deconfounded.load('nowhere')\n"
+    )
     sys.path.insert(0, str(tmp_path))
     try:
         import own  # type: ignore[import-not-found]
@@ -144,6 +146,9 @@ def test_an_error_s_line_is_of_the_user_s_file(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="Expecting") as caught:
             own.f()
         assert error_line(caught.value).endswith("(JSONDecodeError, own.py:3)")
+        with pytest.raises(InputError) as of_ours:  # in deconfounded/__init__.py, called by the user's line
+            own.g()
+        assert users_line(of_ours.value) == "own.py:6"
     finally:
         sys.path.remove(str(tmp_path))
     assert len(str(InputError("x" * 22_000))) < 1100

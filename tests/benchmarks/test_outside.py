@@ -794,6 +794,8 @@ class TestSaved:
             ('{"sign": np.int64(1)}, {}', "int64 is not JSON serializable"),
             ('{"sign": np.nan}, {}', "would hold NaN or infinity"),
             ('{}, {"size": [1.0]}', "must return a dictionary for json and one of arrays"),
+            ("None", "must return a dictionary for json and one of arrays"),
+            ("self.missing", r"no attribute 'missing' \(AttributeError, odd.py:"),
         ],
     )
     def test_what_cannot_be_kept_leaves_nothing(self, tmp_path: Path, state: str, says: str) -> None:

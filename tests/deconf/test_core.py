@@ -601,12 +601,16 @@ class TestWeights:
             policy.load(task, tmp_path / "bad.safetensors")
         layer = {"0.weight": np.zeros((4, 2), np.float32), "0.bias": np.zeros(4, np.float32)}
         save_file(layer, tmp_path / "narrow.safetensors")
-        with pytest.raises(envs.InputError, match="takes 2 finite inputs, not 7"):
+        with pytest.raises(envs.InputError, match="takes 2 inputs, not 7"):
             policy.load(task, tmp_path / "narrow.safetensors")
         layer["0.weight"] = np.zeros((4, 7), np.float32)
         save_file(layer, tmp_path / "wide.safetensors")
         with pytest.raises(envs.InputError, match="give 4 actions, not 1"):
             policy.load(task, tmp_path / "wide.safetensors")
+        layer["0.weight"][0, 0] = np.nan
+        save_file(layer, tmp_path / "odd.safetensors")
+        with pytest.raises(envs.InputError, match="holds NaN or infinity"):
+            policy.load(task, tmp_path / "odd.safetensors")
         save_file({"0.weight": np.zeros((4, 2), np.float32)}, tmp_path / "small.safetensors")
         with pytest.raises(envs.InputError, match="lack a whole layer 0"):
             policy.load(task, tmp_path / "small.safetensors")

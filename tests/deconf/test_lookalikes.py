@@ -129,6 +129,18 @@ def tank(heat: float, lasting: float = 0.0, rough: float = 0.0) -> Trials:
     return Trials(obs, action, np.ones((b, 1, steps), bool))
 
 
+def test_halves_are_of_the_steps_that_are_in() -> None:
+    """Where the first steps of each episode are left out, as out of the expert's range, so are those of its halves."""
+    rng = np.random.default_rng(0)
+    theta, action = rng.uniform(-1, 1, (48, 1, 1, 1)), rng.uniform(-1, 1, (48, 1, 60, 1))
+    moves = (action + theta + 0.5 * rng.standard_normal(action.shape)).cumsum(2)
+    obs = rng.normal(0, 30, (48, 1, 1, 1)) + np.concatenate([np.zeros((48, 1, 1, 1)), moves], 2)
+    trials = Trials(obs, action, np.ones((48, 1, 60), bool) & (np.arange(60) >= 35))
+    alike = fits.own_dynamics(trials, fits.Steps.of(trials))
+    assert alike is not None
+    assert alike[0] > 0.5
+
+
 class TestStatesThatTell:
     """Dynamics that differ from trial to trial, by an amount that observations tell of."""
 

@@ -137,6 +137,8 @@ def test_discrete_actions_start_anywhere() -> None:
     env.step(np.array([[0], [1]]))
     simulator: Any = env.simulator
     assert [each.action for each in simulator._envs] == [5, 6]
+    with pytest.raises(envs.InputError, match="noise of Sliding was 2; of discrete actions it is a share, from 0 to 1"):
+        envs.check_task(task_with(make=lambda self, theta: Two(theta[0]), noise=2))
 
 
 def test_streams_are_separate() -> None:

@@ -10,6 +10,7 @@ from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.contract.physics import same_model
 from deconfounded.envs.contract.probe import Skipped, far_thetas, gl_works, streams
 from deconfounded.envs.edits import ModelEdit, SpecEdit
+from deconfounded.envs.latent import Latent
 from deconfounded.experts import policy
 
 TASKS = envs.names()
@@ -67,6 +68,16 @@ def test_mass_edit_equals_recompiled() -> None:
     spec = task.spec()
     SpecEdit(spec).body_mass("pole", 2.0)
     same_model(model, spec.compile(), "set in place and compiled")
+
+
+def test_far_thetas_reach_both_ends() -> None:
+    """Also of categories, in even numbers, and of two each where there are many latents."""
+    six, two = Latent("size", "", 0, 5, "categorical"), Latent("side", "", 0, 1, "categorical")
+    task = envs.get("slippery_cartpole")
+    assert far_thetas(task.changed(latents=(six,)))[:, 0].tolist() == [0, 3, 5]
+    many = far_thetas(task.changed(latents=(two,) * 4))
+    assert many.shape == (9, 4)
+    assert (many.min(0).tolist(), many.max(0).tolist()) == ([0] * 4, [1] * 4)
 
 
 @pytest.mark.parametrize("name", TASKS)

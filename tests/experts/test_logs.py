@@ -17,7 +17,9 @@ from deconfounded import envs
 from deconfounded.deconf.methods import naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.experts import datasets
-from deconfounded.experts.datasets.table import Odd
+from deconfounded.experts.datasets.logs import trials_of
+from deconfounded.experts.datasets.rows import Roles
+from deconfounded.experts.datasets.table import Odd, Table
 from deconfounded.experts.datasets.tabular import parquet_columns
 from deconfounded.experts.datasets.units import RawAgent, Units
 from deconfounded.experts.trials import Trials
@@ -242,6 +244,15 @@ class TestNotes:
             "observation.speed.1",
         )
         assert "every episode counts as a trial" in " ".join(log.notes)
+
+    def test_episodes_of_two_files_by_a_column(self) -> None:
+        """Given --episode, the trials that a format states do not count: each episode is a trial, of its own file."""
+        columns = {"trial": np.repeat([0.0, 1.0], 3), "lap": np.repeat([0.0, 1.0], 3), "x": np.arange(6.0)}
+        columns["push"] = np.tile([0.1, 0.7], 3)
+        tables = [Table(where, columns, trial="trial") for where in ("a.csv", "b.csv")]
+        (log,) = trials_of([tables], Roles(None, "lap", ("x",), ("push",)))
+        assert log.mask.shape[:2] == (4, 1)
+        assert len(set(log.names)) == 4
 
     def test_episodes_of_lerobot_in_any_order(self, tmp_path: Path) -> None:
         """What is said of an episode is by its number, not by its line."""
