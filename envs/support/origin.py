@@ -3,14 +3,17 @@
 import sysconfig
 from pathlib import Path
 
+import deconfounded
+
 ROOT = Path(__file__).resolve().parents[2]
-OURS = tuple(ROOT / name for name in ("deconfounded", "envs", "experts", "deconf", "benchmarks", "assets"))
+OURS = tuple(ROOT / name for name in ("envs", "experts", "deconf", "benchmarks", "assets"))
+ENTRANCE = Path(deconfounded.__file__).resolve().parent  # of an import and of the command line
 LIBRARIES = {Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")}
 
 
 def is_ours(file: Path) -> bool:
     """Whether a file belongs to this package."""
-    return any(file.is_relative_to(folder) for folder in OURS)
+    return file.parent == ENTRANCE or any(file.is_relative_to(folder) for folder in OURS)
 
 
 def is_library(file: Path) -> bool:
