@@ -1,0 +1,256 @@
+"""What studies and commands hand on and keep: splits, thetas, amounts and verdicts, by what they mean."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from deconfounded import envs
+from deconfounded.benchmarks import certify, diagnose, verify
+from deconfounded.benchmarks import score as score_command
+from deconfounded.benchmarks.engine import identity, protocols, scheduler
+from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
+from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.benchmarks.engine.published import RECORDS
+from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import exploration, validate
+from deconfounded.benchmarks.studies.foreign import measure as foreign
+from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.diagnosis import measures
+from deconfounded.deconf.diagnosis.advice import EXPLORE, VARY_LATENT, Next
+from deconfounded.deconf.diagnosis.measures import Amounts
+from deconfounded.deconf.diagnosis.verdict import Diagnosis, Figure
+from deconfounded.deconf.exact import Grid
+from deconfounded.deconf.particles import exact_agent
+from deconfounded.envs.latent import Latent
+from deconfounded.envs.streams import Array
+from deconfounded.experts.agent import RandomAgent
+from deconfounded.experts.policy import CallableExpert
+from deconfounded.experts.rollout import run_trials
+from tests import toys
+from tests.tools import deconf, tiny_preset
+
+PUSH = toys.Push()
+EXPERT = CallableExpert(PUSH, toys.control, "control")
+
+
+class Stopped(Exception):  # noqa: N818 (nothing is wrong)
+    """Raised where a test has seen enough."""
+
+
+def test_each_split_has_a_generator_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That of `diagnose` in Python, in the same order."""
+    trials = run_trials(envs.BatchEnv(PUSH, 4), RandomAgent(PUSH.action_space), 2, 0).trials
+    trials.save(tmp_path / "trials.npz")
+    (tmp_path / "jobs").mkdir()
+    found = SimpleNamespace(_asdict=lambda: {"draw": drawn[-1]})
+    drawn: list[float] = []
+    monkeypatch.setattr(measures, "measure", lambda *given: (drawn.append(given[3].random()), found)[1])
+    for i in range(3):
+        diagnose.Refit(tmp_path / "trials.npz", None, Amounts(), i, 5, 3, tmp_path).run()
+    assert drawn == [rng.random() for rng in np.random.default_rng(5).spawn(3)]
+    assert json.loads((tmp_path / "jobs" / "refit-1.json").read_text()) == {"draw": drawn[1]}
+
+
+def diagnosis(verdict: Any, tier: int | None, advice: Next = EXPLORE) -> Diagnosis:
+    return Diagnosis(verdict, {"gap": Figure.of([0.4])}, (), tier, advice)
+
+
+@pytest.mark.parametrize(
+    ("name", "certified", "verdict", "tier", "right"),
+    [
+        ("curling", True, "confounded", 2, True),
+        ("curling", True, "confounded", 3, False),
+        ("curling", True, "cannot tell", None, False),
+        ("curling", True, "not confounded", 1, False),
+        ("hidden_goal", False, "confounded", 3, True),
+        ("hidden_goal", False, "confounded", 2, False),
+        ("bandit", False, "nothing at stake", 1, True),
+        ("bandit", False, "cannot tell", None, False),
+    ],
+)
+def test_which_verdicts_are_right(name: str, certified: bool, verdict: Any, tier: int | None, right: bool) -> None:
+    assert validate.right(envs.get(name), certified, diagnosis(verdict, tier)) is right
+
+
+def test_a_gap_is_predicted_where_tier_2_could_close_it() -> None:
+    assert validate.predicted(diagnosis("confounded", 2)) == 0.4
+    assert validate.predicted(diagnosis("cannot tell", None)) == 0.4
+    for verdict, tier in (("confounded", 3), ("not confounded", 1), ("nothing at stake", 1)):
+        assert validate.predicted(diagnosis(verdict, tier)) == 0
+    assert validate.predicted(diagnosis("cannot tell", None, VARY_LATENT)) == 0
+
+
+@pytest.mark.parametrize(
+    ("verdict", "tier", "right"), [("confounded", 2, True), ("not confounded", 1, False), ("cannot tell", None, None)]
+)
+def test_a_wrong_verdict_on_a_foreign_world_is_kept_as_wrong(
+    verdict: Any, tier: int | None, right: bool | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: dict[str, Any] = {}
+    monkeypatch.setattr(diagnose, "run", lambda *_: (diagnosis(verdict, tier), ""))
+    monkeypatch.setattr(foreign, "write", lambda case, **measured: kept.update(measured))
+    case: Any = SimpleNamespace(name="mine", tier=2, truth=("confounded", 2), logs=lambda folder: (folder, folder))
+    foreign.diagnosed(case, tmp_path)
+    assert kept["right"] is right
+
+
+class TestCertificates:
+    """Their curves are those of the policies that they name."""
+
+    def curve(self, task: envs.Task, expert: CallableExpert, conditional: bool, static: bool = False) -> Array:
+        env = envs.BatchEnv(task, 12)
+        agent = exact_agent(env, expert, conditional, 5, static=static)
+        return run_trials(env, agent, certify.EPISODES, certify.SEED).returns.mean(0)
+
+    def test_curves(self) -> None:
+        drift = toys.Drift()
+        expert = CallableExpert(drift, toys.control, "control")
+        made = certify.certify(drift, expert, trials=12, grid=5)
+        curves = {
+            "interventional": self.curve(drift, expert, False),
+            "conditional": self.curve(drift, expert, True),
+            "static": self.curve(drift, expert, False, static=True),
+        }
+        for name, curve in curves.items():
+            assert made[name]["return"] == pytest.approx(curve, abs=1e-6), name
+        assert len({tuple(curve.round(6)) for curve in curves.values()}) == 3
+        evidence = made["evidence_nats_per_step"]
+        assert evidence["dynamics"] > 0.05
+        assert evidence["delusion_ratio"] == pytest.approx(evidence["actions"] / evidence["dynamics"], rel=1e-3)
+
+    def test_evidence_of_dynamics(self) -> None:
+        """The mean log-likelihood ratio of theta against a grid: of Gaussians, half the squared difference of means."""
+        env = envs.BatchEnv(PUSH, 256)
+        grid = Grid(env, EXPERT, 5)
+        recorder = certify.EvidenceRecorder(env, EXPERT, grid)
+        theta = run_trials(env, recorder, 1, 0).theta[:, 0, :1]
+        apart = (theta - PUSH.theta_grid(5).ravel()) * 0.4  # of the velocity; half of that of the position
+        ratio = 0.5 * ((apart / PUSH.std[1]) ** 2 + (0.5 * apart / PUSH.std[0]) ** 2).mean()
+        assert np.concatenate(recorder.dynamics).mean() == pytest.approx(ratio, rel=0.2)
+
+
+class TestCommands:
+    """Settings of the command line reach what they are of."""
+
+    def test_amounts_of_a_protocol(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        jobs: list[BenchmarkJob] = []
+
+        def seen(every: list[BenchmarkJob], *_: Any) -> None:
+            jobs.extend(every)
+            raise envs.InputError("enough")
+
+        monkeypatch.setattr(scheduler, "run_all", seen)
+        deconf(tmp_path, "run", "--task", "curling", "--protocol", "scarce", "--methods", "blind_bc")
+        amounts = protocols.amounts("scarce", preset("default", envs.get("curling"), "cpu"))
+        assert jobs
+        for job in jobs:
+            for name in (*protocols.AMOUNTS, "fresh"):
+                assert getattr(job.preset, name) == getattr(amounts, name)
+
+    def test_amounts_of_a_record_that_is_verified(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        (record, *_) = [r for r in records.of_task(RECORDS, "curling", protocol="scarce") if r["method"] == "naive_rnn"]
+
+        def seen(every: list[BenchmarkJob], *_: Any) -> None:
+            amounts = protocols.amounts("scarce", preset("default", envs.get("curling"), "cpu"))
+            assert every[0].preset.expert_trials == amounts.expert_trials
+            raise Stopped
+
+        monkeypatch.setattr(scheduler, "run_all", seen)
+        with pytest.raises(Stopped):
+            verify.rerun(record, envs.get("curling"), "naive_rnn", None, "cpu")
+
+    def test_another_range_is_scored(self) -> None:
+        """All three agents are in it; the expert has less force there to act against than in the whole range."""
+        agent = RandomAgent(PUSH.action_space)
+        where = score_command.with_ranges(PUSH, ["force=.9:1"])
+        scored = score_command.rescore(agent, PUSH, EXPERT, 16, 7, where)
+        own = run_trials(envs.BatchEnv(where, 16), agent, 2, 7).returns.mean(0)
+        assert scored["return"]["random"] == pytest.approx(own, abs=1e-4)
+        assert scored["return"] != score_command.rescore(agent, PUSH, EXPERT, 16, 7, PUSH)["return"]
+
+    def test_salt_of_a_score(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        seeds: list[int] = []
+        scored = {"score": [0.0], "ci95_last": None}
+        monkeypatch.setattr(score_command, "ready", lambda folder, task: RandomAgent(task.action_space))
+        monkeypatch.setattr(score_command, "rescore", lambda *given: (seeds.append(given[4]), scored)[1])
+        own = ("--agent", ".", "--task", "tests.toys:Push", "--expert", "tests.toys:control", "--seed", "3")
+        for salt in ((), ("--salt", "x")):
+            assert deconf(tmp_path, "score", *own, *salt).returncode == 0
+        assert seeds == [stream(EVALUATION, 3), stream(EVALUATION, 3, "x")]
+
+
+@pytest.mark.parametrize(
+    ("amount", "use"),
+    [
+        ("expert_trials", "demonstrations"),
+        ("fresh", "demonstrations"),
+        ("explore_trials", "exploration"),
+        ("query_trials", "queries"),
+    ],
+)
+def test_results_depend_on_the_data_that_a_method_uses(amount: str, use: str) -> None:
+    one = tiny_preset()
+    other = replace(one, **{amount: getattr(one, amount) + 1})
+    differ = set()
+    for name in METHODS:
+        made = [identity.identity(BenchmarkJob("bandit", each, name, (0,), Path())) for each in (one, other)]
+        differ |= {name} if made[0] != made[1] else set()
+    assert differ == {name for name in METHODS if use in METHODS[name].uses}
+    assert differ
+
+
+class Switching(toys.Push):
+    """Push, whose force is drawn anew in a third of the steps."""
+
+    name = "switching"
+    latents = (Latent("force", "N", -1.0, 1.0, switch=0.3),)
+
+
+class Knows(RandomAgent):
+    """It acts at random, and its features are theta as it is."""
+
+    env: envs.BatchEnv
+
+    def features(self) -> NDArray[np.float32]:
+        return self.env.theta.astype(np.float32)
+
+
+def test_r2_of_a_theta_that_switches_is_of_the_last_step() -> None:
+    task = Switching()
+    context = Context(task, replace(tiny_preset(), eval_trials=256), [0], expert="tests.toys:control")
+    agent = Knows(task.action_space)
+    agent.env = context.env
+    assert evaluate(context, agent, False)[1][0, -1] > 0.95  # when no other episode has begun
+
+
+def test_fresh_demonstrations() -> None:
+    """Of other thetas and starts each time, and paid for."""
+    amounts = replace(tiny_preset(), fresh=3)
+    context = Context(PUSH, amounts, [0, 1], monitor := Monitor(), expert="tests.toys:control")
+    rngs = context.rngs
+    made = [context.demonstrations, context.demonstrate(rngs), context.demonstrate(rngs)]
+    assert [len(trials) for trials in made] == [8, 6, 6]
+    starts = np.concatenate([trials.obs[:, 0, 0, 0] for trials in made])
+    assert len(np.unique(starts)) == len(starts)
+    assert monitor.budget["expert_trials"] == [4 + 3 + 3] * 2
+
+
+def test_points_of_exploration_are_of_both_ends() -> None:
+    of_task = records.of_task(RECORDS, "curling")
+    made = [r for r in of_task if r["method"] in ("deconfounded", "random", "expert") and r["seed"] < 3]
+    point = exploration.measured(made, "deconfounded", 1)
+    zero, one = (
+        np.mean([r["returns"][:5] for r in of_task if r["method"] == name and r["seed"] < 10])
+        for name in ("random", "expert")
+    )
+    own = np.array([r["returns"][:5] for r in made if r["method"] == "deconfounded" and not r["deployment"]])
+    for end, episode in (("first", 0), ("last", -1)):
+        assert point[end] == pytest.approx((own[:, episode] - zero) / (one - zero), abs=1e-3)
