@@ -44,7 +44,8 @@ THRESHOLDS = {
 class EvidenceRecorder(ExpertAgent):
     """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give.
 
-    Evidence is for the true theta over those of the grid; the posterior is of particles where they are given.
+    Evidence is for the true theta over those of the grid, where a category is itself among them; the posterior is of
+    particles where they are given.
     """
 
     def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid, particles: Particles | None = None) -> None:
@@ -56,7 +57,7 @@ class EvidenceRecorder(ExpertAgent):
         if self.particles:
             self.particles.begin(n)
         self.log_belief, self._steps = self.grid.prior(n), 0
-        self.dynamics: list[Array] = []  # nats for the true theta over another one, a step
+        self.dynamics: list[Array] = []  # nats for the true theta over one drawn from the grid, a step
         self.actions: list[Array] = []
         self.estimates: list[Array] = []  # of theta [N, L], at the end of each episode
         self.truths: list[Array] = []  # theta [N, L] then

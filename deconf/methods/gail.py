@@ -1,8 +1,8 @@
 """GAIL with memory, the published paper's baseline: PPO trains a recurrent policy on a discriminator's logit.
 
 A discriminator separates the expert's transitions (s, a, s') from the policy's own (Ho and Ermon, 2016). PPO's
-environments hide theta and the task's reward, and take far more steps than exploration in other methods. The policy
-learns to match the expert's mixture over theta; it matches the expert under *this* theta only as far as transitions
+environments hide theta and the task's reward. They begin new trials each round, of which a round takes the first 512
+steps, so that it seldom trains in a trial's last episodes. The policy learns to match the expert's mixture over theta; it matches the expert under *this* theta only as far as transitions
 identify theta.
 
 RecurrentPPO is sb3-contrib's. An episode of PPO is a whole trial, so that the LSTM's state outlives the resets. PPO

@@ -1,5 +1,8 @@
 """Past-action-leakage regularisation, PALR (Seo et al., 2023): naive_rnn with a penalty on what its memory leaks.
 
+The paper imitates from observation histories; past actions leak through them alone. Here they are inputs of the memory,
+as of `naive_rnn`, since a transition without its action may tell nothing of theta.
+
 The penalty is the Hilbert-Schmidt conditional independence criterion, HSCIC (Park and Muandet, 2020): the dependence of
 memory and previous action, given the expert's next action, by kernels; 0 where they are conditionally independent. It
 covers the last action alone: older actions may leak, and so may a theta that was wrongly inferred from them.

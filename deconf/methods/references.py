@@ -39,7 +39,7 @@ def conditional(given: Given) -> Agent:
 
 @uses("environment", cost=4, **EXACT, deployments=deployments("episode", "mode", "mean"))
 def interventional(given: Given) -> Agent:
-    """The exact interventional policy, by posterior sampling: the optimum of deconfounded imitation."""
+    """The exact interventional policy, by posterior sampling, given the state: what deconfounded imitation aims at."""
     return _exact(given, False)
 
 
