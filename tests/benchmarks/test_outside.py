@@ -8,7 +8,7 @@ import queue
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +33,7 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs import registry
+from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import write_sealed
 from deconfounded.envs.tasks.bandit import Bandit
@@ -862,6 +863,44 @@ def fit(given): return Constant(-0.25)
             file.write("print('runs')\n")
         with pytest.raises(envs.InputError, match=r"agent\.py is missing, damaged, or of another agent"):
             deconfounded.load(tmp_path / "kept")
+
+
+class TestPlay:
+    """One trial in a gymnasium environment, as `deconf play` runs it."""
+
+    def test_the_agent_sees_what_happens(self) -> None:
+        """Each step's own observation, action and next one; and other random numbers in each episode."""
+        seen: list[list[NDArray[Any]]] = []
+        numbers: list[float] = []
+        happened: list[list[NDArray[Any]]] = []
+
+        class Recording(RandomAgent):
+            def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+                super().reset(rngs)
+                numbers.append(rngs[0].random())
+
+            def observe(self, obs: Array, action: Array, next_obs: Array, alive: Mask) -> None:
+                assert alive.tolist() == [True]
+                seen.append([obs[0], action[0], next_obs[0]])
+
+        class Watched(envs.GymEnv):
+            def reset(self, **options: Any) -> Any:
+                self.obs, info = super().reset(**options)
+                return self.obs, info
+
+            def step(self, action: Any) -> Any:
+                then = super().step(action)
+                happened.append([self.obs, action, then[0]])
+                self.obs = then[0]
+                return then
+
+        env = Watched(toys.Push())
+        returns, _ = play.play(Recording(env.task.action_space), env, 3, 5)
+        assert len(returns) == len(set(numbers)) == 3
+        assert len(happened) > 3
+        for one, other in zip(seen, happened, strict=True):
+            for x, y in zip(one, other, strict=True):
+                np.testing.assert_array_equal(x, y)
 
 
 class TestSentences:

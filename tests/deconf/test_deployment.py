@@ -5,8 +5,8 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.deconf.core.deployment import deployments
-from deconfounded.deconf.exact import ExactAgent
-from deconfounded.envs.streams import Array
+from deconfounded.deconf.exact import ExactAgent, PatchGrid
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
 from deconfounded.experts.rollout import run_trials
 
@@ -53,6 +53,15 @@ def test_the_theta_that_an_exact_policy_acts_on(name: str) -> None:
         assert (acted[way] == high).any(-1).any()
     assert (acted["episode"][0] == acted["episode"][1]).all()
     assert (acted["step"][0] != acted["step"][1]).any()
+
+
+def test_a_drawn_theta_has_each_patch_s_own_belief() -> None:
+    """Beliefs that are certain of another value in each patch give just these values."""
+    env = envs.BatchEnv(envs.get("patchy_road"), 3)
+    grid = PatchGrid(env, policy.load(env.task), 7)
+    value = (np.arange(3)[:, None] + np.arange(6)) % 7
+    drawn = grid.sample(np.log(np.eye(7)[value] + 1e-300), Streams(np.random.default_rng(0).spawn(3)))
+    np.testing.assert_array_equal(drawn, grid.theta[value, 0])
 
 
 def test_ways_differ_in_what_comes_of_them() -> None:

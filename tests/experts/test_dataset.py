@@ -87,7 +87,11 @@ def test_what_it_says(tmp_path: Path) -> None:
     dataset = minari.MinariDataset(place / "data")
     episodes = list(dataset.iterate_episodes())
     assert [round(float(one.rewards.sum()), 9) for one in episodes] == returns.ravel().round(9).tolist()
-    assert all(one.terminations[-1] or one.truncations[-1] for one in episodes)
+    early = [len(one.rewards) < task.horizon for one in episodes]
+    assert 0 < sum(early) < len(early)
+    for one, ended in zip(episodes, early, strict=True):
+        assert (one.terminations[-1], one.truncations[-1]) == (ended, not ended)
+        assert not (one.terminations[:-1].any() or one.truncations[:-1].any())
     assert "EpisodeData" in repr(episodes[0])
     assert (dataset.storage.metadata["ref_min_score"], dataset.storage.metadata["ref_max_score"]) == (1.0, 2.0)
     assert dataset.env_spec.id == task.gym_id
@@ -96,6 +100,22 @@ def test_what_it_says(tmp_path: Path) -> None:
     assert not {"theta", "seed"} & set(vars(Trials.from_minari(place)))
     with pytest.raises(envs.InputError, match="obs 'theta' is no column"):
         datasets.read(place, obs=["theta"])
+
+
+def test_what_the_command_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reference scores are of random actions and of the expert; explorations have other thetas than demonstrations."""
+    env, thetas = envs.BatchEnv(envs.get("bandit"), 64), []
+    agents = (RandomAgent(env.task.action_space), ExpertAgent(env, policy.load(env.task)))
+    low, high = (run_trials(env, agent, 1, 3).returns.mean() for agent in agents)
+    assert low < high
+    for kind, option in (("expert", []), ("random", ["--explore"])):
+        words = ["data", "--task", "bandit", "--trials", "8", "--seed", "3", "--out", str(tmp_path / kind), *option]
+        monkeypatch.setattr("sys.argv", words)
+        data.main()
+        about = minari.MinariDataset(next((tmp_path / kind).rglob("data"))).storage.metadata
+        assert (about["ref_min_score"], about["ref_max_score"]) == (low, high)
+        thetas.append(datasets.read_theta(tmp_path / kind))
+    assert (thetas[0] != thetas[1]).any()
 
 
 def test_bad_input_is_one_line(tmp_path: Path) -> None:
