@@ -73,6 +73,11 @@ def adapters_agree(task: Task) -> None:
             same(x, y, f"{name} of GymVectorEnv and SyncVectorEnv after {at} steps")
         step = dm.step(flat[0])
         same(mine[0][0], step.observation, f"observations of GymVectorEnv and DmEnv after {at} steps")
+        if not step.first():
+            same(mine[1][0], step.reward, f"rewards of GymVectorEnv and DmEnv after {at} steps")
+            right = 0.0 if mine[2][0] else 1.0
+            said = f"the discount of DmEnv after {at} steps was {step.discount}; it must be {right:g}"
+            require(step.discount == right, f"{said}, as terminated was {mine[2][0]}")
         over = mine[2][0] or mine[3][0]
         require(step.last() == over, f"after {at} steps the episode was over {over} in GymVectorEnv, not so in DmEnv")
 

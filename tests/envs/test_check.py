@@ -260,6 +260,16 @@ class WrongBound(SlipperyCartpole):
         return np.broadcast_to(np.asarray(theta, float), (n, 1))
 
 
+class HalfRange(SlipperyCartpole):
+    def sample_theta(self, rng: Streams) -> Array:
+        return self.latents[0].ppf(0.5 * self.latents[0].cdf(super().sample_theta(rng)))
+
+
+class LenientActions(SlipperyCartpole):
+    def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
+        return np.zeros((n, 1))
+
+
 class UnnamedGeom(SlipperyCartpole):
     def spec(self) -> mujoco.MjSpec:
         spec = super().spec()
@@ -287,6 +297,8 @@ class UnnamedGeom(SlipperyCartpole):
         (QuietPole, "noise_covers_every_coordinate_that_matters", "theta moves a coordinate without process noise"),
         (NarrowBounds, "bounds_are_wide_enough", "observation velocity of slippery_cartpole was"),
         (WrongBound, "theta_out_of_bounds", ".* was let through"),
+        (LenientActions, "wrong_actions", "action .* of two environments was let through"),
+        (HalfRange, "theta_follows_its_distribution", r"2,000 draws of friction are 0\.[45]\d+ off its distribution"),
         (UnnamedGeom, "every_element_is_named", "of the geoms of slippery_cartpole, number "),
         (NoReward, "dm_env_tests", "dm_env's test_.*: .*reward of slippery_cartpole was nan"),
     ],
@@ -294,6 +306,20 @@ class UnnamedGeom(SlipperyCartpole):
 def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> None:
     with pytest.raises((AssertionError, envs.InputError), match=f"^{says}"):
         CONTRACT[check](task())
+
+
+def test_the_contract_is_whole() -> None:
+    """A check that is left out is missed, also where each task would pass it."""
+    of_interfaces = "gymnasium_env stable_baselines dm_env_tests adapters_agree time_limit reset_options wrong_actions"
+    of_theta = "no_leak effect privileged_view keep_theta theta_follows_its_distribution theta_out_of_bounds"
+    of_theta += " forced_theta_moves_nothing_else"
+    of_seeds = "any_batch_size seed_streams seed_kinds"
+    of_maths = "starts_vary_and_nothing_is_constant observations_share_no_memory"
+    of_maths += " log_prob_is_the_density_of_the_noise log_sense_is_the_density_of_the_readings"
+    of_physics = "bounds_are_wide_enough set_in_place_equals_recompiled nominal_model_is_not_touched"
+    of_physics += " rollout_equals_single_steps every_element_is_named noise_covers_every_coordinate_that_matters"
+    of_physics += " down_is_down_in_pictures picture_shows_theta_or_state"
+    assert set(CONTRACT) == set(" ".join((of_interfaces, of_theta, of_seeds, of_maths, of_physics)).split())
 
 
 def test_check_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

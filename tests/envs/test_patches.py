@@ -12,8 +12,6 @@ from deconfounded.envs.tasks.drifting_raft import LAG, THRUST, DriftingRaft
 from deconfounded.envs.tasks.patchy_road import PatchyRoad
 from deconfounded.experts import policy
 
-RNG = np.random.default_rng(0)
-
 
 def drive(task: PatchyRoad, steps: int) -> list[tuple[Array, Array, Array, Array]]:
     """State, observation, action and next state of random driving, straight on, in eight environments."""
@@ -29,7 +27,7 @@ def drive(task: PatchyRoad, steps: int) -> list[tuple[Array, Array, Array, Array
 def test_the_present_patch_alone_acts() -> None:
     """Outcomes are those of icy_road with the patch's grip; the other patches' grips change no bit."""
     task, icy = PatchyRoad(), envs.get("icy_road")
-    theta = task.sample_theta(envs.streams.Streams(RNG.spawn(8)))
+    theta = task.sample_theta(envs.streams.Streams(np.random.default_rng(0).spawn(8)))
     for state, _, action, _ in drive(task, 3):
         patch = task.patch(state)
         own = np.take_along_axis(theta, patch[:, None], -1)
@@ -65,7 +63,7 @@ def test_the_expert_heeds_the_patch_a_metre_ahead() -> None:
 
 def rafts(n: int, raft: DriftingRaft) -> Array:
     """States in all streams, on the mark, as fast as it, and with the thrust that this needs in still water."""
-    x, y, along, across = RNG.uniform((-30, -30, -1, -1), (30, 30, 1, 1), (n, 4)).T
+    x, y, along, across = np.random.default_rng(0).uniform((-30, -30, -1, -1), (30, 30, 1, 1), (n, 4)).T
     state = raft.state(x=(x, along), y=(y, across), mark_x=(x, along), mark_y=(y, across))
     state[:, -2:] = np.stack([along, across], -1)
     return state
