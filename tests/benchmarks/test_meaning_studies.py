@@ -181,7 +181,7 @@ class TestCommands:
         scored = {"score": [0.0], "ci95_last": None}
         monkeypatch.setattr(score_command, "ready", lambda folder, task: RandomAgent(task.action_space))
         monkeypatch.setattr(score_command, "rescore", lambda *given: (seeds.append(given[4]), scored)[1])
-        own = ("--agent", ".", "--task", "tests.toys:Push", "--expert", "tests.toys:control", "--seed", "3")
+        own = ("--agent", ".", "--task", "curling", "--seed", "3")
         for salt in ((), ("--salt", "x")):
             assert deconf(tmp_path, "score", *own, *salt).returncode == 0
         assert seeds == [stream(EVALUATION, 3), stream(EVALUATION, 3, "x")]
