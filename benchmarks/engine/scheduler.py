@@ -89,7 +89,7 @@ def run_all(
     """Run what has no file yet; returns all that is in the folder now, how many files were there before, and failures.
 
     every: a job for each method, with all seeds, in one folder. check: is called with the results of random actions and
-    of the expert before anything is trained, and may raise an error.
+    of the expert before anything is trained, unless one of the first jobs failed, and may raise an error.
     """
     folder, left = every[0].folder, [list[int]() for _ in every]
     for job, missing in zip(every, left, strict=True):
