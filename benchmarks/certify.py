@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.scoring import check_references, normalise
+from deconfounded.benchmarks.output.scoring import check_expert, normalise
 from deconfounded.deconf.exact import Grid, grid_of
 from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, needs_particles
 from deconfounded.envs.streams import Array
@@ -160,7 +160,7 @@ def certify(
     best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
     recorder.note()
     one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
-    check_references(task.name, zero, one)
+    check_expert(task.name, zero, one)
     done(STAGES[0])
     policies = {"interventional": returns(exact_agent(env, expert, False, thetas))}
     static = {}

@@ -55,7 +55,7 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
     references = (returns["random"].mean(), returns["expert"].mean())
-    scoring.check_references(task.name, *references)
+    scoring.check_expert(task.name, *references)
     by_trial = scoring.normalise(returns["agent"], *references)
     interval = scoring.bootstrap(by_trial[:, -1])
     return {

@@ -116,19 +116,18 @@ def run_all(
     errors = folder.parent / "errors"
     failed = run_jobs(first, f"{label}, demonstrations and references", engine.run, errors)
     if not failed:
-        check([entry for entry in results(every[0], folder) if entry[0] in catalogue.REFERENCES])
+        check(results([job for job in written(every[0], folder) if job.method in catalogue.REFERENCES]))
     failed += run_jobs(later, label, engine.run, errors)
     for job in () if failed else every:
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
-    finished = results(every[0], folder)
+    finished = results(written(every[0], folder))
     made = {(job.method, seed) for job, missing in zip(every, left, strict=True) for seed in missing}
     return finished, sum((method, seed) not in made for method, seed, _ in finished), failed
 
 
-def results(like: Job, folder: Path) -> Finished:
-    """What jobs left in the folder: method, seed and arrays of each file that fits."""
-    done = written(like, folder)
+def results(done: Sequence[Job]) -> Finished:
+    """What jobs of a seed each have written: method, seed and arrays of each file that fits."""
     return [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
 
 

@@ -49,7 +49,7 @@ def _references(records: Sequence[Record]) -> tuple[float, float]:
     if missing := [name for name in REFERENCES if not returns[name]]:
         raise InputError(f"records are without those of {missing[0]}, which scores need")
     random, expert = (float(np.mean(returns[name])) for name in REFERENCES)
-    scoring.check_references(records[0]["task"], random, expert)
+    scoring.check_expert(records[0]["task"], random, expert)
     return random, expert
 
 

@@ -16,7 +16,7 @@ from deconfounded.envs.streams import Array
 VERSION = 2  # raised when the same records come to other figures
 
 
-def check_references(task: str, random: float, expert: float) -> None:
+def check_expert(task: str, random: float, expert: float) -> None:
     """Raises InputError unless the expert's mean return is above that of random actions."""
     if not expert > random:
         says = f"the expert returns {expert:.4g} an episode, random actions {random:.4g}"

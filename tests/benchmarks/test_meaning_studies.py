@@ -50,9 +50,9 @@ def test_each_split_has_a_generator_of_its_own(tmp_path: Path, monkeypatch: pyte
     trials = run_trials(envs.BatchEnv(PUSH, 4), RandomAgent(PUSH.action_space), 2, 0).trials
     trials.save(tmp_path / "trials.npz")
     (tmp_path / "jobs").mkdir()
-    found = SimpleNamespace(_asdict=lambda: {"draw": drawn[-1]})
+    findings = SimpleNamespace(_asdict=lambda: {"draw": drawn[-1]})
     drawn: list[float] = []
-    monkeypatch.setattr(measures, "measure", lambda *given: (drawn.append(given[3].random()), found)[1])
+    monkeypatch.setattr(measures, "measure", lambda *given: (drawn.append(given[3].random()), findings)[1])
     for i in range(3):
         diagnose.Refit(tmp_path / "trials.npz", None, Amounts(), i, 5, 3, tmp_path).run()
     assert drawn == [rng.random() for rng in np.random.default_rng(5).spawn(3)]
@@ -197,11 +197,11 @@ class TestCommands:
     ],
 )
 def test_results_depend_on_the_data_that_a_method_uses(amount: str, use: str) -> None:
-    one = tiny_preset()
-    other = replace(one, **{amount: getattr(one, amount) + 1})
+    few = tiny_preset()
+    more = replace(few, **{amount: getattr(few, amount) + 1})
     differ = set()
     for name in METHODS:
-        made = [identity.identity(BenchmarkJob("bandit", each, name, (0,), Path())) for each in (one, other)]
+        made = [identity.identity(BenchmarkJob("bandit", each, name, (0,), Path())) for each in (few, more)]
         differ |= {name} if made[0] != made[1] else set()
     assert differ == {name for name in METHODS if use in METHODS[name].uses}
     assert differ
@@ -255,10 +255,12 @@ def test_points_of_exploration_are_of_both_ends() -> None:
     of_task = records.of_task(RECORDS, "curling")
     made = [r for r in of_task if r["method"] in ("deconfounded", "random", "expert") and r["seed"] < 3]
     point = exploration.measured(made, "deconfounded", 1)
-    zero, one = (
+    random_return, expert_return = (
         np.mean([r["returns"][:5] for r in of_task if r["method"] == name and r["seed"] < 10])
         for name in ("random", "expert")
     )
     own = np.array([r["returns"][:5] for r in made if r["method"] == "deconfounded" and not r["deployment"]])
     for end, episode in (("first", 0), ("last", -1)):
-        assert point[end] == pytest.approx((own[:, episode] - zero) / (one - zero), abs=1e-3)
+        assert point[end] == pytest.approx(
+            (own[:, episode] - random_return) / (expert_return - random_return), abs=1e-3
+        )
