@@ -20,7 +20,7 @@ from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import check_expert, normalise
-from deconfounded.deconf.exact import Grid, grid_of
+from deconfounded.deconf.exact import GRID, Grid, grid_of, grid_size
 from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, needs_particles
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import check_folder, write_json
@@ -134,21 +134,22 @@ def certify(
     task: envs.Task,
     expert: Expert,
     trials: int = TRIALS,
-    grid: int = 21,
+    grid: int | None = None,
     done: Callable[[str], None] = lambda stage: None,
 ) -> dict[str, Any]:
     """Measure a task; `verdict` is `passed` if every check holds. Scores: 0 = random actions, 1 = the expert.
 
+    grid: the k of `Task.theta_grid`, by default that of the exact policies; of learned dynamics, that of one latent.
     done: called with the name of each stage when it is over.
     """
     env = envs.BatchEnv(task, trials)
     learned: dict[str, Any] = {}
-    thetas: int | Grid = grid
+    thetas: int | Grid = grid or grid_size(task)
     if not task.has_likelihood:
         from deconfounded.deconf.learned_reference import LearnedGrid, learn  # sklearn takes a second
 
         model = learn(task, expert, 2 * trials, stream(EXPLORATION, SEED))
-        thetas, learned = LearnedGrid(env, expert, grid, model), {"r2": model.r2, "exponent": model.exponent}
+        thetas, learned = LearnedGrid(env, expert, grid or GRID, model), {"r2": model.r2, "exponent": model.exponent}
 
     def returns(agent: Agent) -> Array:
         return run_trials(env, agent, EPISODES, SEED).returns.mean(0)

@@ -16,12 +16,13 @@ from deconfounded.deconf.equations import belief_update
 from deconfounded.envs import BatchEnv, MujocoTask
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Streams
-from deconfounded.envs.task import Simulator
+from deconfounded.envs.task import Simulator, Task
 from deconfounded.experts.agent import Agent
 from deconfounded.experts.policy import Expert, sample_rows
 
 PRUNE_BELOW = 1e-4  # of the mass: values with less are not simulated
 AT_LEAST = 2  # values that are
+GRID, GRID_OF_TWO = 21, 59  # the k of `Task.theta_grid`: 21 values of one latent, 15 of each of two
 
 
 def log_next(
@@ -183,6 +184,11 @@ class PatchGrid(Grid):
         return (np.exp(log_belief) @ encoded).reshape(len(log_belief), -1)
 
 
+def grid_size(task: Task) -> int:
+    """The k of `Task.theta_grid` for the exact policies of a task."""
+    return GRID_OF_TWO if len(task.latents) == 2 else GRID
+
+
 def grid_of(env: BatchEnv, expert: Expert, k: int) -> Grid:
     """The grid of k values that fits a task."""
     return (PatchGrid if isinstance(env.task, PatchedTask) else Grid)(env, expert, k)
@@ -203,7 +209,7 @@ class ExactAgent(Agent):
     """
 
     def __init__(
-        self, env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = 21, static: bool = False
+        self, env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = GRID, static: bool = False
     ) -> None:
         """k: the grid, or how many values it has."""
         self.env, self.expert, self.conditional, self.static = env, expert, conditional, static

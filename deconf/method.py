@@ -30,11 +30,11 @@ class Method:
     """A method's declaration, made by `uses`.
 
     uses: of USES. version: raised by hand when the method's numbers change. cost: CPU time of training relative to
-    blind BC, for estimates of remaining time. on_control, on_bandit: its configuration on control
-    tasks, and on bandits (None: the same). smoke, smoke_bandit: changes to these in the preset `smoke`; paper: its
-    configuration on the bandit in the preset `paper`. large: changes for large observations, given the configuration.
-    deployments: further deployments of its agent, each scored. exact: an exact reference policy. reference:
-    path/file.py:function of a method from outside.
+    blind BC, for estimates of remaining time. on_control, on_bandit: its configuration on control tasks, and on bandits
+    (None: the same). two_latents: changes to the former on tasks of two latents. smoke, smoke_bandit: changes in the
+    preset `smoke`; paper: its configuration on the bandit in the preset `paper`. large: changes for large observations,
+    given the configuration. deployments: further deployments of its agent, each scored. exact: an exact reference
+    policy. reference: path/file.py:function of a method from outside.
     """
 
     uses: tuple[str, ...]
@@ -42,6 +42,7 @@ class Method:
     cost: int = 4
     on_control: Any = None
     on_bandit: Any = None
+    two_latents: Mapping[str, Any] = field(default_factory=dict)
     smoke: Mapping[str, Any] = field(default_factory=dict)
     smoke_bandit: Mapping[str, Any] = field(default_factory=dict)
     paper: Any = None
@@ -70,6 +71,8 @@ class Method:
         config = self.on_bandit if bandit and self.on_bandit is not None else self.on_control
         if config is None:
             return {}
+        if not bandit and len(task.latents) == 2:
+            config = replace(config, **self.two_latents)
         if preset == "smoke":
             config = replace(config, **(self.smoke_bandit if bandit else self.smoke))
         if preset == "paper" and bandit and self.paper is not None:
@@ -127,7 +130,9 @@ def check_values(method: Method) -> None:
             right = "an object of a dataclass, and all of the same"
             raise InputError(f"a method declares {name}={config!r}; configurations must be {right}")
         _check_json(name, config)
-    for name, config in (("smoke", method.on_control), ("smoke_bandit", method.on_bandit or method.on_control)):
+    on_bandit = method.on_bandit or method.on_control
+    changed = (("two_latents", method.on_control), ("smoke", method.on_control), ("smoke_bandit", on_bandit))
+    for name, config in changed:
         changes, settings = getattr(method, name), [] if config is None else [each.name for each in fields(config)]
         if not isinstance(changes, Mapping) or not set(changes) <= set(settings):
             right = f"a dictionary of fields of its configuration, {', '.join(settings) or 'which has none'}"

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.deconf.core.deployment import Way, acted_on
-from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.exact import GRID, ExactAgent, Grid
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.latent import folded
 from deconfounded.envs.patches import PatchedTask
@@ -257,7 +257,7 @@ def needs_particles(task: Task) -> bool:
     return len(task.latents) > GRID_UP_TO and not isinstance(task, PatchedTask)
 
 
-def exact_agent(env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = 21, static: bool = False) -> Agent:
+def exact_agent(env: BatchEnv, expert: Expert, conditional: bool, k: int | Grid = GRID, static: bool = False) -> Agent:
     """The exact policy of a task, by particles where it needs them, else by a grid k."""
     if needs_particles(env.task) and not isinstance(k, Grid):
         return ParticleAgent(env, expert, conditional, static)

@@ -10,6 +10,7 @@ from typing import Any
 
 from deconfounded.deconf.core.deployment import deployments
 from deconfounded.deconf.core.sizes import Configuration
+from deconfounded.deconf.exact import GRID, GRID_OF_TWO, grid_size
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.particles import exact_agent
@@ -20,15 +21,18 @@ from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 class ExactConfig(Configuration):
     """grid: the k of `Task.theta_grid`: values of a single latent; 0, as for bandits, most often: the default."""
 
-    grid: int = 21
+    grid: int = GRID
 
 
 def _exact(given: Given, conditional: bool) -> Agent:
     env, expert = given.environment
-    return exact_agent(env, expert, conditional, given.config.grid or ExactConfig.grid)
+    return exact_agent(env, expert, conditional, given.config.grid or grid_size(env.task))
 
 
-EXACT: dict[str, Any] = {"exact": True, "on_control": ExactConfig(), "on_bandit": ExactConfig(0), "smoke": {"grid": 9}}
+EXACT: dict[str, Any] = {
+    **{"exact": True, "on_control": ExactConfig(), "on_bandit": ExactConfig(0)},
+    **{"two_latents": {"grid": GRID_OF_TWO}, "smoke": {"grid": 9}},
+}
 
 
 @uses("environment", cost=1, **EXACT)

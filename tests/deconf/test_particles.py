@@ -13,7 +13,8 @@ from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf import particles
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.equations import belief_update
-from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.exact import ExactAgent, Grid, grid_size
+from deconfounded.deconf.methods import references
 from deconfounded.deconf.particles import ParticleAgent, Particles, exact_agent, needs_particles
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Streams
@@ -214,6 +215,18 @@ def test_particles_are_for_many_latents() -> None:
     env = envs.BatchEnv(Three(), 1)
     assert isinstance(exact_agent(env, expert(env.task), False), ParticleAgent)
     assert isinstance(exact_agent(env, expert(env.task), False, Grid(env, expert(env.task), 2)), ExactAgent)
+
+
+@pytest.mark.parametrize("name", [name for name in envs.names() if not needs_particles(envs.get(name))])
+def test_grids_are_fine(name: str) -> None:
+    """The exact policies' grid has 15 values or more of each continuous latent, so that its error is within noise."""
+    task = envs.get(name)
+    if task.is_bandit:
+        return
+    k = references.interventional.method.amounts("default", task, "cpu")["grid"]  # type: ignore[attr-defined]
+    assert k == grid_size(task), "certificates have the same"
+    for latent, values in zip(task.latents, task.theta_grid(k).T, strict=True):
+        assert latent.distribution == "categorical" or len(np.unique(values)) >= 15
 
 
 class Biased(Arms):
