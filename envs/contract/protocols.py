@@ -83,7 +83,16 @@ def adapters_agree(task: Task) -> None:
 
 
 def time_limit(task: Task) -> None:
-    """Episodes are truncated at exactly the time limit, unless they ended before."""
+    """Episodes are truncated at exactly the time limit, unless they ended before.
+
+    Where random actions end all of them before, as a pole falls, a limit of three steps would be kept, too.
+    """
+    _check_limit(task)
+    if task.has_likelihood and task.horizon > 3:
+        _check_limit(task.changed(horizon=3))
+
+
+def _check_limit(task: Task) -> None:
     batch = BatchEnv(task, 64)
     batch.reset(0)
     for step, action in enumerate(actions(task, 64, task.horizon), start=1):

@@ -126,6 +126,17 @@ class TestCertificates:
         assert evidence["dynamics"] > 0.05
         assert evidence["delusion_ratio"] == pytest.approx(evidence["actions"] / evidence["dynamics"], rel=1e-3)
 
+    def test_belief_about_a_theta_that_drifts(self) -> None:
+        """Between episodes it spreads, as theta moves on meanwhile."""
+        drift = toys.Drift()
+        env, expert = envs.BatchEnv(drift, 12), CallableExpert(drift, toys.control, "control")
+        recorder = certify.EvidenceRecorder(env, expert, Grid(env, expert, 5))
+        run_trials(env, recorder, 1, 0)
+        learned = recorder.log_belief
+        recorder.reset([np.random.default_rng(i) for i in range(12)])
+        np.testing.assert_allclose(recorder.log_belief, recorder.grid.predict(learned))
+        assert (recorder.log_belief.max(-1) < learned.max(-1)).all()
+
     def test_evidence_of_dynamics(self) -> None:
         """The mean log-likelihood ratio of theta against a grid: of Gaussians, half the squared difference of means."""
         env = envs.BatchEnv(PUSH, 256)

@@ -684,6 +684,21 @@ def test_beliefs_are_drawn(tmp_path: Path) -> None:
     assert (tmp_path / "some.png").stat().st_size > 5000
 
 
+def test_true_theta_is_of_the_trial_that_is_filmed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A run keeps the thetas of all trials, and the states of one."""
+    task, drawn = envs.get("slippery_cartpole"), []
+    monkeypatch.setattr(run_report, "beliefs", lambda _, clips, file: drawn.append(clips["naive_rnn"]["theta"]))
+    for name in ("adaptation", "learning"):
+        monkeypatch.setattr(run_report, name, lambda *_: None)
+    monkeypatch.setattr(film, "write", lambda *_: None)
+    monkeypatch.setattr(film, "decoded", lambda *_: None)
+    theta, of_one = np.arange(15.0).reshape(3, 5, 1), np.zeros(3)
+    kept = {"state": of_one, "action": of_one, "episode": of_one, "theta": theta, "trial": np.array(1), "read": of_one}
+    finished = [("naive_rnn", 0, {f"naive_rnn/{key}": value for key, value in kept.items()})]
+    run_report.pictures(task, {}, finished, tmp_path)  # type: ignore[arg-type]
+    assert drawn[0].tolist() == theta[1].tolist()
+
+
 def test_each_latent_has_its_panel(figures: list[Any], tmp_path: Path) -> None:
     """Of two latents and two episodes: the truth, and below it what was believed, each in its own unit."""
     task, episode = envs.get("slippery_walker"), np.array([0, 0, 1])

@@ -332,7 +332,10 @@ def test_learned_dynamics_give_the_posterior() -> None:
     for t in range(30):
         obs, action, then = trials.obs[:, 0, t], trials.action[:, 0, t], trials.obs[:, 0, t + 1]
         state, following = (np.append(x, np.zeros((32, 2)), 1) for x in (obs, then))
-        total += grid.log_dynamics(state, action, following)
+        log_dynamics = grid.log_dynamics(state, action, following)
+        true = grid.log_true(state, action, following, np.repeat(grid.theta[3:4], 32, 0))
+        np.testing.assert_allclose(true, log_dynamics[:, 3], rtol=1e-6)
+        total += log_dynamics
         exact -= 0.5 * ((then - obs - 0.2 * (2 * action + grid.theta.T)) / 0.3) ** 2
     means = [(w := np.exp(x - x.max(1, keepdims=True))) @ grid.theta[:, 0] / w.sum(1) for x in (total, exact)]
     assert np.abs(means[0] - means[1]).mean() < 0.1

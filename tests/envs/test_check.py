@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -265,6 +266,34 @@ class HalfRange(SlipperyCartpole):
         return self.latents[0].ppf(0.5 * self.latents[0].cdf(super().sample_theta(rng)))
 
 
+class FixedTheta(SlipperyCartpole):
+    def sample_theta(self, rng: Streams) -> Array:
+        return np.full((rng.groups, 1), 0.3)
+
+
+class Wanders(SlipperyCartpole):
+    """Theta moves from one episode to the next, though no latent says so."""
+
+    drifts = True  # type: ignore[assignment]
+
+    def drifted(self, theta: Array, rng: Streams) -> Array:
+        return 0.9 * theta
+
+
+class StandsStill(SlipperyCartpole):
+    """Theta does not move from one episode to the next, though its latent says so."""
+
+    latents = (replace(SlipperyCartpole.latents[0], drift=0.3),)
+
+    def drifted(self, theta: Array, rng: Streams) -> Array:
+        return theta
+
+
+class RoundedTheta(SlipperyCartpole):
+    def check_theta(self, theta: object, n: int) -> Array:
+        return super().check_theta(theta, n).round(2)
+
+
 class LenientActions(SlipperyCartpole):
     def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
         return np.zeros((n, 1))
@@ -296,6 +325,11 @@ class UnnamedGeom(SlipperyCartpole):
         (FixedStart, "starts_vary_and_nothing_is_constant", "eight episodes started with the same"),
         (QuietPole, "noise_covers_every_coordinate_that_matters", "theta moves a coordinate without process noise"),
         (NarrowBounds, "bounds_are_wide_enough", "observation velocity of slippery_cartpole was"),
+        (FixedTheta, "keep_theta", "a reset without keep_theta drew the theta of the trial before"),
+        (Wanders, "keep_theta", "friction before and after a reset with keep_theta differ"),
+        (StandsStill, "keep_theta", "friction, which drifts, stood still from one episode to the next"),
+        (RoundedTheta, "forced_theta_moves_nothing_else", "runs of the same seed with theta drawn and forced differ"),
+        (NoReward, "stable_baselines", "Stable-Baselines3's checker: reward of slippery_cartpole was nan"),
         (WrongBound, "theta_out_of_bounds", ".* was let through"),
         (LenientActions, "wrong_actions", "action .* of two environments was let through"),
         (HalfRange, "theta_follows_its_distribution", r"2,000 draws of friction are 0\.[45]\d+ off its distribution"),
@@ -306,6 +340,35 @@ class UnnamedGeom(SlipperyCartpole):
 def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> None:
     with pytest.raises((AssertionError, envs.InputError), match=f"^{says}"):
         CONTRACT[check](task())
+
+
+def test_the_contract_catches_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No task can share memory by itself: batches copy what it observes."""
+    observe, shared = envs.BatchEnv.observe, np.zeros((1, 6), np.float32)
+
+    def reused(self: envs.BatchEnv) -> NDArray[np.float32]:
+        shared[...] = observe(self)
+        return shared
+
+    monkeypatch.setattr(envs.BatchEnv, "observe", reused)
+    with pytest.raises(AssertionError, match=r"^the first observation before and after three steps differ"):
+        CONTRACT["observations_share_no_memory"](SlipperyCartpole())
+
+
+@pytest.mark.parametrize(("late", "says"), [(False, "truncation at step 2 and"), (True, "truncation at step 3 and")])
+def test_the_contract_catches_a_wrong_time_limit(late: bool, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor can it have another time limit than its horizon: batches count the steps."""
+    step = envs.BatchEnv.step
+
+    def off(self: envs.BatchEnv, action: object) -> Any:
+        obs, reward, terminated, truncated = step(self, action)
+        if late:
+            return obs, reward, terminated, truncated & False
+        return obs, reward, terminated, truncated | (self._steps == self.task.horizon - 1) & ~terminated
+
+    monkeypatch.setattr(envs.BatchEnv, "step", off)
+    with pytest.raises(AssertionError, match=f"^{says}"):
+        CONTRACT["time_limit"](SlipperyCartpole())
 
 
 def test_the_contract_is_whole() -> None:
@@ -406,5 +469,6 @@ def test_an_expert_trained_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
         weights = {"0.weight": np.zeros((1, 7), np.float32), "0.bias": np.full(1, bias, np.float32)}
         monkeypatch.setattr("deconfounded.experts.train.train", lambda *_, weights=weights: weights)
         train.main()
+        assert policy.version(task, file) == (2 if bias else 1), "a version is raised by each training"
     kept = policy.load(task, file).mean(np.zeros((1, 6), np.float32), np.zeros((1, 1)))
     np.testing.assert_allclose(kept, 0.1, rtol=1e-6)
