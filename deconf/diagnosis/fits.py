@@ -1,7 +1,6 @@
-"""Measures of the first look at logs: fits of actions and of the dynamics, in all trials and in each; tails; copies."""
+"""Measures of the first look at logs: fits of actions, in all trials and in each; tails; copies."""
 
 import hashlib
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -15,12 +14,10 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 FEW = 6  # columns, up to which their products are features too
 ENOUGH = 8  # steps of a trial for each feature of a fit of its own
-CHANCE = 0.001  # probability that trials that are alike are said to differ
 MENDED = 4.0  # excess kurtosis
 HIDDEN, FITTED, RIDGE = 128, 20_000, 1e-4  # random features; steps, at most; of standardised features
 FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hidden, left what looked like it
 CLIP = 4.0  # usual deviations
-RATIOS, LASTING = (0.0, 0.01, 0.1, 1.0, 10.0), (0.0, 0.3, 0.6, 0.9)  # of variances; correlations from step to step
 ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
 
 
@@ -196,93 +193,10 @@ def _correlation(x: Array, y: Array) -> float:
     return float((x * y).sum()) / max(float((x**2).sum() * (y**2).sum()) ** 0.5, 1e-12)
 
 
-def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[float, int] | None:
-    """How alike two halves of a trial are in what a fit of all trials leaves of the motion, and the column of it.
-
-    Half the episodes each, or of one episode half the steps. What is left, and its products with observations and
-    actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest, or 0
-    if that is chance. Where nothing is alike by least squares, fits with `trial_means` are tried. None for too little
-    data, also where chance exceeds `least`. Columns that observation and action decide are left out.
-    """
-    count = len(trials)
-    if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
-        return None
-    action = one_hot(steps.action, trials.actions)
-    change, inputs = steps.then - steps.obs, clipped(np.concatenate([steps.obs, action], 1))
-    basis = random_features(inputs, FINE)
-    left = change - basis @ _fitted(basis, change)
-    unit = usual_size(left, change)
-    kept = np.flatnonzero(np.isfinite(unit))
-    _, episode, step = np.nonzero(trials.mask)
-    taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
-    second = episode % 2 if trials.mask.shape[1] > 1 else taken >= trials.mask.sum((1, 2))[steps.trial] / 2
-    group = 2 * steps.trial + second
-    both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
-    if not len(kept) or both.sum() < 16:
-        return None
-    tests = len(kept) * (1 + inputs.shape[1])
-    deviations = statistics.NormalDist().inv_cdf(1 - CHANCE / tests)
-    chance, rest = deviations / float(both.sum()) ** 0.5, (left[:, kept] / unit[kept]).clip(-CLIP, CLIP)
-
-    def alike(columns: Numbers, rest: Array, slopes: Array) -> tuple[float, int]:
-        best = (0.0, 0)
-        for k, y in zip(columns, rest.T, strict=True):
-            for x in slopes.T:
-                power = np.maximum(by_trial(x**2, group, 2 * count), 1e-9)
-                halves = (by_trial(x * y, group, 2 * count) / power).reshape(count, 2)[both]
-                ranks = halves.argsort(0).argsort(0).T
-                best = max(best, (float(np.corrcoef(*ranks).min()), int(k)), key=lambda pair: pair[0])
-        return best if best[0] > chance else (0.0, 0)
-
-    constant = np.ones((len(rest), 1))
-    best = alike(kept, rest, np.concatenate([constant, inputs], 1))
-    if not best[0]:
-        succeeds = (np.diff(steps.trial) == 0) & (np.diff(episode) == 0) & (np.diff(step) == 1)
-        follows = np.concatenate([[False], succeeds])
-        rest, likelier = trial_means(basis, rest, steps.trial, follows)
-        own = likelier > deviations**2 / 2
-        best = alike(kept[own], rest[:, own], constant)
-    return best if best[0] or chance <= least else None
-
-
-def trial_means(basis: Array, y: Array, trial: Numbers, follows: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """What fits of y [N, C] by the basis [N, K] leave, [N, C], where trials have means, and their log-likelihood ratio.
-
-    y = basis beta + u + e is a panel with random intercepts: each trial has its own u ~ N(0, ratio s^2), integrated
-    out, and errors e of variance s^2 are AR(1), as misfits are, and gusts that last. Least squares, where u is 0, takes
-    for an effect of observations what they tell of u, if u moved them; this likelihood does not, as long as u is
-    independent of where trials start, and of actions given the past. follows [N]: the row before.
-    """
-    count = int(trial[-1]) + 1
-    chosen = np.random.default_rng(0).permutation(count)[: max(16, int(count * FITTED / len(trial)))]
-    part = np.isin(trial, chosen)
-    begins = np.concatenate([[0], np.flatnonzero(np.diff(trial[part])) + 1])
-    without, best = np.full((2, y.shape[1]), -np.inf)
-    beta = np.zeros((basis.shape[1], y.shape[1]))
-    for correlation in LASTING:
-        first = np.where(follows[part], 1, (1 - correlation**2) ** 0.5)[:, None]
-        b, z, constant = (
-            first * (x - correlation * follows[part, None] * np.roll(x, 1, 0))
-            for x in (basis[part], y[part], np.ones((part.sum(), 1)))
-        )
-        gram, moment = b.T @ b + RIDGE * len(b) * np.eye(b.shape[1]), b.T @ z
-        p, q, size = (np.add.reduceat(x * constant, begins) for x in (b, z, constant))
-        for ratio in RATIOS:
-            weight = ratio / (1 + ratio * size)  # [B, 1]
-            of_basis, of_y = gram - (weight * p).T @ p, moment - (weight * p).T @ q
-            solved = np.linalg.solve(of_basis, of_y)
-            rest = (z**2).sum(0) - (weight * q**2).sum(0) - (of_y * solved).sum(0)
-            likely = np.log(first).sum() - 0.5 * (len(b) * np.log(rest) + np.log1p(ratio * size).sum())
-            if not ratio:
-                without = np.maximum(without, likely)
-            beta, best = np.where(likely > best, solved, beta), np.maximum(likely, best)
-    return y - basis @ beta, best - without
-
-
 def smooth(x: Array, y: Array) -> Array:
     """A smooth function of standardised x [N, F], fitted to y [N, K] in all trials: ridge on random features."""
     basis = random_features(x, HIDDEN)
-    return basis @ _fitted(basis, y)
+    return basis @ fitted(basis, y)
 
 
 def random_features(x: Array, count: int) -> Array:
@@ -293,7 +207,7 @@ def random_features(x: Array, count: int) -> Array:
     return np.concatenate([np.ones((len(x), 1)), x, x**2, hidden], 1)
 
 
-def _fitted(basis: Array, y: Array) -> Array:
+def fitted(basis: Array, y: Array) -> Array:
     """Coefficients of a fit to some of the steps."""
     part = np.random.default_rng(0).permutation(len(y))[:FITTED]
     return ridge(basis[part], y[part], RIDGE)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from deconfounded.deconf.diagnosis import fits
+from deconfounded.deconf.diagnosis import trial_dynamics
+from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.trials import Trials
 
@@ -39,5 +40,5 @@ def named(trials: Trials, explore: Trials | None) -> list[str]:
 
 
 def _differ(trials: Trials) -> bool:
-    measured = fits.own_dynamics(trials, fits.Steps.of(trials))
+    measured = trial_dynamics.own_dynamics(trials, Steps.of(trials))
     return measured is not None and measured[0] > 0

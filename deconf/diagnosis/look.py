@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.deconf.diagnosis import columns, fits, labels, state
+from deconfounded.deconf.diagnosis import columns, fits, labels, state, trial_dynamics
 from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.deconf.diagnosis.remark import LISTED, Remark, listed
 from deconfounded.experts.datasets.logs import Log
@@ -253,7 +253,7 @@ def _lasting(trials: Trials, steps: Steps) -> Iterator[Remark]:
 
 def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool) -> Iterator[Remark]:
     """Whether trials differ in their dynamics."""
-    measured, odd = fits.own_dynamics(trials, steps), False
+    measured, odd = trial_dynamics.own_dynamics(trials, steps), False
     if measured is None:
         text = "Whether trials differ in their dynamics cannot be seen: they are too few, or too short."
     elif measured[0]:

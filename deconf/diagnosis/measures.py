@@ -20,8 +20,9 @@ from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
-from deconfounded.deconf.diagnosis import fits, latent, trait
+from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
+from deconfounded.deconf.diagnosis.fits import Steps, copies
 from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report, typical
 from deconfounded.deconf.diagnosis.latent import Explanation
 from deconfounded.deconf.diagnosis.learned_env import (
@@ -85,7 +86,7 @@ class Findings(NamedTuple):
     expert_evidence: evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the
     expert's actions, for which a naive clone takes its own.
     dynamics_differ: rank correlation of what two halves of an exploration trial, or of an episode, do beyond a fit of
-    all trials; 0 if that is chance, None if they are too few to know (`fits.own_dynamics`).
+    all trials; 0 if that is chance, None if they are too few to know (`trial_dynamics.own_dynamics`).
 
     The others are of the last episode of rollouts in the learned dynamics; deviations are relative to chance, 1.
     stakes: deviation of trajectories under a wrong latent, of the half that is farther from the right one, from those
@@ -171,10 +172,10 @@ def near(expert: Trials, explore: Trials) -> Trials:
 
 def _differ(explored: Trials) -> tuple[float | None, float]:
     """How much trials differ in their dynamics, see Findings, and how much their episodes, 0 of one episode."""
-    lasting = fits.own_dynamics(explored, fits.Steps.of(explored), RESOLVED)
+    lasting = trial_dynamics.own_dynamics(explored, Steps.of(explored), RESOLVED)
     if explored.mask.shape[1] == 1:
         return lasting and lasting[0], 0.0
-    passing = fits.own_dynamics(episodes := split_episodes(explored), fits.Steps.of(episodes))
+    passing = trial_dynamics.own_dynamics(episodes := split_episodes(explored), Steps.of(episodes))
     return lasting and lasting[0], passing[0] if passing else 0.0
 
 
@@ -281,7 +282,7 @@ def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trial
     """Trials for training, and about that share of them that is held out: a trial and its copies are on one side."""
     order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
     first = np.arange(len(trials))  # of the trials that are the same
-    for same in fits.copies(trials)[0]:
+    for same in copies(trials)[0]:
         first[same] = same[0]
     _, begins, group = np.unique(first[order], return_index=True, return_inverse=True)
     order = order[np.argsort(begins[group], kind="stable")]  # copies follow each other

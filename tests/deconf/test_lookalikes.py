@@ -9,7 +9,8 @@ import torch
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import LabelScaler, Scaler
-from deconfounded.deconf.diagnosis import fits, judgement, latent, measures
+from deconfounded.deconf.diagnosis import judgement, latent, measures, trial_dynamics
+from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
@@ -136,7 +137,7 @@ def test_halves_are_of_the_steps_that_are_in() -> None:
     moves = (action + theta + 0.5 * rng.standard_normal(action.shape)).cumsum(2)
     obs = rng.normal(0, 30, (48, 1, 1, 1)) + np.concatenate([np.zeros((48, 1, 1, 1)), moves], 2)
     trials = Trials(obs, action, np.ones((48, 1, 60), bool) & (np.arange(60) >= 35))
-    alike = fits.own_dynamics(trials, fits.Steps.of(trials))
+    alike = trial_dynamics.own_dynamics(trials, Steps.of(trials))
     assert alike is not None
     assert alike[0] > 0.5
 
@@ -146,17 +147,17 @@ class TestStatesThatTell:
 
     @pytest.fixture(autouse=True)
     def _few_features(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fits, "FINE", 16)
+        monkeypatch.setattr(trial_dynamics, "FINE", 16)
 
     def differ(self, trials: Trials) -> float:
-        alike = fits.own_dynamics(trials, fits.Steps.of(trials))
+        alike = trial_dynamics.own_dynamics(trials, Steps.of(trials))
         assert alike is not None
         return alike[0]
 
     def test_least_squares_takes_it_for_an_effect_of_the_state(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """And the likelihood, in which trials have means, does not."""
         assert self.differ(tank(0.3)) > 0.6
-        monkeypatch.setattr(fits, "trial_means", lambda basis, y, *rest: (y, np.zeros(y.shape[1])))
+        monkeypatch.setattr(trial_dynamics, "trial_means", lambda basis, y, *rest: (y, np.zeros(y.shape[1])))
         assert self.differ(tank(0.3)) == 0
 
     @pytest.mark.parametrize("kind", [{}, {"lasting": 0.6}, {"rough": 0.3}], ids=["idle", "gusts", "misfit"])
@@ -169,7 +170,7 @@ class TestStatesThatTell:
         y, trial = rng.normal(size=(60, 1)), np.repeat(np.arange(20), 3)
         y += 0.5 * rng.normal(size=20)[trial, None]
         follows = np.concatenate([[False], np.diff(trial) == 0])
-        _, ratio = fits.trial_means(np.ones((60, 1)), y, trial, follows)
+        _, ratio = trial_dynamics.trial_means(np.ones((60, 1)), y, trial, follows)
 
         def likely(kept: float, share: float) -> float:
             lag = np.abs(np.subtract.outer(range(3), range(3)))
@@ -179,8 +180,8 @@ class TestStatesThatTell:
             rest = float((y[:, 0] - mean) @ (solved[:, 0] - mean * solved[:, 1]))
             return -30 * np.log(rest) - np.linalg.slogdet(cov)[1] / 2
 
-        grid = {(k, r): likely(k, r) for k in fits.LASTING for r in fits.RATIOS}
-        by_hand = max(grid.values()) - max(grid[k, 0.0] for k in fits.LASTING)
+        grid = {(k, r): likely(k, r) for k in trial_dynamics.LASTING for r in trial_dynamics.RATIOS}
+        by_hand = max(grid.values()) - max(grid[k, 0.0] for k in trial_dynamics.LASTING)
         assert ratio[0] == pytest.approx(by_hand, abs=0.02)
 
 
