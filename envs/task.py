@@ -178,6 +178,11 @@ class Task(ThetaModel, ABC):
         """Gymnasium's id of the task, such as deconf/SlipperyCartpole-v1."""
         return f"deconf/{self.name.title().replace('_', '')}-v{self.version}"
 
+    @property
+    def tier_name(self) -> str:
+        """The tier as tables have it: its number, or none."""
+        return "none" if self.tier is None else str(self.tier)
+
     def without_switches(self) -> Self:
         """The same task, with a theta that holds still within episodes."""
         if not self.switches:

@@ -15,6 +15,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import identity, sources
+from deconfounded.benchmarks.engine.context import demonstrations_file
 from deconfounded.benchmarks.engine.jobs import Job
 from deconfounded.benchmarks.engine.scheduler import Engine
 from deconfounded.benchmarks.engine.worker import Files, Unlike, work
@@ -157,7 +158,7 @@ def connect(address: str) -> None:
 def given(job: Job) -> dict[str, Path]:
     """The files that a job needs: as they are called over there, and where they are here."""
     seeds = job.seeds if "demonstrations" in job.about.uses else ()
-    inside = [job.checkpoint, *(job.folder / f"demonstrations-{seed}.npz" for seed in seeds)]
+    inside = [job.checkpoint, *(demonstrations_file(job.folder, seed) for seed in seeds)]
     files = {f"jobs/{file.name}": file for file in inside}
     files |= {str(Path("outside", *file.parts[1:])): file for file in from_outside(job)}
     return {name: file for name, file in files.items() if file.is_file()}

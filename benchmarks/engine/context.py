@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 DEMOS, EXPLORATION, EVALUATION, GUEST = 1, 2, 3, 4  # each purpose has seeds of its own
 
 
+def demonstrations_file(folder: Path, seed: int) -> Path:
+    """Where the jobs of a folder keep a seed's demonstrations."""
+    return folder / f"demonstrations-{seed}.npz"
+
+
 def stream(purpose: int, seed: int, salt: str = "") -> int:
     """A seed for one purpose of one run, far from all others; with a salt, one that nobody can have looked at."""
     entropy = [purpose, seed, *salt.encode("utf-8", "surrogateescape")]
@@ -75,7 +80,7 @@ class Context:
         assert self.folder is not None
         what = (self.task, self.named_expert, self.preset.expert_trials, seed, self.protocol)
         made_of = identity.demonstrations(*what)
-        return self.folder / f"demonstrations-{seed}.npz", made_of
+        return demonstrations_file(self.folder, seed), made_of
 
     def has_demonstrations(self, seed: int) -> bool:
         """Whether they are in the folder: whole, and of this seed, task and expert."""

@@ -1,7 +1,9 @@
 """What comes with the package, in a checkout and installed alike: certificates of tasks, and records of methods."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import ROOT
@@ -17,12 +19,13 @@ def certificate(name: str, suffix: str = ".json") -> Path:
 
 def certified() -> list[str]:
     """Names of the suite's tasks whose certificate is passed."""
+    files = {name: certificate(name) for name in envs.SUITE}
+    return passed({name: json.loads(file.read_bytes()) for name, file in files.items() if file.is_file()})
 
-    def passed(name: str) -> bool:
-        file = certificate(name)
-        return file.is_file() and json.loads(file.read_bytes())["verdict"] == "passed"
 
-    return [name for name in envs.SUITE if passed(name)]
+def passed(certificates: Mapping[str, Any]) -> list[str]:
+    """Names of the tasks whose certificate is passed, given the certificates by name."""
+    return [name for name, certificate in certificates.items() if certificate["verdict"] == "passed"]
 
 
 def tasks(asked: list[str]) -> list[envs.Task]:

@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES, labels
 from deconfounded.benchmarks.output import scoring, statistics
 from deconfounded.benchmarks.output.pictures import colours, encoded
@@ -141,7 +142,7 @@ def about(docs: Path, task: envs.Task, results: dict[str, Any], certified: dict[
     return {
         "name": task.name,
         "version": task.version,
-        "tier": "none" if task.tier is None else str(task.tier),
+        "tier": task.tier_name,
         "headline": first,
         "text": [part.replace("\n", " ") for part in others],
         "latents": [f"{units[lat.name]}, {lat.distribution}" for lat in task.latents],
@@ -159,7 +160,7 @@ def certified(
     found: Found, certificates: Mapping[str, Any], measure: str = "last"
 ) -> dict[str, dict[str, dict[int, float]]]:
     """One of scoring.MEASURES, by task, method and seed, of the tasks whose certificate is passed."""
-    passed = {name for name, one in certificates.items() if one["verdict"] == "passed"}
+    passed = published.passed(certificates)
     return {task.name: measured(results["methods"], measure) for task, results in found if task.name in passed}
 
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS
 from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.pictures import panels
@@ -63,7 +64,7 @@ def _ranked(methods: dict[str, Any], end: str, chosen: Callable[[dict[str, Any]]
 
 def of_tasks(found: index.Found, certified: dict[str, Any], end: str, tiers: str = "123") -> dict[str, Headroom]:
     """By name, of the tasks whose certificate is passed."""
-    passed = {name for name, one in certified.items() if one["verdict"] == "passed"}
+    passed = published.passed(certified)
     made = {task.name: headroom(results["methods"], end, tiers) for task, results in found if task.name in passed}
     return {name: one for name, one in made.items() if one}
 
@@ -129,7 +130,7 @@ def _mean(runs: list[Array]) -> Array:
 
 def deployments(found: index.Found, certified: dict[str, Any]) -> str:
     """Its part on ways of deploying one belief: means over the tasks where all ways of a method were run."""
-    passed = {name for name, one in certified.items() if one["verdict"] == "passed"}
+    passed = published.passed(certified)
     ways: dict[str, dict[str, None]] = {}
     for _, results in found:
         for name, entry in results["methods"].items():

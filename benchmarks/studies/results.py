@@ -167,9 +167,8 @@ def by_task(found: index.Found) -> str:
     rows, column = [], scoring.COLUMNS.index("last")
     for task, results in found:
         last = {row[0]: row[column] for row in scoring.rows(results["methods"])}
-        tier = "none" if task.tier is None else str(task.tier)
         row = (*(last.get(name, "") for name in BY_TASK), f"{results['wall_s']:,.0f}")
-        rows.append((f"[{task.name}](#{task.name})", tier, *row))
+        rows.append((f"[{task.name}](#{task.name})", task.tier_name, *row))
     methods = (f"{name} ({METHODS[name].tier})" for name in BY_TASK)
     table = markdown_table(("task", "tier needed", *methods, "seconds"), rows)
     text = """A *tier* is what a method may use: 1, demonstrations; 2, also exploration that is blind to theta; 3, also

@@ -88,10 +88,11 @@ def _tasks(by_task: dict[str, Any]) -> str:
     for name in TASKS:
         task = envs.get(name)
         latents = ", ".join(f"{lat.name} ({lat.unit})" if lat.unit else lat.name for lat in task.latents)
-        tier = "none" if task.tier is None else str(task.tier)
         scores = (by_task.get(name, {}).get("methods", {}).get(method) for method in ("deconfounded", "naive_rnn"))
         last = (scoring.two_decimals(entry["score_last"]) if entry else "" for entry in scores)
-        rows.append((f"[{name}](tasks.md#{name})", _headline(inspect.getmodule(type(task))), latents, tier, *last))
+        rows.append(
+            (f"[{name}](tasks.md#{name})", _headline(inspect.getmodule(type(task))), latents, task.tier_name, *last)
+        )
     head = ("task", "what", "latents", "tier needed", "deconfounded", "naive_rnn")
     table = markdown_table(head, rows)
     text = "Tier needed: the lowest at which the interventional policy is identified. Scores are of the last episode."

@@ -71,7 +71,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
     """Files of expert trials, and of exploration: half at random, half by a clone without memory that tries things."""
     from deconfounded.benchmarks.engine import identity
     from deconfounded.benchmarks.engine.catalogue import METHODS
-    from deconfounded.benchmarks.engine.context import Context
+    from deconfounded.benchmarks.engine.context import Context, demonstrations_file
     from deconfounded.benchmarks.engine.presets import preset
     from deconfounded.deconf.diagnosis import exploration
     from deconfounded.experts.trials import Trials, joined
@@ -87,7 +87,7 @@ def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]
         rngs = context.rngs  # once: each exploration draws thetas of its own
         explorer = exploration.fit(demonstrations, METHODS["blind_bc"].config(settings.configs["blind_bc"]), rngs)
         joined([context.explore(agent, rngs) for agent in (None, explorer)]).save(file, made_of)
-    return folder / f"demonstrations-{SEED}.npz", file
+    return demonstrations_file(folder, SEED), file
 
 
 def point(task: envs.Task) -> dict[str, Any] | None:
