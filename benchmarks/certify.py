@@ -2,7 +2,7 @@
 
 Four measurements: how much evidence of theta the dynamics and the expert's actions hold, what the exact policies score,
 what it costs an expert to assume a wrong theta, and what a clone without memory scores. Only the last one is trained,
-and the dynamics of a task without a likelihood.
+and the dynamics of a task without a likelihood. The exit status is 1 if the task does not pass.
 """
 
 import time

@@ -35,7 +35,7 @@ def parser(description: str | None, methods: str, seeds: int | None = None, resu
     made.add_argument("--preset", default="default", help=presets)
     made.add_argument("--methods", nargs="+", metavar="NAME", help=methods)
     made.add_argument("--set", nargs="+", metavar="KEY=VALUE", default=[], help="settings, e.g. naive_rnn.updates=500")
-    made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'the preset'}")
+    made.add_argument("--seeds", type=int, default=seeds, metavar="N", help=f"default: {seeds or 'of the preset'}")
     cluster = "run on a Ray cluster: HOST:PORT, or auto for this machine's"
     made.add_argument("--cluster", metavar="ADDRESS", help=cluster)
     made.add_argument("--out", type=place, help="output folder; default: a folder under results/")

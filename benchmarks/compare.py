@@ -10,6 +10,8 @@ from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
+from deconfounded.benchmarks.engine import protocols
+from deconfounded.benchmarks.engine.catalogue import check_names
 from deconfounded.benchmarks.output import records
 
 
@@ -27,12 +29,16 @@ def main() -> None:
     parser.add_argument("results", nargs="+", type=Path, help="folders of runs, or files of records")
     default = ["deconfounded", "naive_rnn"]
     parser.add_argument("--against", nargs="+", metavar="NAME", default=default, help="default: deconfounded naive_rnn")
+    parser.add_argument("--protocol", help="only the records of this protocol; default: all, which must be of one")
     parser.add_argument("--out", type=place, default=Path("results") / "comparison", help="default: results/comparison")
     args = parser.parse_args()
     from deconfounded.benchmarks.output import comparison  # it takes seconds
 
     against = list(dict.fromkeys(args.against))
     every = [record for given in dict.fromkeys(args.results) for record in read(given)]
+    if args.protocol is not None:
+        check_names("protocol", [args.protocol], list(protocols.PROTOCOLS))
+        every = [record for record in every if record.get(records.NAME, protocols.STANDARD) == args.protocol]
     scores = comparison.gathered(every, against)
     own = list(dict.fromkeys(records.named(record) for record in every))
     methods = [name for name in scores if name in own and (name not in against or len(against) > 1)]

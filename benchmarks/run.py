@@ -48,7 +48,8 @@ def main() -> None:
     if args.list:
         return listed(args)
     if (args.task is None) == (args.tasks is None):
-        raise envs.InputError(f"--task is missing, or given with --tasks; there are {', '.join(envs.names())}")
+        given = "--task and --tasks were both given" if args.task else "neither --task nor --tasks was given"
+        raise envs.InputError(f"{given}; give one of them: there are {', '.join(envs.names())}")
     tasks = [envs.get(args.task)] if args.task is not None else published.tasks(args.tasks)
     tasks = [applied(args.protocol, task) for task in tasks]
     opaque = next((task.name for task in tasks if not task.has_likelihood), None)

@@ -1,4 +1,4 @@
-"""Score a saved agent on fresh thetas: `deconf score --agent DIR --task slippery_cartpole`
+"""Score a saved agent on fresh thetas: `deconf score --agent DIR --task slippery_cartpole --salt mine`
 
 Thetas are drawn from p(theta) by --seed and --salt, or with --range from another range, which may exceed the task's.
 The expert and random actions are run under the same thetas: the score is 1 for the expert, and 0 for random actions.

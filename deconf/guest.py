@@ -44,7 +44,9 @@ class ChannelAsk:
     def __call__(self, kind: str, *details: Any, agent: Agent | None = None) -> Any:
         channel, self._channel = self._channel, None
         if channel is None:
-            raise InputError(f"{kind} were asked for while an agent acts, or when fitting was over; ask in between")
+            raise InputError(
+                f"{kind} were asked for by an agent's method, or after fitting; ask in the function that fits"
+            )
         try:
             channel.send_bytes(pack([kind, agent is not None, *details]))
             return serve(channel, agent)

@@ -16,7 +16,7 @@ REPEATED = "what was finished is kept, and the same command goes on"
 WRITTEN = "what was written so far stays; run it again"
 COMMANDS = {  # name: module, what it does, what is said when it is interrupted
     "run": ("benchmarks.run", "train, deploy and score methods on a task", RESUMED),
-    "train": ("benchmarks.train", "train a task's expert (PPO)", WRITTEN),
+    "train": ("benchmarks.train", "train a task's expert (PPO)", NOTHING),
     "check": ("benchmarks.check", "does a task meet the contract? its tests", NOTHING),
     "certify": ("benchmarks.certify", "is a task confounded, and by how much?", NOTHING),
     "diagnose": ("benchmarks.diagnose", "is *your* data confounded? from logs alone", REPEATED),

@@ -25,7 +25,7 @@ class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         if getattr(env.unwrapped, "episodes", 1) < 2:
-            raise InputError("a trial had one episode; make the environment with episodes=5, say")
+            raise InputError("TrialEnv was given an environment of one episode a trial; make it with episodes=5, say")
         inner, (width, self._actions) = env.observation_space, action_sizes(env.action_space)
         assert isinstance(inner, spaces.Box)
         self._before = np.zeros(self._actions or width, np.float32)

@@ -163,7 +163,8 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
 
 
 def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
-    remedy = f"run `deconf train --task {task.reference or task.name}`"
+    out = "" if file == path(task) else f" --out {file}"
+    remedy = f"`deconf train --task {task.reference or task.name}{out}` makes such a file"
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:

@@ -51,7 +51,7 @@ def trial_seeds(n: int, seed: int | Sequence[int]) -> list[int]:
     """The environments' seeds for n trials, in equal groups. Raises InputError where n is no multiple of the seeds."""
     seeds = _group_seeds(seed)
     if n % len(seeds):
-        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be as many for each")
+        raise InputError(f"{n} trials were to share {len(seeds)} seeds; it must be a multiple of their number")
     return [first + i for first in seeds for i in range(n // len(seeds))]
 
 

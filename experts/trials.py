@@ -38,7 +38,8 @@ class Trials:
         if mask.dtype != bool and not np.isin(mask, (0, 1)).all():
             raise InputError("mask of Trials held numbers other than 0 and 1; it must be bool")
         if not isinstance(self.actions, int | np.integer) or isinstance(self.actions, bool) or self.actions < 0:
-            raise InputError(f"actions of Trials was {self.actions!r}; it must be how many there are, or 0")
+            right = "the number of discrete actions, or 0 if continuous"
+            raise InputError(f"actions of Trials was {self.actions!r}; it must be {right}")
         b, e, t = mask.shape if mask.ndim == 3 else (0, 0, 0)
         fit = obs.shape[:-1] == (b, e, t + 1) and action.shape[:-1] == (b, e, t)
         if not fit or 0 in (obs.shape[-1], action.shape[-1]):
@@ -60,7 +61,8 @@ class Trials:
         if self.actions and not np.isin(action, np.arange(self.actions)).all():
             raise InputError(f"Trials held an action that is not one of 0..{self.actions - 1}")
         if not self.actions and (far := size(action)) > 1:
-            raise InputError(f"Trials held an action of size {far:.9g}; actions must be in [-1, 1], or `actions` given")
+            right = "actions must be in [-1, 1]; discrete ones need `actions`, their number"
+            raise InputError(f"Trials held an action of size {far:.9g}; {right}")
         if not np.can_cast(obs.dtype, np.float32):
             check_rounding(obs, mask)
         for name, array, dtype in (("obs", obs, np.float32), ("action", action, np.float32), ("mask", mask, bool)):
@@ -100,7 +102,8 @@ class Trials:
         try:
             with np.load(file, allow_pickle=False) as data:
                 if missing := {"obs", "action", "mask", "actions", "made_of"} - {*data}:
-                    raise InputError(f"it lacks {min(missing)}; Trials.save writes such a file")
+                    remedy = "Trials(obs, action, mask).save writes such a file"
+                    raise InputError(f"it lacks {', '.join(sorted(missing))}; {remedy}")
                 if made_of not in (None, str(data["made_of"])):
                     raise InputError("it was made of something else")
                 return Trials(data["obs"], data["action"], data["mask"], int(data["actions"]))

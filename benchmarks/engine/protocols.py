@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 STANDARD = "standard"
 PROTOCOLS = {
-    STANDARD: "all of it",
+    STANDARD: "the amounts of the preset, trials of several episodes",
     "scarce": "a sixteenth of the expert trials, of exploration and of queries",
     "unseen": "theta from the middle half of each latent's distribution in training, from the rest in evaluation",
     "once": "trials of one episode",

@@ -58,7 +58,7 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
     scores: dict[str, dict[str, dict[int, Array]]] = {}
     protocols = list(dict.fromkeys(record.get(records.NAME, STANDARD) for record in every))
     if len(protocols) > 1:
-        raise InputError(f"records of protocols {' and '.join(protocols)} are not to be compared; give those of one")
+        raise InputError(f"records of protocols {' and '.join(protocols)} are not to be compared; give --protocol")
 
     def add(record: Record) -> None:
         of = scores.setdefault(records.named(record), {}).setdefault(record["task"], {})

@@ -73,7 +73,8 @@ class LearnedAgent(Agent):
 
     def begin(self, n: int) -> None:
         if not isinstance(n, int | np.integer) or n < 1 or n % self.seeds:
-            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; it must be as many for each")
+            right = "it must be a multiple of the number of seeds"
+            raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; {right}")
         self._n = n // self.seeds
         self._draws = Draws([], self.device)
 

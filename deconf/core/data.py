@@ -168,7 +168,8 @@ class Batch:
         """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
         trials = trials_of(trials)
         if len(trials) % seeds:
-            raise InputError(f"{len(trials)} trials were given for {seeds} seeds; it must be as many for each")
+            right = "it must be a multiple of the number of seeds"
+            raise InputError(f"{len(trials)} trials were given for {seeds} seeds; {right}")
         obs, action, next_obs, mask = (
             joined(array, trials.mask, seeds, device)
             for array in (trials.obs[:, :, :-1], trials.action, trials.obs[:, :, 1:], trials.mask[..., None])

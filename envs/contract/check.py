@@ -60,7 +60,8 @@ def check_task(task: Task) -> None:
         with _part(task, name):
             given = np.asarray(ask())
             if given.shape != shape:
-                raise InputError(f"{name} of {task.name} gave {given.shape} of {n} environments; it must be {shape}")
+                wrong = f"{name} of {task.name} gave an array of shape {given.shape} for {n} environments"
+                raise InputError(f"{wrong}; it must be {shape}")
             if not np.isfinite(given).all():
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):

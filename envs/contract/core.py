@@ -66,7 +66,7 @@ def effect(task: Task) -> None:
         if not alike.any():
             break
     if task.tier is None:
-        require(alike.all(), "theta changes a trajectory, and the tier is None: nothing must tell of theta")
+        require(alike.all(), "theta changes a trajectory, and the tier is None: nothing may depend on theta")
     else:
         of = f"thetas {thetas[1:][alike].tolist()} have the trajectories of {thetas[0].tolist()}"
         require(not alike.any(), f"{of}; theta must have an effect")

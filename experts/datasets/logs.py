@@ -149,10 +149,12 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
         for i, name in enumerate(action):
             if name in table.limits:
                 low[i], high[i] = min(low[i], table.limits[name][0]), max(high[i], table.limits[name][1])
-    said = "; ".join(f"{name} {a:.6g} to {b:.6g}" for name, a, b in zip(action, low, high, strict=True))
-    return Units(
-        obs, action, tuple(low.tolist()), tuple(high.tolist())
-    ), f"Actions, each range taken as -1 to 1: {said}"
+    ranges = "; ".join(f"{name} {a:.6g} to {b:.6g}" for name, a, b in zip(action, low, high, strict=True))
+    said = f"Actions, each range taken as -1 to 1: {ranges}"
+    if whole and 2 < len(held := np.unique(taken)) <= MOST_DISCRETE:
+        listed = ", ".join(f"{value:g}" for value in held)
+        said = Odd(f"{said}. They are whole numbers with gaps ({listed}); discrete ones must be consecutive, or texts")
+    return Units(obs, action, tuple(low.tolist()), tuple(high.tolist())), said
 
 
 def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, horizon: int, single: bool) -> Log:
@@ -181,11 +183,12 @@ def _log(tables: list[Table], parts: list[Episodes], units: Units, said: str, ho
         )
         raise InputError(f"{error}{f' ({listed})' if listed else ''}") from None
     where = tables[0].where if len(tables) == 1 else f"{len(tables)} files"
-    notes = [f"{where}: {_size(mask)}.", f"{said}."]
+    notes = [f"{where}: {_size(mask)}.", type(said)(f"{said}.")]
     files = Counter(name for part in parts for name in dict.fromkeys(episode.trial for episode in part.episodes))
     if not single and (shared := [name for name, count in files.items() if count > 1]):
         names = ", ".join(shared[:5]) + ", ..." * (len(shared) > 5)
-        notes.append(Odd(f"Several files have a trial {names}: rows with one name of a trial are of one trial."))
+        what = f"Rows of trial {names} are in several files, and are taken for one trial of each name"
+        notes.append(Odd(f"{what}; if they are different trials, give these different names."))
     notes += [note for part in parts for note in part.notes]
     return Log(
         *(trials.obs, trials.action, trials.mask, trials.actions), units, tuple(by_trial), tuple(dict.fromkeys(notes))

@@ -49,7 +49,8 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
     """Episodes by the table's boundaries, or by columns. Raises InputError for what cannot be trials."""
     for what, given, default in (("obs", roles.obs, table.obs), ("action", roles.action, table.action)):
         if not given and not default:
-            raise InputError(f"{table.where} does not say what is {what}; give --{what}, of {', '.join(table.columns)}")
+            remedy = f"give --{what}, some of {', '.join(table.columns)}"
+            raise InputError(f"{table.where} does not say which columns are {what}; {remedy}")
     if roles.episode is None and roles.trial is None and table.boundaries is None:
         raise InputError(
             f"{table.where} does not say where an episode begins; give --episode or --trial, of"
@@ -57,15 +58,18 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
         )
     names = table.select("obs", roles.obs) or table.obs, table.select("action", roles.action) or table.action
     action_names = names[1]
-    groups = [None if name is None else table.select(what, [name])[0] for what, name in _groups(table, roles)]
-    if both := [name for name in roles.obs if name in (*action_names, *groups)]:
-        used = "an action" if both[0] in action_names else "what a trial or an episode is"
-        raise InputError(f"obs {both[0]!r} of {table.where} is {used} too; a column has one role")
-    obs_names = tuple(name for name in names[0] if name not in action_names and name not in groups)
+    groups = [() if name is None else table.select(what, [name]) for what, name in _groups(table, roles)]
+    grouping = [name for group in groups for name in group]
+    for what, given, taken in (("obs", roles.obs, (*action_names, *grouping)), ("action", action_names, grouping)):
+        if both := [name for name in given if name in taken]:
+            role = "an action" if what == "obs" and both[0] in action_names else "what a trial or an episode is"
+            raise InputError(f"{what} {both[0]!r} of {table.where} is {role} too; a column has one role")
+    obs_names = tuple(name for name in names[0] if name not in action_names and name not in grouping)
     if not obs_names:
-        raise InputError(f"obs of {table.where} are none beside the trial, the episode and the action")
-    trial, labels = (None if name is None else table.labels(name) for name in groups)
-    first = _starts(table, groups, [column for column in (trial, labels) if column is not None], roles)
+        raise InputError(f"no column of {table.where} is left for obs, beside the trial, the episode and the action")
+    trial, labels = (_labels(table, group) if group else None for group in groups)
+    used = [", ".join(group) for group in groups if group]
+    first = _starts(table, used, [column for column in (trial, labels) if column is not None], roles)
     obs = np.stack([_numbers(table, name) for name in obs_names], 1)
     action, empty = _actions(table, action_names)
     bounds = list(zip(first, [*first[1:], len(table)], strict=True))
@@ -122,6 +126,16 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def _labels(table: Table, names: Sequence[str]) -> Column:
+    """What tells trials or episodes apart [N]: a column, or the values of several together."""
+    columns = [table.labels(name) for name in names]
+    for name, column in zip(names, columns, strict=True):
+        _check(table, [name], (column == "" if column.dtype == object else np.isnan(column))[:, None], 0, "is empty")
+    if len(columns) == 1:
+        return columns[0]
+    return np.array([", ".join(map(_text, row)) for row in zip(*columns, strict=True)], object)
+
+
 def _groups(table: Table, roles: Roles) -> list[tuple[str, str | None]]:
     return [("trial", roles.trial or (None if roles.episode else table.trial)), ("episode", roles.episode)]
 
@@ -133,11 +147,8 @@ def _text(value: Any) -> str:
     return f"{value:.0f}" if value.is_integer() else repr(float(value))
 
 
-def _starts(table: Table, names: list[str | None], columns: list[Column], roles: Roles) -> list[int]:
-    """The first row of each episode. Raises InputError for rows of one episode that stand apart."""
-    used = [name for name in names if name is not None]
-    for name, column in zip(used, columns, strict=True):
-        _check(table, [name], (column == "" if column.dtype == object else np.isnan(column))[:, None], 0, "is empty")
+def _starts(table: Table, used: list[str], columns: list[Column], roles: Roles) -> list[int]:
+    """The first row of each episode. used: names of the columns. Raises InputError for rows of one that stand apart."""
     own = table.boundaries is not None and roles.episode is None
     grouping = [table.boundaries] if own else columns
     keys = [np.unique(column, return_inverse=True)[1] for column in grouping if column is not None]
@@ -148,7 +159,8 @@ def _starts(table: Table, names: list[str | None], columns: list[Column], roles:
             inside = (column[1:] != column[:-1]) & ~changes
             if inside.any():
                 row = int(np.flatnonzero(inside)[0]) + 2
-                raise InputError(f"{name!r} of {table.where} changes within an episode, in row {row}; a trial is whole")
+                what = f"{name!r} of {table.where} changes within an episode, in row {row}"
+                raise InputError(f"{what}; an episode is of one trial")
         return first
     seen: dict[tuple[int, ...], int] = {}
     for row in first:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
+from deconfounded.benchmarks import compare
 from deconfounded.benchmarks.engine import progress, protocols
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.catalogue import METHODS
@@ -160,6 +161,27 @@ class TestTables:
         less = [{**record, "returns": [value - 1 for value in record["returns"]]} for record in once]
         own = [value + 1 for value in aggregation.references(less[0], less)]
         assert own == pytest.approx(aggregation.references(once[0], once))
+
+    @pytest.mark.parametrize(("protocol", "name"), [("standard", None), ("once", "once")])
+    def test_compare_takes_those_of_one(
+        self,
+        protocol: str,
+        name: str | None,
+        both: tuple[list[Any], list[Any]],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """With --protocol, of a file that holds records of two."""
+
+        def of_one(every: list[Any], _: list[str]) -> None:
+            assert [record.get("protocol_name") for record in every] == [name] * len(both[0])
+            raise InterruptedError
+
+        monkeypatch.setattr(comparison, "gathered", of_one)
+        records.write(tmp_path, [*both[0], *both[1]])
+        monkeypatch.setattr("sys.argv", ["compare", str(tmp_path), "--protocol", protocol])
+        with pytest.raises(InterruptedError):
+            compare.main()
 
     def test_compare_refuses_two(self, both: tuple[list[Any], list[Any]]) -> None:
         standard, once = both

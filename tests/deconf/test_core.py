@@ -1,5 +1,6 @@
 """The core: equations against numbers by hand, beliefs, data types, and methods on little data."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -594,8 +595,10 @@ class TestMethods:
 class TestWeights:
     def test_missing_damaged_and_wrong(self, tmp_path: Path) -> None:
         task = envs.get("slippery_cartpole")
-        with pytest.raises(envs.InputError, match="no expert weights"):
-            policy.load(task, tmp_path / "none.safetensors")
+        file = tmp_path / "none.safetensors"
+        remedy = f"`deconf train --task slippery_cartpole --out {file}` makes such a file"
+        with pytest.raises(envs.InputError, match=re.escape(f"no expert weights at {file}; {remedy}")):
+            policy.load(task, file)
         (tmp_path / "bad.safetensors").write_bytes(b"\x80\x04not safetensors")
         with pytest.raises(envs.InputError, match="damaged"):
             policy.load(task, tmp_path / "bad.safetensors")

@@ -335,6 +335,18 @@ class TestNames:
         log = datasets.read(write_csv(tmp_path / "x.csv", made), trial="run", obs=["x"], action=["u"])
         assert log.names == ("1", "2")
 
+    def test_several_columns(self, tmp_path: Path) -> None:
+        """As a goal of two numbers: together they are a trial's name, and no observations."""
+        goals = [(0.5, 1.0), (0.5, 2.0), (3.0, 1.0)]
+        made = [{"goal.0": a, "goal.1": b, "x": float(t), "u": t / 10} for a, b in goals for t in range(3)]
+        for trial in ("goal", "g*"):
+            log = datasets.read(write_csv(tmp_path / "x.csv", made), trial=trial, action=["u"], obs=["*"])
+            assert log.names == ("0.5, 1", "0.5, 2", "3, 1")
+            assert log.units.obs == ("x",)
+        made[4]["goal.1"] = ""
+        with pytest.raises(envs.InputError, match=r"'goal\.1' of .*x\.csv is empty in row 5"):
+            datasets.read(write_csv(tmp_path / "x.csv", made), trial="goal", action=["u"], obs=["x"])
+
     @pytest.mark.parametrize("names", [[2**60, 2**60 + 1], [20261129001, 20261129002]])
     def test_parquet(self, names: list[int], tmp_path: Path) -> None:
         """Whole numbers that float64 rounds; in a column that nobody asks for they are no trouble."""
@@ -370,8 +382,7 @@ class TestNames:
         files = [write_csv(tmp_path / f"{i}.csv", self.named([0, i])) for i in (1, 2)]
         log = datasets.read(files, trial="run", obs=["x"], action=["u"])
         assert log.names == ("0", "1", "2")
-        assert "Several files have a trial 0: rows with one name of a trial are of one trial." in log.notes
-        assert [type(note) for note in log.notes if note.startswith("Several files")] == [Odd]
+        assert [type(note) for note in log.notes if note.startswith("Rows of trial 0 are in several files")] == [Odd]
 
 
 class TestActions:
@@ -399,6 +410,8 @@ class TestActions:
         log = datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
         assert log.units.values == kept
         assert log.actions == len(kept)
+        gaps = [note for note in log.notes if "They are whole numbers with gaps (0, 40, 100); discrete ones" in note]
+        assert [type(note) for note in gaps] == [Odd] * (values == (0, 40, 100))
         back = log.units.unscaled(log.action[0, 0, :3])[:, 0].tolist()
         texts = isinstance(values[0], str) and kept[0] != 0
         assert back == (list(values) if texts else pytest.approx([float(value) for value in values]))
@@ -465,10 +478,11 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
         "rows of vehicle a, lap 0 stand apart in .*, from row 1 and again from row 4; sort it by",
     ),
     "no trial": ({}, {"vehicle": ""}, "'vehicle' of .* is empty in row 3"),
-    "nothing said": ({"obs": []}, {}, "does not say what is obs; give --obs, of vehicle, lap"),
+    "nothing said": ({"obs": []}, {}, "does not say which columns are obs; give --obs, some of vehicle, lap"),
     "no episode": ({"trial": None, "episode": None}, {}, "does not say where an episode begins; give --episode or"),
     "one text": ({"obs": "speed x"}, {}, r"obs was 'speed x'; it must be a list of columns, \['speed x'\]"),
-    "all used": ({"obs": ["thr*", "lap*"]}, {}, "obs of .* are none beside the trial"),
+    "an action that is the trial": ({"action": ["vehicle"]}, {}, "action 'vehicle' of .* is what a trial or an"),
+    "all used": ({"obs": ["thr*", "lap*"]}, {}, "no column of .* is left for obs, beside the trial"),
 }
 
 
