@@ -24,7 +24,7 @@ Info = dict[str, Any]
 def _array(action: Any) -> NDArray[Any]:
     try:
         return np.asarray(action)
-    except ValueError:  # lists of several lengths
+    except (ValueError, RuntimeError):  # lists of several lengths; a tensor with a gradient
         raise InputError(f"action was {action!r}; it must be numbers, as many in each row") from None
 
 
@@ -35,9 +35,11 @@ def _observation_space(task: Task, privileged: bool) -> spaces.Box:
 
 def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
     """Gymnasium's metadata for rendering. Raises InputError for an unknown render_mode."""
-    if render_mode not in (None, "rgb_array"):
-        raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be 'rgb_array' or None")
-    return {"render_modes": ["rgb_array"], "render_fps": round(1 / task.control_dt)}
+    modes = ["rgb_array"] if task.has_likelihood else []  # a black box has no pictures
+    if render_mode not in (None, *modes):
+        right = "'rgb_array' or None" if modes else "None, as a black box has no pictures"
+        raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be {right}")
+    return {"render_modes": modes, "render_fps": round(1 / task.control_dt)}
 
 
 class _Pictures:
@@ -98,6 +100,9 @@ class GymEnv(gym.Env[Any, Any]):
     def render(self) -> Any:
         return None if self.render_mode is None else self._pictures(0)
 
+    def close(self) -> None:
+        self.batch.close()
+
 
 class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
@@ -118,7 +123,8 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
         autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         check_number("episodes", episodes)
-        if autoreset_mode not in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
+        modes = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)
+        if autoreset_mode not in (*modes, *(mode.value for mode in modes)):
             right = "it must be AutoresetMode.NEXT_STEP or SAME_STEP"
             raise InputError(f"autoreset_mode of {task.name} was {autoreset_mode!r}; {right}")
         self.metadata = {**_metadata(task, render_mode), "autoreset_mode": AutoresetMode(autoreset_mode)}
@@ -157,6 +163,9 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """A picture [H, W, 3] of each environment; None without a render_mode."""
         return None if self.render_mode is None else tuple(self._pictures(i) for i in range(self.num_envs))
+
+    def close_extras(self, **_: Any) -> None:
+        self.batch.close()
 
 
 class DmEnv(dm_env.Environment):

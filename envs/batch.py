@@ -19,8 +19,8 @@ class BatchEnv:
 
     Attributes: `theta` [N, L] and `state` [N, S], for experts and exact references alone; `path` [N, T + 1, L], where
     theta switches: that of each step of the episode, and of the next episode's first; `action` [N, A], the last one
-    taken, for pictures; `alive` [N], whether the episode goes on. An environment whose episode has ended keeps its row,
-    has reward 0, and waits for `reset`.
+    taken in this episode, or NaN, for pictures; `alive` [N], whether the episode goes on. An environment whose episode
+    has ended keeps its row, has reward 0, and waits for `reset`.
     """
 
     def __init__(self, task: Task, n: int, privileged: bool = False) -> None:
@@ -48,7 +48,8 @@ class BatchEnv:
             seed = [None] * self.n
         elif isinstance(seed, int | np.integer) and is_seed(seed):
             seed = [int(seed) + i for i in range(self.n)]
-        shape = seed.shape if isinstance(seed, np.ndarray) else (len(seed),) if isinstance(seed, list | tuple) else None
+        listed = (len(seed),) if isinstance(seed, Sequence) and not isinstance(seed, str | bytes) else None
+        shape = seed.shape if isinstance(seed, np.ndarray) else listed
         if isinstance(seed, int) or shape != (self.n,) or not all(value is None or is_seed(value) for value in seed):
             raise InputError(f"seed was {seed}; it must be None, a number from 0 up, or {self.n} of these")
         self._streams = [generators(value) for value in seed]
@@ -76,6 +77,8 @@ class BatchEnv:
         if seed is not None or not self._streams:
             self.seed(seed)
         rows = self._all_rows if where is None else np.flatnonzero(where)
+        if not len(rows):
+            return self.observe()
         theta_rng, start_rng, noise_rng, switch_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
         new, task = ~keep[rows], self.task
         for which, is_new in ((new, True), (~new, False)):
@@ -96,8 +99,12 @@ class BatchEnv:
         if first:
             self.state, self._noise = np.zeros((self.n, start.shape[1])), np.zeros((self.n, *noise.shape[1:]))
         self.state[rows], self._noise[rows] = start, noise
-        self._steps[rows], self.alive[rows] = 0, True
+        self._steps[rows], self.alive[rows], self.action[rows] = 0, True, np.nan
         return self.observe()
+
+    def close(self) -> None:
+        """Close what the simulator holds; another reset opens it again."""
+        self.simulator.close()
 
     def _keep_mask(self, keep: object) -> Mask:
         """True, False or booleans [N] -> booleans [N]. Raises InputError for anything else."""
@@ -143,8 +150,7 @@ class BatchEnv:
         reward[on] = task.reward(before, taken, after, theta)
         terminated[on] = task.terminated(after)
         self._steps[on] += 1
-        truncated[on] = self._steps[on] >= task.horizon
-        truncated &= ~terminated
+        truncated[on] = (self._steps[on] >= task.horizon) | task.truncated(after)
         if not np.isfinite(reward).all():
             raise InputError(f"reward of {task.name} was {reward[~np.isfinite(reward)][0]}; it must be finite")
         self.state = self.state.copy()  # agents may hold the array before

@@ -3,8 +3,10 @@
 A *world* makes such an environment for a theta (envs/world.py); `task_of` turns it into a task.
 """
 
+import contextlib
 import inspect
 import re
+import weakref
 from typing import Any, ClassVar, Generic, TypeVar
 
 import gymnasium
@@ -16,8 +18,9 @@ from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Renderer, Simulator, Task
-from deconfounded.envs.world import Facts, World, drawn, facts, made, part
+from deconfounded.envs.world import Facts, World, bounds, drawn, facts, made, part
 
+LARGEST = float(np.finfo(np.float32).max)  # of an observation
 LEAST_NOISE = 0.01  # of an expert, as Eq. (1) needs a density: a share of half the action range, or of actions
 PARTS = ("make", "sample_theta", "expert", "episodes", "steps")
 SHAPE = "make(theta), sample_theta(rng), expert(obs, theta), episodes and steps"
@@ -34,6 +37,10 @@ class GymSimulator(Simulator):
         super().__init__(task, n)
         self.box = task
         self._envs: list[gymnasium.Env[Any, Any] | None] = [None] * n
+        weakref.finalize(self, _close, self._envs)  # simulators may hold processes, sockets and windows
+
+    def close(self) -> None:
+        _close(self._envs)
 
     def __getstate__(self) -> dict[str, Any]:
         raise InputError(f"environments of {self.box.name} cannot be copied; make others")
@@ -53,7 +60,7 @@ class GymSimulator(Simulator):
                 obs, _ = self._values("reset", env.reset(seed=int(first)), "obs, info")
                 bits = env.unwrapped.np_random.bit_generator
                 bits.state = type(bits)(int(then)).state  # in place, as parts of the environment may hold the generator
-            states.append(self._state("reset", obs, 0.0, False))
+            states.append(self._state("reset", obs, 0.0, False, False))
         return np.stack(states)
 
     def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
@@ -71,7 +78,7 @@ class GymSimulator(Simulator):
                     raise InputError(
                         f"step of {self.box.name} gave the reward {reward!r}; it must be a number"
                     ) from None
-                after[k] = self._state("step", obs, paid, over or cut)
+                after[k] = self._state("step", obs, paid, over, cut)
         return after
 
     def _values(self, where: str, values: object, names: str) -> tuple[Any, ...]:
@@ -81,14 +88,22 @@ class GymSimulator(Simulator):
             raise InputError(f"{where} of {self.box.name} returned {what}; it must return {names}, as gymnasium.Env")
         return values
 
-    def _state(self, where: str, obs: object, reward: float, over: bool) -> Array:
+    def _state(self, where: str, obs: object, reward: float, over: bool, cut: bool) -> Array:
         row, width = np.asarray(obs, float), len(self.box.observation)
-        if row.shape != (width,) or not np.isfinite(row).all():
-            what = f"NaN or infinity, {row.tolist()}" if row.shape == (width,) else f"shape {row.shape}"
-            raise InputError(
-                f"{where} of {self.box.name} gave an observation of {what}; it must be {width} finite numbers"
-            )
-        return np.append(row, (reward, over))
+        if row.shape != (width,) or not (np.abs(row) <= LARGEST).all():
+            what = f"{row.tolist()}" if row.shape == (width,) else f"shape {row.shape}"
+            right = f"{width} finite numbers, as float32 has them"
+            raise InputError(f"{where} of {self.box.name} gave an observation of {what}; it must be {right}")
+        return np.append(row, (reward, over, cut))
+
+
+def _close(made: list[gymnasium.Env[Any, Any] | None]) -> None:
+    """Close environments, and leave None in their places; what they raise on closing is of no use to anybody."""
+    for i, env in enumerate(made):
+        made[i] = None
+        with contextlib.suppress(Exception):
+            if env is not None:
+                env.close()
 
 
 Value = TypeVar("Value")
@@ -105,7 +120,7 @@ class Fact(Generic[Value]):
 
 
 class BlackBox(Task):
-    """The task of a world. The state [S] is the observation, the step's reward, and whether the episode ended early."""
+    """The task of a world. The state [S] is the observation, and a step's reward, `terminated` and `truncated`."""
 
     world: ClassVar[type[World]]
     has_likelihood = False
@@ -135,7 +150,7 @@ class BlackBox(Task):
     def expert_noise(self) -> Any:  # type: ignore[override]
         """Standard deviation [A] where actions are in [-1, 1]; the share of random ones where they are discrete."""
         space, noise = self.facts.space, self.facts.noise
-        scale = 1.0 if isinstance(space, spaces.Discrete) else (space.high - space.low).astype(float) / 2
+        scale = 1.0 if isinstance(space, spaces.Discrete) else np.subtract(*bounds(space)[::-1]) / 2
         return np.maximum(noise / scale, LEAST_NOISE)
 
     def make(self, theta: Array) -> gymnasium.Env[Any, Any]:
@@ -151,7 +166,10 @@ class BlackBox(Task):
         space = self.facts.space
         if isinstance(space, spaces.Discrete):
             return int(action[0]) + int(space.start)
-        return (space.low + (action + 1) / 2 * (space.high - space.low)).astype(space.dtype)
+        low, high = bounds(space)
+        scaled = low + (action + 1) / 2 * (high - low)
+        whole = np.issubdtype(space.dtype, np.integer)
+        return (np.rint(scaled) if whole else scaled).astype(space.dtype).clip(space.low, space.high)
 
     def simulator(self, n: int) -> GymSimulator:
         return GymSimulator(self, n)
@@ -176,12 +194,15 @@ class BlackBox(Task):
         raise InputError(f"{self.name} is a black box: its likelihood is not known")
 
     def observe(self, state: Array) -> Array:
-        return state[:, :-2]
+        return state[:, :-3]
 
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
-        return next_state[:, -2]
+        return next_state[:, -3]
 
     def terminated(self, state: Array) -> Mask:
+        return state[:, -2] > 0
+
+    def truncated(self, state: Array) -> Mask:
         return state[:, -1] > 0
 
     def renderer(self, theta: Array) -> Renderer:
@@ -216,9 +237,10 @@ class BlackBox(Task):
             if rows[-1].size != np.prod(right) or not np.isfinite(rows[-1]).all():
                 wrong = f"{given if given is None else rows[-1].tolist()} for an observation"
                 raise InputError(f"expert of {self.name} gave {wrong}; it must be of shape {right}, finite, of {space}")
-        action = np.stack(rows).reshape(len(obs), -1)
+        action = np.reshape(rows, (len(obs), self.action_width))
         if not isinstance(space, spaces.Discrete):
-            return np.clip(2 * (action - space.low) / (space.high - space.low) - 1, -1, 1)
+            low, high = bounds(space)
+            return np.clip(2 * (action - low) / (high - low) - 1, -1, 1)
         if not np.isin(action, space.start + np.arange(space.n)).all():
             wrong = action[~np.isin(action, space.start + np.arange(space.n))][0]
             raise InputError(f"expert of {self.name} gave the action {wrong:g}; it must be one of {space}")

@@ -92,6 +92,8 @@ def get(name: str) -> Task:
     if registered := [task for task in TASKS.values() if task.reference == reference]:
         return registered[0]()
     cls = outside.find("task", name)
+    if cls in TASKS.values():  # one of this package's, by the module that it is in
+        return cls()
     if not isinstance(cls, type):
         raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task, or a world")
     if not issubclass(cls, Task):
@@ -103,6 +105,9 @@ def get(name: str) -> Task:
 def make(name: str, privileged: bool = False, render_mode: str | None = None, episodes: int = 1) -> GymEnv:
     """A gymnasium environment; `privileged` appends theta to the observation, for experts; see GymEnv."""
     return GymEnv(get(name), privileged, render_mode, episodes)
+
+
+make.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]  # gymnasium.make adds modes of its own
 
 
 def make_vec(

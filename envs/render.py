@@ -15,19 +15,22 @@ from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.handles import Handle
 
+BACKENDS = {"linux": ("egl", "osmesa"), "darwin": ("cgl", "glfw")}  # in this order
 _PROBE = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()"
 
 
 @cache
 def backend() -> str:
-    """Name of the GL backend that works here: MUJOCO_GL if set, else egl or osmesa. Raises InputError if none does."""
+    """Name of the GL backend that works here: MUJOCO_GL if set, else of BACKENDS. Raises InputError if none does."""
     # A failed import leaves PyOpenGL on the wrong platform, so each is tried in a process of its own.
     selected = os.environ.get("MUJOCO_GL", "").strip().lower()  # as mujoco reads it
-    for name in (selected,) if selected else ("egl", "osmesa"):
+    names = (selected,) if selected else BACKENDS.get(sys.platform, ("glfw",))
+    for name in names:
         environ = {**os.environ, "MUJOCO_GL": name}
         if subprocess.run([sys.executable, "-c", _PROBE], env=environ, capture_output=True).returncode == 0:
             return name
-    raise InputError(f"no GL for pictures: tried {selected or 'egl and osmesa'}; install libegl1 or libosmesa6")
+    remedy = "; install libegl1 or libosmesa6" * (sys.platform == "linux")
+    raise InputError(f"no GL for pictures: tried {' and '.join(names)}{remedy}")
 
 
 _GL_PROCESSES: set[int] = set()  # that created a GL context: this process, and those that it was forked from
@@ -117,7 +120,7 @@ class MujocoRenderer:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _load_triton()
-        if (name := backend()) in ("egl", "osmesa"):
+        if (name := backend()) in ("egl", "osmesa", "cgl", "glfw"):
             gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
         self._model, self._data = model, mujoco.MjData(model)
         level(model)

@@ -12,7 +12,6 @@ own: states, thetas and random streams are passed in.
 """
 
 import copy
-import inspect
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Mask, Streams
+from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.spaces import action_sizes
 from deconfounded.envs.theta import ThetaModel
@@ -57,6 +57,9 @@ class Simulator:
         rows [M]: the index of each row's environment, and so of its theta; None: all environments, in order.
         """
         return self.task.outcome(state, action, self.theta if rows is None else self.theta[rows])
+
+    def close(self) -> None:
+        """Give back what it holds beside memory: by default nothing."""
 
 
 class Task(ThetaModel, ABC):
@@ -125,6 +128,10 @@ class Task(ThetaModel, ABC):
         """Whether the episode ends in a state [N, S] -> [N]; by default never."""
         return np.zeros(len(state), bool)
 
+    def truncated(self, state: Array) -> Mask:
+        """Whether the episode is cut off in a state [N, S] before its horizon -> [N]; by default never."""
+        return np.zeros(len(state), bool)
+
     def simulator(self, n: int) -> Simulator:
         """A simulator of n environments, each with its own theta."""
         return Simulator(self, n)
@@ -150,7 +157,12 @@ class Task(ThetaModel, ABC):
     def home(self) -> Path:
         """The folder of its MJCF and its expert's weights: assets/, or that of the file of a task from outside."""
         cls = next(cls for cls in type(self).__mro__ if "name" in vars(cls))
-        return ASSETS if cls.__module__.startswith(__package__) else Path(inspect.getfile(cls)).resolve().parent
+        if cls.__module__.startswith(__package__):
+            return ASSETS
+        if (file := outside.source(cls)) is None:  # as of a class in a notebook
+            right = "it must be in a .py file, or state `spec` and be given an --expert"
+            raise InputError(f"task {self.name} has no folder for its model and its expert; {right}")
+        return file.parent
 
     @property
     def observation_space(self) -> spaces.Box:
@@ -218,7 +230,7 @@ class Task(ThetaModel, ABC):
             if array.dtype.kind not in "biuf":
                 raise TypeError
             array = array.astype(float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError):  # the latter of a tensor with a gradient
             raise InputError(f"action of {self.name} was {action!r}; it must be numbers") from None
         if array.shape != (right := (n, self.action_width)):
             raise InputError(f"action of {self.name} had shape {array.shape}; it must be {right}")

@@ -96,7 +96,9 @@ class ThetaModel:
             array = np.asarray(theta)
             if array.dtype.kind not in "iuf":
                 raise TypeError
-            array = np.broadcast_to(array.astype(float), (n, len(self.latents))).copy()
+            if array.shape[-1:] != (width := (len(self.latents),)) and (array.shape, width) != ((), (1,)):
+                raise ValueError
+            array = np.broadcast_to(array.astype(float), (n, *width)).copy()
         except (TypeError, ValueError):
             right = f"{len(self.latents)} number(s), or one row for each of the {n} environment(s)"
             raise InputError(f"theta of {self.name} was {theta!r}; it must be {right}") from None

@@ -132,10 +132,16 @@ def made(name: str, world: World, theta: Array) -> gymnasium.Env[Any, Any]:
         return env
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise InputError(f"action_space of {name} was {acts}; it must be Discrete, or a Box of one axis")
-    if not np.isfinite([space.low, space.high]).all() or (space.low >= space.high).any():
+    if not np.isfinite(space.high - space.low).all() or (space.low >= space.high).any():
         right = "bounded, as its bounds are scaled to -1 and 1"
         raise InputError(f"action_space of {name} was {acts}; it must be {right}")
     return env
+
+
+def bounds(space: spaces.Box) -> tuple[Array, Array]:
+    """What becomes -1 and 1 [A] of bounded actions; of whole numbers half a number more, so that all are alike."""
+    more = 0.5 if np.issubdtype(space.dtype, np.integer) else 0.0
+    return space.low.astype(float) - more, space.high.astype(float) + more
 
 
 @contextmanager

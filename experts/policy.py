@@ -87,11 +87,11 @@ class NetworkExpert(BoxExpert):
     def mean(self, obs: Array, theta: Array, groups: int = 1) -> Array:
         w, last = self.weights, len(self.weights) // 2 - 1
         rows = np.concatenate([obs, self.task.seen_theta(obs, theta)], -1).astype(np.float32)
-        hidden = rows.reshape(groups, -1, rows.shape[1])
+        hidden = rows.reshape(groups, len(rows) // groups, rows.shape[1])
         for i in range(last):
             hidden = np.tanh(hidden @ w[f"{i}.weight"].T + w[f"{i}.bias"])
         out = hidden @ w[f"{last}.weight"].T + w[f"{last}.bias"]
-        return np.clip(out.reshape(len(rows), -1), -1, 1).astype(float)
+        return np.clip(out.reshape(len(rows), out.shape[-1]), -1, 1).astype(float)
 
 
 class CallableExpert(BoxExpert):
@@ -159,12 +159,12 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         return expert
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")
-    return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source)))
+    given = "" if source is None else f" --out {source}"
+    remedy = f"`deconf train --task {task.reference or task.name}{given}` makes such a file"
+    return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source), remedy))
 
 
-def _weights(task: Task, file: Path) -> dict[str, NDArray[np.float32]]:
-    out = "" if file == path(task) else f" --out {file}"
-    remedy = f"`deconf train --task {task.reference or task.name}{out}` makes such a file"
+def _weights(task: Task, file: Path, remedy: str) -> dict[str, NDArray[np.float32]]:
     if not file.is_file():
         raise InputError(f"no expert weights at {file}; {remedy}")
     try:

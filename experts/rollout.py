@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.streams import Array, Streams, generators, unseeded
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.numbers import check_number, is_seed
@@ -14,7 +15,6 @@ from deconfounded.experts.agent import Agent
 from deconfounded.experts.trials import Trials
 
 if TYPE_CHECKING:
-    from deconfounded.envs.batch import BatchEnv
     from deconfounded.envs.task import Task
 
 Seeds = int | Sequence[int]  # one for all trials, or one for each of equal groups of them
@@ -78,7 +78,7 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     """
     task, n = env.task, env.n
     check_number("episodes", episodes)
-    if getattr(agent, "env", env) is not env and isinstance(agent.env, type(env)):  # type: ignore[attr-defined]
+    if getattr(agent, "env", env) is not env and isinstance(agent.env, BatchEnv):  # type: ignore[attr-defined]
         raise InputError(f"{type(agent).__name__} reads the state or theta of other environments than it was to act in")
     each, seeds = trial_seeds(n, seed), _group_seeds(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)

@@ -53,7 +53,8 @@ class Sb3VecEnv(BatchVecEnv):
         infos: list[dict[str, Any]] = [{} for _ in done]
         for i in np.flatnonzero(done):
             episode = {"r": self._returns[i], "l": self._lengths[i], "t": 0.0}
-            infos[i] = {"terminal_observation": obs[i], "TimeLimit.truncated": bool(truncated[i]), "episode": episode}
+            infos[i] = {"terminal_observation": obs[i], "episode": episode}
+            infos[i]["TimeLimit.truncated"] = bool(truncated[i] & ~terminated[i])
         if done.any():
             self._returns[done], self._lengths[done] = 0, 0
             obs = batch.reset(where=done)

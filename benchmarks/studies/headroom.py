@@ -78,8 +78,9 @@ alone, of the tasks whose certificate is passed. The *ceiling* is the exact inte
 deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
 best method without theta in training (its tier in brackets), chosen after the fact, task by task; the *fifth* tells
 how far the five best lie apart, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
-the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief. Nor can it always be reached: exact policies read the state, of
-which observations may hide a part that tells of theta ([concepts](concepts.md#exact-policies)).
+the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief. Nor can it always be reached:
+exact policies read the state, of which observations may hide a part that tells of theta
+([concepts](concepts.md#exact-policies)).
 
 The rule of this suite: where {SHARE:.0%} of its tasks are solved in the last episode without queries, it no longer
 separates the best methods, and is to be made harder."""

@@ -96,7 +96,7 @@ def _check_numbers(task: Task) -> None:
 
 def _check_model(task: MujocoTask) -> None:
     """The model compiles, every joint has its noise stated, and there is a camera for pictures."""
-    with _part(task, f"the model ({task.home.name}/{task.name}.xml, or what `spec` makes)"):
+    with _part(task, f"the model ({task.name}.xml, or what `spec` makes)"):
         model = task.model
     with _part(task, "process_noise"):
         noise = task.noise

@@ -196,6 +196,10 @@ def theta_out_of_bounds(task: Task) -> None:
             env.reset(options={"theta": [wrong] + [lat.low for lat in task.latents[1:]]})
     with refused("a theta of too many numbers", "must be"):
         env.reset(options={"theta": [0.0] * (len(task.latents) + 6)})
+    if len(task.latents) > 1:
+        for few in (latent.low, [latent.low]):
+            with refused("a theta of too few numbers", "must be"):
+                env.reset(options={"theta": few})
 
 
 def wrong_actions(task: Task) -> None:

@@ -9,6 +9,8 @@ import numpy as np
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.datasets.table import EXTRA, Column, Table, natural, of_episodes, spread
 
+FLAGS = ("terminals", "timeouts")  # of D4RL: of a row after which an episode ends
+
 
 def read_hdf5(file: Path) -> Table:
     """An HDF5 file as robomimic or D4RL writes it. Raises InputError for another."""
@@ -105,12 +107,16 @@ def _d4rl(file: Path, opened: Any) -> Table:
     n = len(arrays["actions"])
     if len(arrays["observations"]) != n:
         raise InputError(f"{file} has {len(arrays['observations'])} observations and {n} actions; they must be as many")
-    columns = _rows(str(file), arrays, n)
-    flags = [columns[name] for name in ("terminals", "timeouts") if name in columns]
+    flat = {name: np.ravel(array) for name, array in arrays.items() if array.shape == (n, 1) and name in FLAGS}
+    columns = _rows(str(file), arrays | flat, n)
+    flags = [columns[name] for name in FLAGS if name in columns]
     if not flags:
         raise InputError(f"{file} has neither `terminals` nor `timeouts`; they must say where its episodes end")
     ends = np.any([flag != 0 for flag in flags], 0)
     episode = np.append(0, np.cumsum(ends)[:-1])
+    shapes = [arrays[name].shape for name in ("observations", "next_observations") if name in arrays]
+    if len(set(shapes)) > 1:
+        raise InputError(f"next_observations of {file} have shape {shapes[1]}; it must be {shapes[0]}, as observations")
     later = {key[5:]: columns.pop(key) for key in list(columns) if key.startswith("next_observations")}
     if later:
         last = np.flatnonzero(np.append(np.diff(episode) != 0, True))

@@ -1,6 +1,7 @@
 """Minari data sets. Ours have the number of each episode's trial in its metadata and, for scoring, theta."""
 
 import os
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -61,6 +62,8 @@ def write(
     collected: the result of `collect`. scores: mean returns of an episode by random actions and by the expert, for
     Minari's normalisation. Raises InputError if the data set exists already.
     """
+    if not re.fullmatch(r"[-\w]+", name, re.ASCII):
+        raise InputError(f"name of the data set was {name!r}; it must be of letters, digits, - and _")
     folder = folder.resolve()  # Minari would join a relative path to itself
     with _root(folder), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about authors and links, which are optional

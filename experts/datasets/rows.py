@@ -11,6 +11,7 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.datasets.table import EMPTY, Column, Odd, Table, number
 
 CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
+NO_LABEL = EMPTY - {"none"}  # of a trial: "none" may be a condition
 GAP = 1.5  # times the usual time between rows
 
 
@@ -130,7 +131,9 @@ def _labels(table: Table, names: Sequence[str]) -> Column:
     """What tells trials or episodes apart [N]: a column, or the values of several together."""
     columns = [table.labels(name) for name in names]
     for name, column in zip(names, columns, strict=True):
-        _check(table, [name], (column == "" if column.dtype == object else np.isnan(column))[:, None], 0, "is empty")
+        texts = column.dtype == object
+        empty = np.array([str(cell).strip().lower() in NO_LABEL for cell in column]) if texts else np.isnan(column)
+        _check(table, [name], empty[:, None], 0, "is empty")
     if len(columns) == 1:
         return columns[0]
     return np.array([", ".join(map(_text, row)) for row in zip(*columns, strict=True)], object)

@@ -1,5 +1,6 @@
 """Black-box tasks: other people's environments as tasks; the examples of docs/worlds.md, and a small world."""
 
+import gc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
@@ -69,6 +70,116 @@ class Sliding:
 def task_with(**parts: Any) -> BlackBox:
     """The task of Sliding with other parts."""
     return task_of(type("Sliding", (Sliding,), parts))()
+
+
+class Steps(Slide):
+    """Of whole numbers from 0 to 5; it is cut off after seven steps, and counts how many of them are open."""
+
+    action_space = spaces.Box(0, 5, (1,), np.int32)
+    opened: ClassVar[list[int]] = [0]
+
+    def __init__(self, theta: float) -> None:
+        super().__init__(theta)
+        self.opened[0] += 1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.steps, self.taken = 0, list[int]()
+        return super().reset(seed=seed)
+
+    def step(self, action: Any) -> Any:
+        assert self.action_space.contains(action)
+        self.steps += 1
+        return *super().step(action)[:2], False, self.steps == 7, {}
+
+    def close(self) -> None:
+        self.opened[0] -= 1
+
+
+class Whole(Sliding):
+    """The expert takes the third number."""
+
+    noise = 0.0
+
+    def make(self, theta: Any) -> Any:
+        return Steps(theta[0])
+
+    def expert(self, obs: Any, theta: Any) -> Any:
+        return [3]
+
+
+def test_whole_actions() -> None:
+    """All are alike to random actions, and the expert's are taken as they are."""
+    task = task_of(Whole)()
+    expert, rng = policy.load(task), np.random.default_rng(0)
+    meant = expert.mean(np.zeros((1, 1)), np.zeros((1, 1)))[0]
+    taken = [int(task.raw(meant + 0.01 * rng.standard_normal(1))[0]) for _ in range(200)]
+    assert taken == [3] * 200
+    chance = np.bincount([int(task.raw(rng.uniform(-1, 1, 1))[0]) for _ in range(6000)])
+    assert len(chance) == 6
+    assert (np.abs(chance - 1000) < 150).all(), chance  # five standard deviations
+    assert [task.raw(np.array([end]))[0] for end in (-1, 1)] == [0, 5]
+    for number in range(6):
+        other = task_of(type("Whole", (Whole,), {"expert": lambda self, obs, theta, number=number: [number]}))()
+        assert other.raw(policy.load(other).mean(np.zeros((1, 1)), np.zeros((1, 1)))[0]) == [number]
+
+
+@pytest.mark.parametrize(("low", "high", "dtype"), [(-0.1, 0.3, "f8"), (-3.0, -0.8, "f4"), (0.1, 0.7, "f4")])
+def test_scaled_actions_are_in_the_space(low: float, high: float, dtype: str) -> None:
+    space = spaces.Box(low, high, (1,), np.dtype(dtype).type)
+    task = task_with(make=lambda self, theta: type("Wide", (Slide,), {"action_space": space})(theta[0]))
+    for action in (-1.0, -0.999, 0.3, 1.0):
+        assert space.contains(task.raw(np.array([action])))
+
+
+def test_actions_of_an_infinite_range() -> None:
+    huge = type("Huge", (Slide,), {"action_space": spaces.Box(-3e38, 3e38, (1,))})
+    task = task_with(make=lambda self, theta: huge(theta[0]))
+    with pytest.raises(envs.InputError, match="it must be bounded"):
+        envs.GymEnv(task)
+
+
+def test_a_world_s_own_time_limit() -> None:
+    """It cuts an episode off, and ends no state: dm_env's discount stays 1."""
+    task = task_of(Whole)()
+    env, dm = envs.GymEnv(task), envs.DmEnv(task)
+    env.reset(seed=0)
+    dm.reset()
+    ends, discounts = [], []
+    for _ in range(7):
+        ends.append(env.step(np.zeros(1))[2:4])
+        discounts.append(dm.step(np.zeros(1)).discount)
+    assert ends == [(False, False)] * 6 + [(False, True)]
+    assert discounts == [1.0] * 7
+
+
+def test_worlds_are_closed() -> None:
+    """With their environment, or when nobody holds it any more."""
+    task = task_of(Whole)()
+    assert task.horizon == 12  # a probe is made, and closed
+    before = Steps.opened[0]
+    for made in (envs.GymEnv(task), envs.GymVectorEnv(task, 3)):
+        made.reset(seed=0)
+        assert Steps.opened[0] == before + (1 if isinstance(made, envs.GymEnv) else 3)
+        made.close()
+        assert Steps.opened[0] == before
+    run_trials(BatchEnv(task, 4), RandomAgent(task.action_space), 2, 0)
+    gc.collect()
+    assert Steps.opened[0] == before
+
+
+def test_a_world_has_no_pictures() -> None:
+    task = task_with()
+    assert envs.GymEnv(task).metadata["render_modes"] == []
+    with pytest.raises(envs.InputError, match="must be None, as a black box has no pictures"):
+        envs.GymEnv(task, render_mode="rgb_array")
+
+
+def test_no_observations_have_no_actions() -> None:
+    task = task_with()
+    expert = policy.load(task)
+    assert expert.mean(np.zeros((0, 1)), np.zeros((0, 1))).shape == (0, 1)
+    network = policy.load(envs.get("slippery_cartpole"))
+    assert network.log_prob(np.zeros((0, 6)), np.zeros((0, 1)), np.zeros((0, 1))).shape == (0,)
 
 
 def test_a_changed_task_has_what_it_was_given() -> None:
@@ -331,7 +442,7 @@ def test_learned_dynamics_give_the_posterior() -> None:
     total, exact = np.zeros((2, 32, 15))
     for t in range(30):
         obs, action, then = trials.obs[:, 0, t], trials.action[:, 0, t], trials.obs[:, 0, t + 1]
-        state, following = (np.append(x, np.zeros((32, 2)), 1) for x in (obs, then))
+        state, following = (np.append(x, np.zeros((32, 3)), 1) for x in (obs, then))
         log_dynamics = grid.log_dynamics(state, action, following)
         true = grid.log_true(state, action, following, np.repeat(grid.theta[3:4], 32, 0))
         np.testing.assert_allclose(true, log_dynamics[:, 3], rtol=1e-6)

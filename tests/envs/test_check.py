@@ -10,6 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks import slippery_walker
+from deconfounded.envs.tasks.ant_goal import AntGoal
 from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
@@ -124,7 +126,7 @@ class NoCamera(SlipperyCartpole):
 @pytest.mark.parametrize(
     ("task", "says"),
     [
-        (MissingFile, r"the model \(envs/nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
+        (MissingFile, r"the model \(nowhere.xml, .*\) of nowhere: .*nowhere.xml"),
         (MisspeltJoint, "process_noise of slippery_cartpole: .*'slyder'"),
         (MisspeltElement, "apply_latent of slippery_cartpole: .*'pool'"),
         (OneTooMany, r"observe of slippery_cartpole gave an array of shape \(2, 6\) for .*; it must be \(2, 7\)"),
@@ -172,7 +174,7 @@ def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "nowhere.xml").write_text("<mujoco><worldbody></mujoco>")
     monkeypatch.setattr(MissingFile, "home", tmp_path)
-    with pytest.raises(envs.InputError, match=r"^the model \(.*/nowhere\.xml, .*\) of nowhere: XML") as caught:
+    with pytest.raises(envs.InputError, match=r"^the model \(nowhere\.xml, .*\) of nowhere: XML") as caught:
         envs.check_task(MissingFile())
     assert "\n" not in str(caught.value)
 
@@ -294,6 +296,11 @@ class RoundedTheta(SlipperyCartpole):
         return super().check_theta(theta, n).round(2)
 
 
+class Repeats(AntGoal):
+    def check_theta(self, theta: object, n: int) -> Array:
+        return super().check_theta(np.resize(theta, 2) if np.size(theta) < 2 else theta, n)
+
+
 class LenientActions(SlipperyCartpole):
     def check_action(self, action: object, n: int, ignored: NDArray[np.bool_] | None = None) -> Array:
         return np.zeros((n, 1))
@@ -331,6 +338,7 @@ class UnnamedGeom(SlipperyCartpole):
         (RoundedTheta, "forced_theta_moves_nothing_else", "runs of the same seed with theta drawn and forced differ"),
         (NoReward, "stable_baselines", "Stable-Baselines3's checker: reward of slippery_cartpole was nan"),
         (WrongBound, "theta_out_of_bounds", ".* was let through"),
+        (Repeats, "theta_out_of_bounds", "a theta of too few numbers was let through"),
         (LenientActions, "wrong_actions", "action .* of two environments was let through"),
         (HalfRange, "theta_follows_its_distribution", r"2,000 draws of friction are 0\.[45]\d+ off its distribution"),
         (UnnamedGeom, "every_element_is_named", "of the geoms of slippery_cartpole, number "),
@@ -340,6 +348,34 @@ class UnnamedGeom(SlipperyCartpole):
 def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> None:
     with pytest.raises((AssertionError, envs.InputError), match=f"^{says}"):
         CONTRACT[check](task())
+
+
+def test_tensors_with_a_gradient() -> None:
+    """Whoever forgot to detach them reads what is wrong."""
+    tensor = torch.zeros(1, requires_grad=True)
+    for env in (envs.make("slippery_cartpole"), envs.make_vec("slippery_cartpole", 1)):
+        env.reset(seed=0)
+        with pytest.raises(envs.InputError, match=r"^action was tensor"):
+            env.step(tensor)
+    batch = envs.BatchEnv(envs.get("slippery_cartpole"), 1)
+    batch.reset(0)
+    with pytest.raises(envs.InputError, match=r"^action of slippery_cartpole was tensor"):
+        batch.step(tensor[:, None])
+
+
+def test_a_class_that_stands_in_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a notebook: it is checked, with its own `spec`; without weights it is said why there can be none."""
+    made = type("InNotebook", (SlipperyCartpole,), {"name": "in_notebook", "__module__": "__main__"})
+    monkeypatch.setattr("deconfounded.envs.support.outside.source", lambda of: None)
+    monkeypatch.setattr(made, "spec", lambda self: envs.get("slippery_cartpole").spec())
+    envs.check_task(made())
+    with pytest.raises(envs.InputError, match=r"^task in_notebook has no folder for its model and its expert"):
+        policy.load(made())
+
+
+def test_a_task_by_the_module_that_it_is_in() -> None:
+    assert type(envs.get("deconfounded.envs.tasks.bandit:Bandit")) is type(envs.get("bandit"))
+    assert envs.get("bandit").reference == "bandit"
 
 
 def test_the_contract_catches_shared_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -152,7 +152,7 @@ def test_a_forced_theta_starts_a_trial() -> None:
 class TestTimeLimits:
     @pytest.mark.slow
     def test_registered_limit_is_the_task_s(self, name: str) -> None:
-        """The made environment truncates when ours does; only an episode that ends by itself then is called both."""
+        """The made environment truncates when ours does."""
         task, n = envs.get(name), 3
         assert gymnasium.spec(task.gym_id).max_episode_steps == task.horizon
         for seed in range(n):
@@ -165,7 +165,7 @@ class TestTimeLimits:
                 mine = own.step(action)
                 np.testing.assert_array_equal(obs, mine[0])
                 assert (reward, terminated, info) == (mine[1], mine[2], {})
-                assert truncated == (mine[3] or step == task.horizon)
+                assert truncated == mine[3] == (step == task.horizon)
                 if terminated or truncated:
                     break
             assert mine[2] or step == task.horizon
@@ -183,9 +183,8 @@ class TestTimeLimits:
         np.testing.assert_array_equal(ours.reset(seed=1)[0], sync.reset(seed=1)[0])
         for action in flat(task, 2, task.horizon + 3):
             mine, theirs = ours.step(action), sync.step(action)
-            for x, y in zip(mine[:3], theirs[:3], strict=True):
+            for x, y in zip(mine[:4], theirs[:4], strict=True):
                 np.testing.assert_array_equal(x, y)
-            np.testing.assert_array_equal(mine[3] | mine[2], theirs[3] | theirs[2])
         trials = gymnasium.make_vec(task.gym_id, num_envs=2, episodes=4, privileged=True)
         assert isinstance(trials, envs.GymVectorEnv)
         assert (trials.episodes, trials.batch.privileged) == (4, True)
@@ -245,6 +244,34 @@ def test_render_modes(name: str) -> None:
             early.render()
     with pytest.raises(envs.InputError, match="render was called before the first reset"):
         envs.make_dm(name).render()
+
+
+def test_modes_that_gymnasium_adds() -> None:
+    """Lists of pictures are made by gymnasium, of ours."""
+    if not gl_works():
+        pytest.skip("no GL for pictures")
+    env = gymnasium.make("deconf/Bandit-v0", render_mode="rgb_array_list")
+    env.reset(seed=0)
+    env.step(1)
+    first, second = env.render()  # type: ignore[misc]
+    assert first.shape == second.shape == (240, 320, 3)
+    assert (first[60:150] == 225).any(-1).sum() > (second[60:150] == 225).any(-1).sum(), "no arm is pulled at first"
+    env.step(2)
+    env.reset(options={"keep_theta": True})
+    again = env.render()[-1]  # type: ignore[index]
+    assert (again[60:150] == first[60:150]).all(), "nor after the next reset"
+
+
+def test_odd_arguments() -> None:
+    """As gymnasium and numpy take them: names of modes, ranges of seeds, no environment to reset."""
+    vec = envs.make_vec("bandit", 3, autoreset_mode="SameStep")  # type: ignore[arg-type]
+    assert vec.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+    batch = vec.batch
+    first = batch.reset(range(4, 7))
+    thetas_of_range = batch.theta.copy()
+    batch.reset(4)
+    np.testing.assert_array_equal(batch.theta, thetas_of_range)
+    np.testing.assert_array_equal(batch.reset(where=np.zeros(3, bool)), first)
 
 
 Pictures = Callable[[Array, Array], Array]

@@ -99,7 +99,7 @@ def test_a_trial_as_one_episode(name: str) -> None:
             else:
                 before = np.arange(discrete.n) == action if discrete else action.clip(-1, 1)
                 np.testing.assert_allclose(ours[width:-1], before, rtol=1e-6)
-    with pytest.raises(envs.InputError, match="a trial had one episode; make the environment with episodes=5"):
+    with pytest.raises(envs.InputError, match="TrialEnv was given an environment of one episode a trial"):
         envs.TrialEnv(envs.make(name))
 
 

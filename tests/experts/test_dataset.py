@@ -85,12 +85,14 @@ def test_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     collected = datasets.collect(task, 3, lambda env: RandomAgent(task.action_space), 5)
     returns = run_trials(envs.BatchEnv(task, 3), RandomAgent(task.action_space), task.episodes, 5).returns
     place = datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    with pytest.raises(envs.InputError, match="name of the data set was 'my data'; it must be of letters"):
+        datasets.write(tmp_path, task, "my data", collected, "random", (1.0, 2.0))
     dataset = minari.MinariDataset(place / "data")
     episodes = list(dataset.iterate_episodes())
     assert [round(float(one.rewards.sum()), 9) for one in episodes] == returns.ravel().round(9).tolist()
     for one in episodes:
-        assert one.terminations[-1] != one.truncations[-1]
-        assert len(one.rewards) == task.horizon or one.terminations[-1]
+        assert one.terminations[-1] or one.truncations[-1]
+        assert one.truncations[-1] == (len(one.rewards) == task.horizon)
         assert not np.any([one.terminations[:-1], one.truncations[:-1]])
     assert len({bool(one.truncations[-1]) for one in episodes}) == 2
     assert "EpisodeData" in repr(episodes[0])

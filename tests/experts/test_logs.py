@@ -117,14 +117,15 @@ def of_robomimic(folder: Path, later: bool = True) -> datasets.Log:
     return datasets.read(folder / "demos.hdf5", "vehicle")
 
 
-def of_d4rl(folder: Path, later: bool = True) -> datasets.Log:
+def of_d4rl(folder: Path, later: bool = True, flags: tuple[int, ...] = (-1,)) -> datasets.Log:
     h5py = pytest.importorskip("h5py")
     actions = ACTIONS if later else [np.append(action, [[AFTER]], 0) for action in ACTIONS]
     seen = [obs[:-1] for obs in OBS] if later else OBS
     ends = np.concatenate([np.arange(len(action)) == len(action) - 1 for action in actions])
     with h5py.File(folder / "d4rl.h5", "w") as file:
         file["observations"], file["actions"] = np.concatenate(seen), np.concatenate(actions)
-        file["terminals"], file["timeouts"] = ends & (np.cumsum(ends) < 3), ends & (np.cumsum(ends) >= 3)
+        file["terminals"] = (ends & (np.cumsum(ends) < 3)).reshape(flags)
+        file["timeouts"] = (ends & (np.cumsum(ends) >= 3)).reshape(flags)
         file["infos/vehicle"] = np.repeat([ord(name) for name in OWNERS], [len(action) for action in actions]) * 1.0
         file["metadata/algorithm"] = "expert"
         if later:
@@ -254,6 +255,17 @@ class TestNotes:
         assert log.mask.shape[:2] == (4, 1)
         assert len(set(log.names)) == 4
 
+    def test_d4rl_of_columns(self, tmp_path: Path) -> None:
+        """Flags [N, 1] are flags; next observations of another shape are refused."""
+        assert of_d4rl(tmp_path, flags=(-1, 1)).sha256 == expected().sha256
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(tmp_path / "d4rl.h5", "a") as file:
+            rows_of = file["next_observations"][:-1]
+            del file["next_observations"]
+            file["next_observations"] = rows_of
+        with pytest.raises(envs.InputError, match=r"next_observations of .* have shape \(\d+, 2\); it must be "):
+            datasets.read(tmp_path / "d4rl.h5", "infos/vehicle")
+
     def test_episodes_of_lerobot_in_any_order(self, tmp_path: Path) -> None:
         """What is said of an episode is by its number, not by its line."""
         log, lines = of_lerobot(tmp_path, "v2.1"), tmp_path / "set" / "meta" / "episodes.jsonl"
@@ -334,6 +346,15 @@ class TestNames:
         ]
         log = datasets.read(write_csv(tmp_path / "x.csv", made), trial="run", obs=["x"], action=["u"])
         assert log.names == ("1", "2")
+
+    @pytest.mark.parametrize("other", ["7", "A", "007"])
+    def test_unknown(self, other: str, tmp_path: Path) -> None:
+        """Rows of an unknown trial are not of one trial; "none" may be a condition."""
+        file = write_csv(tmp_path / "x.csv", self.named([other, "NA"]))
+        with pytest.raises(envs.InputError, match=r"'run' of .*x\.csv is empty in row 4"):
+            datasets.read(file, trial="run", obs=["x"], action=["u"])
+        file = write_csv(tmp_path / "y.csv", self.named(["heavy", "none"]))
+        assert datasets.read(file, trial="run", obs=["x"], action=["u"]).names == ("heavy", "none")
 
     def test_several_columns(self, tmp_path: Path) -> None:
         """As a goal of two numbers: together they are a trial's name, and no observations."""
