@@ -212,7 +212,7 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert task.reference == f"{folder}/{BENT}"
     assert policy.path(task) == folder / "bent_cartpole.safetensors"
     assert type(envs.get("bent_cartpole")) is type(task)
-    with pytest.raises(envs.InputError, match=r"run `deconf train --task .*bent_cartpole.py:BentCartpole`"):
+    with pytest.raises(envs.InputError, match=r"`deconf train --task .*bent_cartpole.py:BentCartpole` makes such"):
         policy.load(task)
     expert = policy.load(task, f"{folder}/linear.py:control")
     result = certify.certify(task, expert, trials=4, grid=3)
