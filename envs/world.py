@@ -132,7 +132,9 @@ def made(name: str, world: World, theta: Array) -> gymnasium.Env[Any, Any]:
         return env
     if not isinstance(space, spaces.Box) or len(space.shape) != 1:
         raise InputError(f"action_space of {name} was {acts}; it must be Discrete, or a Box of one axis")
-    if not np.isfinite(space.high - space.low).all() or (space.low >= space.high).any():
+    with np.errstate(over="ignore"):  # a range of the largest numbers is infinite
+        bounded = np.isfinite(space.high - space.low).all() and (space.low < space.high).all()
+    if not bounded:
         right = "bounded, as its bounds are scaled to -1 and 1"
         raise InputError(f"action_space of {name} was {acts}; it must be {right}")
     return env
