@@ -33,12 +33,14 @@ class Sb3VecEnv(BatchVecEnv):
     def __init__(self, task: envs.Task, n: int, seed: int) -> None:
         self.env = envs.GymVectorEnv(task, n, privileged=True)
         super().__init__(n, self.env.single_observation_space, self.env.single_action_space)
-        self.env.batch.seed(seed)
+        self.seed(seed)  # of the next reset
         self._returns, self._lengths = np.zeros(n), np.zeros(n, int)
 
     def reset(self) -> Any:
         self._returns[:], self._lengths[:] = 0, 0
-        return self.env.reset()[0]
+        seeds = None if None in self._seeds else self._seeds
+        self._reset_seeds()
+        return self.env.reset(seed=seeds)[0]
 
     def step_async(self, actions: Any) -> None:
         self._actions = actions

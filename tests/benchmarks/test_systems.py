@@ -265,6 +265,15 @@ class TestAsGymnasiumHasIt:
             infos = vec.step(action)[3]
         assert [info["episode"]["l"] for info in infos] == [horizon, horizon]
 
+    def test_seeds_of_stable_baselines(self) -> None:
+        """They are those of the next reset alone, which the constructor's seed gives, too."""
+        vec, same = Sb3VecEnv(Push(), 3, 5), envs.GymVectorEnv(Push(), 3, privileged=True)
+        first, second = vec.reset(), vec.reset()
+        np.testing.assert_array_equal(first, same.reset(seed=5)[0])
+        np.testing.assert_array_equal(second, same.reset()[0])
+        vec.seed(5)
+        np.testing.assert_array_equal(vec.reset(), first)
+
     def test_time_limits_of_stable_baselines(self) -> None:
         """An episode that ran out of time is told from one that ended, whose value is 0."""
         vec, ended = Sb3VecEnv(Push(), 8, 0), list[tuple[bool, bool]]()
