@@ -116,7 +116,7 @@ class Environments:
         self._ask, self._number, self.n = ask, number, n
 
     def reset(self) -> FloatArray:
-        """Start trials; returns observations [n, O]."""
+        """Start trials; returns observations [n, O]. A later reset starts the same trials again."""
         return self._ask("reset", self._number)
 
     def step(self, action: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:

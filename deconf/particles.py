@@ -95,8 +95,11 @@ class Particles:
             least = np.where(np.isfinite(log_prob), log_prob, np.inf).min(-1, keepdims=True) - IMPOSSIBLE
             log_prob = np.maximum(log_prob, least)
             power = self._power(self.log_weight[rows], log_prob, remaining[rows])
-            if not power.all():
-                raise InputError("likelihoods of a step differ too much among particles; is the noise too small?")
+            if (full := rows[power == 0]).size:  # the step before left no room for this one: draw these anew first
+                if not np.ptp(self.log_weight[full], -1).all():
+                    raise InputError("likelihoods of a step differ too much among particles; is the noise too small?")
+                self._move(full)
+                continue
             weight = self.log_weight[rows] + power[:, None] * log_prob
             self.log_weight[rows] = weight - np.logaddexp.reduce(weight, -1, keepdims=True)
             remaining[rows] -= power

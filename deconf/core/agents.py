@@ -110,6 +110,8 @@ class LearnedAgent(Agent):
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
+        if not len(self._draws):
+            raise InputError("observe was called before begin and reset; begin(n) trials, reset([generator]), then act")
         shapes, signature = (np.shape(action), np.shape(alive)), self.policy.signature
         if shapes != ((len(obs), signature.action), (len(obs),)):
             raise InputError(

@@ -146,6 +146,13 @@ def joined(array: NDArray[Any], mask: Mask, seeds: int, device: str | torch.devi
     return torch.as_tensor(flat.reshape(seeds, -1, *flat.shape[1:]), device=device)
 
 
+def joined_trials(left: Tensor, right: Tensor) -> Tensor:
+    """What is of the steps of trials [S, B, T, ...] and of others, with zeros at the end of the shorter ones."""
+    steps = max(left.shape[2], right.shape[2])
+    padded = (torch.cat([x, x.new_zeros(*x.shape[:2], steps - x.shape[2], *x.shape[3:])], 2) for x in (left, right))
+    return torch.cat(list(padded), 1)
+
+
 def joined_theta(trials: Trials, theta: Array, seeds: int, device: str | torch.device = "cpu") -> Tensor:
     """The theta [S, B, T, F] of each step of `Batch.of`, given that of episodes [B, E, F] or of steps [B, E, T, F]."""
     return joined(of_steps(theta, trials.mask.shape[2]), trials.mask, seeds, device)
@@ -208,14 +215,7 @@ class Batch:
 
     def joined(self, other: "Batch") -> "Batch":
         """The trials of both batches, padded to the same length."""
-        steps = max(self.mask.shape[2], other.mask.shape[2])
-
-        def padded(x: Tensor) -> Tensor:
-            return torch.cat([x, x.new_zeros(*x.shape[:2], steps - x.shape[2], *x.shape[3:])], 2)
-
-        return Batch(
-            *(torch.cat([padded(x) for x in pair], 1) for pair in zip(self.tensors, other.tensors, strict=True))
-        )
+        return Batch(*(joined_trials(*pair) for pair in zip(self.tensors, other.tensors, strict=True)))
 
     def beginnings(self, update: int, shortest: float) -> "Batch":
         """The first n steps of every trial; over updates 0, 1, 2, ... n is log-uniform between a share of them and all.

@@ -105,17 +105,23 @@ class DeconfoundedAgent(LearnedAgent):
 class Explorer(DeconfoundedAgent):
     """The exploration policy: the current imitator, with a share of random actions; it sees no theta.
 
-    In every other trial its latent is drawn once an episode from those inferred on expert trials (samples of the prior)
-    instead of from the belief, so that each expert's behaviour is rolled out under each theta.
+    In every other trial, counted over all calls of `begin`, its latent is drawn once an episode from those inferred on
+    expert trials (samples of the prior) instead of from the belief, so that each expert's behaviour is rolled out under
+    each theta.
     """
 
     def __init__(self, agent: DeconfoundedAgent, latents: Tensor, random_share: float) -> None:
         super().__init__(agent.model, agent.policy, agent.online)
         self.latents, self.random_share = latents, random_share
+        self._before = 0  # trials of each seed, before those that act now
+
+    def begin(self, n: int) -> None:
+        self._before += self._n
+        super().begin(n)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
-        self._blind = torch.arange(self._n, device=self.device)[:, None] % 2 == 0
+        self._blind = (self._before + torch.arange(self._n, device=self.device))[:, None] % 2 == 0
         self._drawn = take(self.latents, self._draws.integers(self.latents.shape[1], self._n))
 
     def latent(self) -> Tensor:

@@ -39,9 +39,9 @@ class Scaler(nn.Module):
     def __init__(self, data: Tensor, mask: Tensor) -> None:
         super().__init__()
         mean, variance = moments(data, mask)
-        std = variance.sqrt()
+        std, size = variance.sqrt(), data.abs().flatten(1, -2).amax(1)
         self.register_buffer("mean", mean)
-        self.register_buffer("std", torch.where(std > 1e-6, std, torch.ones_like(std)))
+        self.register_buffer("std", torch.where(std > (1e-5 * size).clamp(max=1e-6), std, torch.ones_like(std)))
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - per_seed(self.mean, x)) / per_seed(self.std, x)

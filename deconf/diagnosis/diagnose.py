@@ -18,7 +18,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials, check_trials
 
-VERSION = 14  # raised when figures or verdicts of the same trials change
+VERSION = 15  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)

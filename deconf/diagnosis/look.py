@@ -132,7 +132,8 @@ def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     change = np.abs(np.diff(log.obs[..., moving].astype(float), axis=2))
     spread = np.sqrt((change[log.mask] ** 2).mean(0))
     motion = (change / np.where(spread > 0, spread, np.inf)).max(-1)
-    usual = np.quantile(motion[log.mask], 0.9)
+    moves = motion[log.mask]
+    usual = np.quantile(moves, 0.9) or np.quantile(moves[moves > 0], 0.9) if moves.any() else 0.0
     still = (motion <= STILL * usual) & log.mask
     if usual == 0:
         yield Remark("pause", "No observation ever changes within an episode.", True)

@@ -143,8 +143,7 @@ def measure(
     data = [train] if explore is None else [train, explore]
     ends = termination.fit(data, blind.scales.obs, draws)
     with torch.no_grad():
-        episodes = Batch.of(split_episodes(train), 1)
-        episodes = episodes[:, (episodes.mask[0].sum(-1) > 0).nonzero()[:, 0]]  # trials may have fewer than others
+        episodes = Batch.of(episodes_of(train), 1)
         batches, (_, per_trial, horizon) = [Batch.of(trials, 1) for trials in data], trials.mask.shape
 
         def learned_env(reference: LatentPolicy) -> LearnedEnv:
@@ -163,6 +162,13 @@ def measure(
     return findings
 
 
+def episodes_of(trials: Trials) -> Trials:
+    """Each episode that took place as a trial of its own; some trials may have fewer than others."""
+    split = split_episodes(trials)
+    some = split.mask.any((1, 2))
+    return Trials(split.obs[some], split.action[some], split.mask[some], split.actions)
+
+
 def near(expert: Trials, explore: Trials) -> Trials:
     """Exploration where the expert goes."""
     low, high = (x[0].numpy() for x in valid_range(Batch.of(expert, 1)))
@@ -175,7 +181,7 @@ def _differ(explored: Trials) -> tuple[float | None, float]:
     lasting = trial_dynamics.own_dynamics(explored, Steps.of(explored), RESOLVED)
     if explored.mask.shape[1] == 1:
         return lasting and lasting[0], 0.0
-    passing = trial_dynamics.own_dynamics(episodes := split_episodes(explored), Steps.of(episodes))
+    passing = trial_dynamics.own_dynamics(episodes := episodes_of(explored), Steps.of(episodes))
     return lasting and lasting[0], passing[0] if passing else 0.0
 
 
@@ -193,7 +199,7 @@ def _trait_stakes(
     index = draws.integers(amounts.candidates, count)
     latents = take(explanation.latents, draws.integers(explanation.latents.shape[1], count))
     right, wrong = (
-        TraitPolicy(explanation.dynamics, of_trial.policy, latents, take(candidates, i))
+        TraitPolicy(explanation.dynamics, of_trial, latents, take(candidates, i))
         for i in (index, draw_distant(candidates, index, draws))
     )
     env = learned_env(right)
@@ -266,7 +272,7 @@ def _explain(
     lasting, passing = _differ(near(*(train for train, _ in (expert, exploration))))
     if passing > (lasting or 0.0):
         longer = replace(config, inference_batch=batch and per_trial * batch)  # as many steps as of whole trials
-        episodes = ((split_episodes(x[0]), split_episodes(x[1])) for x in (expert, exploration))
+        episodes = ((episodes_of(x[0]), episodes_of(x[1])) for x in (expert, exploration))
         units.append((*episodes, per_trial, longer))
     explanations = list[Explanation]()
     for i, unit in enumerate(units):

@@ -28,11 +28,13 @@ NOISE = 0.3  # of traits in training, so that they do not name trials
 class Trait(NamedTuple):
     """A policy given a trait, traits [1, B, D] of the trials of training, and its gain in held-out ones.
 
-    gain: log-likelihood of the actions of their second half, given the trait of the first, over a policy that was
-    trained with traits of other trials, and has as much to overfit; nats a step.
+    scales: those that the policy was trained with. gain: log-likelihood of the actions of their second half, given the
+    trait of the first, over a policy that was trained with traits of other trials, and has as much to overfit; nats a
+    step.
     """
 
     policy: ActionHead
+    scales: Scales
     traits: Tensor
     gain: float
 
@@ -97,17 +99,18 @@ def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessC
     with torch.no_grad():
         early, late = halves(held_out)
         trait = each_step(late, encoder(early))
-        return Trait(own, traits, typical(log_prob(own, late, trait) - log_prob(other, late, trait), late))
+        return Trait(own, scales, traits, typical(log_prob(own, late, trait) - log_prob(other, late, trait), late))
 
 
 class TraitPolicy(LatentPolicy):
     """A policy given traits [S, N, TRAIT], in dynamics under latents [S, N, D]; theta_hat holds both."""
 
-    def __init__(self, dynamics: DynamicsHead, policy: ActionHead, latent: Tensor, trait: Tensor) -> None:
-        super().__init__(dynamics, policy, torch.cat([latent, trait], -1))
+    def __init__(self, dynamics: DynamicsHead, of_trial: Trait, latent: Tensor, trait: Tensor) -> None:
+        super().__init__(dynamics, of_trial.policy, torch.cat([latent, trait], -1))
+        self.scales = of_trial.scales  # of expert trials; those of the dynamics may be of exploration
 
     def features(self, obs: Tensor, latent: Tensor) -> Tensor:
-        return torch.cat([self.dynamics.inputs.scales.obs(obs), latent[..., -TRAIT:]], -1)
+        return torch.cat([self.scales.obs(obs), latent[..., -TRAIT:]], -1)
 
     def next_obs(self, obs: Tensor, action: Tensor, draws: Draws) -> Tensor:
         return self.dynamics.sample(obs, action, self.theta_hat[..., :-TRAIT], draws)

@@ -29,23 +29,29 @@ RATIOS, LASTING = (0.0, 0.01, 0.1, 1.0, 10.0), (0.0, 0.3, 0.6, 0.9)  # of varian
 def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[float, int] | None:
     """How alike two halves of a trial are in what a fit of all trials leaves of the motion, and the column of it.
 
-    Half the episodes each, or of one episode half the steps. What is left, and its products with observations and
-    actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest, or 0
-    if that is chance. Where nothing is alike by least squares, fits with `trial_means` are tried. None for too little
-    data, also where chance exceeds `least`. Columns that observation and action decide are left out.
+    Half the episodes each, or half the steps of a trial's only one. What is left, and its products with observations
+    and actions, has a mean in each half; alike is the rank correlation of the halves over trials, where it is largest,
+    or 0 if that is chance. Where nothing is alike by least squares, fits with `trial_means` are tried. None for too
+    little data, also where chance exceeds `least`. Columns that observation and action decide are left out.
     """
+    from scipy.stats import rankdata  # a second
+
     count = len(trials)
     if count < 16 or np.median(np.bincount(steps.trial, minlength=count)) < 8:
         return None
     action = one_hot(steps.action, trials.actions)
     change, inputs = steps.then - steps.obs, clipped(np.concatenate([steps.obs, action], 1))
+    inputs = inputs[:, inputs.any(0)]  # a constant column is alike in all halves
     basis = random_features(inputs, FINE)
     left = change - basis @ fitted(basis, change)
     unit = usual_size(left, change)
     kept = np.flatnonzero(np.isfinite(unit))
     _, episode, step = np.nonzero(trials.mask)
     taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
-    second = episode % 2 if trials.mask.shape[1] > 1 else taken >= trials.mask.sum((1, 2))[steps.trial] / 2
+    took_place = trials.mask.any(2)
+    number = (took_place.cumsum(1) - 1)[steps.trial, episode]  # of the episode, among those that took place
+    halfway = taken >= trials.mask.sum((1, 2))[steps.trial] / 2
+    second = np.where(took_place.sum(1)[steps.trial] > 1, number % 2, halfway)
     group = 2 * steps.trial + second
     both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
     if not len(kept) or both.sum() < 16:
@@ -60,7 +66,9 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
             for x in slopes.T:
                 power = np.maximum(by_trial(x**2, group, 2 * count), 1e-9)
                 halves = (by_trial(x * y, group, 2 * count) / power).reshape(count, 2)[both]
-                ranks = halves.argsort(0).argsort(0).T
+                if not np.ptp(halves, 0).all():
+                    continue
+                ranks = rankdata(halves, axis=0).T
                 best = max(best, (float(np.corrcoef(*ranks).min()), int(k)), key=lambda pair: pair[0])
         return best if best[0] > chance else (0.0, 0)
 

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, joined_trials, take, take_steps
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -144,7 +144,7 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     for i in range(config.rounds):
         if i > 0:
             _, more, new = labelled(query, agent, *asked)
-            data, label = data.joined(more), torch.cat([label, new], 1)
+            data, label = data.joined(more), joined_trials(label, new)
         for _ in range(updates[i]):
             index, batch = draws.integers(len(data), config.batch), data.beginnings(done, config.shortest)
             target = take(label[:, :, : batch.mask.shape[2]], index)

@@ -172,6 +172,7 @@ class Synthesis:
         """As many trials, and their latents [S, n, D]."""
         model, policy, latents, starts, draws = self.model, self.policy, self.latents, self.starts, self.draws
         low, high = extent(self.expert.obs, self.expert.mask)
+        varies = low < high
         theta_hat = take(latents, draws.integers(latents.shape[1], n))
         obs, action_latent = starts[:, :1], latents[:, :1]  # replaced in the first step
         over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
@@ -183,6 +184,7 @@ class Synthesis:
             action = policy.sample(torch.cat([model.inputs.obs(obs), action_latent], -1), draws)
             action = policy.signature.randomise(action, self.random_share, draws)
             next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
+            next_obs = torch.where(varies, next_obs, low)
             steps.append((obs, action, next_obs))
             obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
         obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))

@@ -28,7 +28,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, take, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joined_trials, take, take_steps
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.sizes import Configuration
@@ -38,6 +38,7 @@ from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods.dagger import Query, by_round, labelled
 from deconfounded.deconf.methods.naive_transformer import TransformerAgent
+from deconfounded.envs.support.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,9 @@ def train(query: Query, config: DptConfig, rng: Rngs, monitor: Monitor | None = 
     for i in range(begin, config.rounds):
         if i > 0:
             _, more, new = labelled(query, agent, *asked)
-            data, label = data.joined(more), torch.cat([label, new], 1)
+            if (longest := more.mask.shape[2]) > (window := agent.shape()["window"]):
+                raise InputError(f"trials of a later round had {longest} steps; they must be at most {window}")
+            data, label = data.joined(more), joined_trials(label, new)
         for _ in range(updates[i]):
             longest = data.beginnings(done, config.shortest).mask.shape[2]
             own = data.trials(index := draws.integers(len(data), config.batch))

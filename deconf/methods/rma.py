@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joined_theta, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joined_theta, joined_trials, take
 from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
@@ -130,7 +130,7 @@ def train(
     for i in range(begin, config.rounds):
         own, thetas = explore(agent if i > 0 else None)
         new, target = Batch.of(own, len(rngs), config.device), joined_theta(own, thetas, len(rngs), config.device)
-        data, targets = (new, target) if data is None else (data.joined(new), torch.cat([targets, target], 1))
+        data, targets = (new, target) if data is None else (data.joined(new), joined_trials(targets, target))
         for j in range(passes[i]):
             index = draws.integers(len(data), config.batch)
             error = _pass(agent, optimizer, data.trials(index), take(targets, index), config.chunk)

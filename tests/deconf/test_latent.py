@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.core.nets import Inputs, Scales
 from deconfounded.deconf.diagnosis import latent, measures, trait
 from deconfounded.deconf.diagnosis.measures import Amounts, split
 from deconfounded.deconf.diagnosis.thresholds import NO_EVIDENCE
@@ -131,5 +133,33 @@ def test_a_trait_s_gain_is_over_a_policy_that_fits_as_well(size: float, least: f
     )
     config = MemorylessConfig(updates=100, batch=256, width=32, learning_rate=6e-3)
     data = Batch.of(train, 1), Batch.of(held_out, 1)
-    gain = trait.fit(*data, Signature.of(train), config, Draws([rng], "cpu")).gain
-    assert least < gain < most
+    made = trait.fit(*data, Signature.of(train), config, Draws([rng], "cpu"))
+    assert least < made.gain < most
+
+
+def test_a_trait_s_policy_acts_by_the_scales_of_its_training() -> None:
+    """Those of the expert, whatever the dynamics were learned from."""
+    rng = np.random.default_rng(0)
+    obs = rng.normal(0, 1, (24, 1, 21, 1))
+    trials = Trials(obs, 0.3 * np.tanh(obs[:, :, :-1]), np.ones((24, 1, 20), bool))
+    data, signature = Batch.of(trials, 1), Signature.of(trials)
+    draws = Draws([rng], "cpu")
+    of_trial = trait.fit(data, data, signature, MemorylessConfig(updates=2, width=8), draws)
+    wide = Scales(signature, replace(data, obs=3 * data.obs), data.action, data.mask)
+    dynamics = DynamicsHead(2, 8, Inputs(wide), draws)
+    latents, traits = torch.zeros(1, 24, 2), of_trial.traits
+    made = trait.TraitPolicy(dynamics, of_trial, latents, traits)
+    seen = made.features(data.obs[:, :, 0], torch.cat([latents, traits], -1))
+    torch.testing.assert_close(seen[..., :1], Scales.of(signature, data).obs(data.obs[:, :, 0]))
+
+
+def test_episodes_that_did_not_take_place() -> None:
+    """Some trials have fewer episodes than others; nothing is of those that they lack."""
+    trials = world(0.2, True, 6, 0, 4)
+    mask = trials.mask.copy()
+    mask[1:, 2:] = False
+    episodes = measures.episodes_of(Trials(trials.obs, trials.action, mask))
+    assert len(episodes) == 4 + 5 * 2
+    assert episodes.mask.any((1, 2)).all()
+    np.testing.assert_array_equal(episodes.action[:4, 0], trials.action[0])
+    np.testing.assert_array_equal(episodes.action[4:6, 0], trials.action[1, :2])

@@ -34,6 +34,19 @@ from tests.deconf.test_diagnose import _tiny_init
 B, E, T = 48, 2, 60
 
 
+def test_a_log_that_is_mostly_at_rest() -> None:
+    """It pauses; that nothing ever changes would be untrue."""
+    trials = driven()
+    obs, action = trials.obs.copy(), trials.action.copy()
+    obs[:, :, 5:], action[:, :, 5:] = obs[:, :, 5:6], 0
+    remarks = [remark.text for remark in look(changed(trials, obs=obs, action=action)) if remark.kind == "pause"]
+    assert len(remarks) == 1
+    assert "No observation ever changes" not in remarks[0]
+    still = np.repeat(obs[:, :, :1], T + 1, 2)
+    texts = [remark.text for remark in look(changed(trials, obs=still)) if remark.kind == "pause"]
+    assert texts == ["No observation ever changes within an episode."]
+
+
 def driven(lasting: float = 0.0, noise: float = 0.1, reaction: int = 0, same: bool = False, goals: float = 0) -> Trials:
     """A cart in a hidden wind, which its driver feels.
 

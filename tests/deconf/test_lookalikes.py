@@ -142,6 +142,43 @@ def test_halves_are_of_the_steps_that_are_in() -> None:
     assert alike[0] > 0.5
 
 
+def wandering(hidden: float, actions: int = 0, episodes: int = 1) -> Trials:
+    """40 trials of a point that is pushed by its action, and by a force that is hidden."""
+    rng = np.random.default_rng(0)
+    shape = (40, episodes, 40, 1)
+    action = rng.integers(2, size=shape).astype(float) if actions else rng.uniform(-1, 1, shape)
+    moves = 0.3 * action + hidden * rng.uniform(-1, 1, (40, 1, 1, 1)) + 0.3 * rng.standard_normal(shape)
+    obs = np.concatenate([np.zeros((40, episodes, 1, 1)), moves.cumsum(2)], 2)
+    return Trials(obs, action, np.ones(shape[:3], bool), actions)
+
+
+class TestHalves:
+    """Halves of a trial are alike where something of the trial moves it."""
+
+    def alike(self, trials: Trials) -> float | None:
+        measured = trial_dynamics.own_dynamics(trials, Steps.of(trials))
+        return measured and measured[0]
+
+    def test_constant_columns(self) -> None:
+        """An observation that never changes, and an action that is never taken, are alike in all halves."""
+        trials = wandering(0)
+        still = np.concatenate([trials.obs, np.full_like(trials.obs, 7)], -1)
+        assert self.alike(trials) == self.alike(Trials(still, trials.action, trials.mask)) == 0
+        assert self.alike(wandering(0, actions=2)) == self.alike(wandering(0, actions=3)) == 0
+        hidden = wandering(0.5)
+        still = np.concatenate([hidden.obs, np.full_like(hidden.obs, 7)], -1)
+        assert self.alike(Trials(still, hidden.action, hidden.mask)) == self.alike(hidden)
+
+    def test_trials_of_different_numbers_of_episodes(self) -> None:
+        """Those of one episode have halves, too, if another trial has two."""
+        two = wandering(0.5, episodes=2)
+        mask = two.mask.copy()
+        mask[1:, 1] = False
+        alike = self.alike(Trials(two.obs, two.action, mask))
+        assert alike is not None
+        assert alike > 0.8
+
+
 class TestStatesThatTell:
     """Dynamics that differ from trial to trial, by an amount that observations tell of."""
 
@@ -192,6 +229,15 @@ def test_one_trial_does_not_own_a_likelihood() -> None:
     before = latent.typical(log_prob, batch)
     log_prob[0, 7] -= 1000
     assert latent.typical(log_prob, batch) == pytest.approx(before, abs=0.05)
+
+
+def test_small_units_are_no_constants() -> None:
+    """A column in units of 1e-7 is scaled as it is in others; what is constant keeps its scale, rounding or not."""
+    x = torch.randn(1, 50, 20, 1, generator=torch.Generator().manual_seed(0))
+    mask = torch.ones(1, 50, 20)
+    torch.testing.assert_close(Scaler(1e-7 * x, mask)(1e-7 * x), Scaler(x, mask)(x), rtol=1e-3, atol=1e-3)
+    for constant in (0.0, 1e-7, 0.1, 0.3, 7.0, 1e4):
+        assert Scaler(torch.full_like(x, constant), mask).std.item() == 1
 
 
 class TestHeavyTails:

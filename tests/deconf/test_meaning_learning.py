@@ -150,6 +150,17 @@ class TestExploration:
         assert (latent[:, ::2] == 7).all()
         assert (latent[:, 1::2] != 7).all()
 
+    def test_trials_that_begin_one_by_one(self) -> None:
+        """As in a program that has one environment: every other one is blind, of all that begin."""
+        one = Draws([np.random.default_rng(0)], "cpu")
+        agent = DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 1), one)
+        made, blind = Explorer(agent, torch.full((1, 4, 3), 7.0), 0.1), []
+        for _ in range(6):
+            made.begin(1)
+            made.reset([np.random.default_rng(0)])
+            blind.append(bool((made.latent() == 7).all()))
+        assert blind == [True, False] * 3
+
     def test_a_share_of_actions_is_random(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of a policy that always says .5: as many others as asked for, uniform in [-1, 1]."""
         for share in (0.0, 0.3, 1.0):

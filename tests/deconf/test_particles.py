@@ -217,6 +217,24 @@ def test_particles_are_for_many_latents() -> None:
     assert isinstance(exact_agent(env, expert(env.task), False, Grid(env, expert(env.task), 2)), ExactAgent)
 
 
+def test_a_step_for_which_the_one_before_left_no_room() -> None:
+    """Particles are drawn anew first, where the effective number is half of them, but for rounding."""
+    task = Three()
+    env = envs.BatchEnv(task, 2)
+    env.reset(0)
+    belief = Particles(env, expert(task), False)
+    belief.begin(2)
+    belief.reset(Streams([np.random.default_rng(i) for i in range(2)]))
+    share = 0.5 * (1 + 1e-9)  # of particles with all of the weight: an effective number of just so many
+    heavy = np.arange(FEW) < round(share * FEW)
+    weight = np.where(heavy, 1.0, 1e-7)
+    belief.log_weight[0] = np.log(weight / weight.sum())
+    state = env.state
+    env.step(np.ones((2, 1)))
+    belief.learn(state, env.observe(), np.ones((2, 1)), env.state + 1.0, np.ones(2, bool))
+    assert np.isfinite(belief.log_weight).all()
+
+
 @pytest.mark.parametrize("name", [name for name in envs.names() if not needs_particles(envs.get(name))])
 def test_grids_are_fine(name: str) -> None:
     """The exact policies' grid has 15 values or more of each continuous latent, so that its error is within noise."""
