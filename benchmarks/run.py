@@ -8,6 +8,9 @@ Seeds of a method run side by side in one program, in as many groups as there ar
 """
 
 if __name__ == "__main__":  # this file is `deconf run` too
+    import sys
+
+    sys.path.pop(0)  # benchmarks/, whose `data` or `train` would be taken for a user's
     from deconfounded.__main__ import main as deconf
 
     deconf("run")
@@ -119,7 +122,9 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
 def listed(args: argparse.Namespace) -> None:
     """Print the tasks with their latents, and the methods."""
     if args.task is not None or args.tasks is not None:
-        raise envs.InputError(f"--list was given with {args.task or ' '.join(args.tasks)}; it lists all; give it alone")
+        raise envs.InputError(
+            f"--list was given with {args.task or ' '.join(args.tasks or ())}; it lists all; give it alone"
+        )
     for name in envs.names():
         try:
             task = envs.get(name)

@@ -79,8 +79,8 @@ class Method:
             config = self.paper
         values = asdict(config)
         changes: dict[str, Any] = {"device": device, "drifts": task.drifts}
-        if len(task.observation) >= LARGE_OBSERVATION:
-            changes |= {"width": WIDE, **(self.large(config) if self.large else {})}
+        if len(task.observation) >= LARGE_OBSERVATION:  # the width of a method from outside is its author's
+            changes |= {**({} if self.reference else {"width": WIDE}), **(self.large(config) if self.large else {})}
         return values | {key: value for key, value in changes.items() if key in values}
 
     @property

@@ -13,6 +13,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import label
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
+from deconfounded.benchmarks.engine.job_files import in_name
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
@@ -91,15 +92,17 @@ class CurveMonitor(JobMonitor):
     def __init__(self, job: Job, share: float) -> None:
         super().__init__(job, share)
         self.writer: Any = None
+        self.noted = 0  # the last update whose losses are kept
         if job.track:
             from torch.utils.tensorboard import SummaryWriter
 
-            name = f"{job.method}-{'-'.join(map(str, job.seeds))}"
+            name = f"{job.method}-{in_name(job.seeds)}"
             self.writer = SummaryWriter(str(job.folder.parent / "tensorboard" / name))
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:
         super().update(done, total, losses, agent)
-        if done % max(total // 400, 1) == 0:
+        if done - self.noted >= max(total // 400, 1):
+            self.noted = done
             for kind, loss in losses.items():
                 self.kept.setdefault(kind, []).append((done, loss))
                 if self.writer is not None:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from deconfounded import envs
 from deconfounded.deconf import methods
@@ -45,7 +46,7 @@ def add(reference: str) -> str:
     if ENVIRONMENT in fit.method.uses:
         raise envs.InputError(f"a method uses {ENVIRONMENT!r}; it may use {', '.join(USES)}")
     where, _, function = reference.rpartition(":")
-    stem = where.removesuffix(".py").replace("/", ".").rpartition(".")[2]
+    stem = Path(where).stem if where.endswith(".py") else where.rpartition(".")[2]
     name = re.sub(r"[^A-Za-z0-9_]", "_", stem if function == "fit" else f"{stem}_{function}")
     made = replace(fit.method, reference=outside.absolute(reference), version=0, exact=False, deployments={})
     taken = {"all", "demonstrations", *labels(methods.METHODS)}

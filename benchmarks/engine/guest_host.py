@@ -77,7 +77,7 @@ class Guest(Agent):
     def _connect(self, reference: str) -> Connection:
         """The guest's end calls here. Raises InputError if its process ends before it does."""
         key, accepted = secrets.token_bytes(16), queue.SimpleQueue[Connection]()
-        path = [str(Path(entry).resolve()) for entry in sys.path]
+        path = [str(Path(entry).resolve()) for entry in sys.path if entry not in outside.FOLDERS]  # of others
         with Listener(authkey=key) as listener:
             threading.Thread(target=lambda: accepted.put(listener.accept()), daemon=True).start()
             begun = {"reference": reference, "address": listener.address, "key": key.hex(), "path": path}

@@ -1,6 +1,8 @@
 """What jobs leave in a run's folder, one file a (method, seed): what is in it is finished, and kept."""
 
+import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,12 @@ def read(file: Path) -> dict[str, Any] | None:
     return {**arrays, "meta": meta} if isinstance(meta, dict) else None
 
 
+def in_name(seeds: Sequence[int]) -> str:
+    """Seeds as names of files have them: 0-1-2, or of many the first, the last, and a hash."""
+    every = "-".join(map(str, seeds))
+    return every if len(seeds) <= 10 else f"{seeds[0]}-to-{seeds[-1]}-{hashlib.sha256(every.encode()).hexdigest()[:8]}"
+
+
 Finished = list[tuple[str, int, dict[str, Any]]]
 """Method, seed, and what its job wrote."""
 
@@ -83,13 +91,18 @@ def left_in(folder: Path) -> Finished:
 
 
 def _of_latest_text(finished: Finished) -> Finished:
-    """Those for which the task had the text of the latest job, and the method that of its latest; a line on others."""
+    """Those of the latest text of the task, and of the latest version and text of the method; a line on others."""
     texts, task, kept = dict[str, dict[str, str]](), None, list[tuple[str, int, dict[str, Any]]]()
+    versions: dict[str, int | None] = {}
     for method, _, data in sorted(finished, key=lambda job: max(end for _, end in job[2]["meta"]["spans"])):
         texts[method] = data["meta"]["identity"]["outside"]
+        versions[method] = data["meta"]["identity"].get("method_version")
         task = texts[method].get("task")
     for method, seed, data in finished:
-        if data["meta"]["identity"]["outside"] == texts[method] and texts[method].get("task") == task:
+        made_of = data["meta"]["identity"]
+        if made_of.get("method_version") != versions[method]:
+            print(f"{method}-{seed}.npz is left out: it is of another version; run it again with --resume")
+        elif made_of["outside"] == texts[method] and texts[method].get("task") == task:
             kept.append((method, seed, data))
         else:
             print(f"{method}-{seed}.npz is left out: its task or method had another text; run it again with --resume")

@@ -79,7 +79,7 @@ class Job(ABC):
     @property
     def checkpoint(self) -> Path:
         """What an interrupted job goes on from."""
-        return self.folder / f".{self.method}-{'-'.join(map(str, self.seeds))}.pt"
+        return self.folder / f".{self.method}-{job_files.in_name(self.seeds)}.pt"
 
     @property
     def ticks(self) -> int:

@@ -1,9 +1,11 @@
 """How much data each preset spends, by kind of task, and with what amounts each method trains."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, get_args, get_type_hints
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
@@ -76,17 +78,24 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
         if name not in amounts:
             raise envs.closest("--set amount", key, [f"{method}.{each}" if method else each for each in amounts])
         kind = get_type_hints(type(METHODS[method].on_control) if method else Preset)[name]
-        new = {name: _parsed(key, value, get_args(kind) or (kind,), values[name])}
+        kinds = get_args(kind) if get_origin(kind) in (Union, UnionType, Literal) else (get_origin(kind) or kind,)
+        own = bool(method) and bool(METHODS[method].reference)
+        new = {name: _parsed(key, value, kinds, values[name], own)}
         settings = settings.configured(method, **new) if method else replace(settings, **new)
     return settings
 
 
-def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any) -> Any:
-    """The text as a value of one of those types, or one of those values."""
+def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any, own: bool) -> Any:
+    """The text as a value of one of those types, or one of those values. own: of a method from outside, of any size."""
     try:
         value = json.loads(text)
     except ValueError:
         value = text
+    if own:
+        value = tuple(value) if isinstance(value, list) and tuple in kinds else value
+        if not fits(value, kinds, -math.inf):
+            raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}")
+        return value
     least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
     least = FEWEST if key == "eval_trials" else least
     if not fits(value, kinds, least, MOST):

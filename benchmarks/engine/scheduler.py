@@ -12,7 +12,7 @@ import numpy as np
 
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
-from deconfounded.benchmarks.engine.job_files import Finished, read
+from deconfounded.benchmarks.engine.job_files import Finished, in_name, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.errors import InputError, error_line
@@ -157,7 +157,7 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
     def say(job: Some, outcome: str | Exception) -> None:
-        file = errors and errors / f"{job.method}-{'-'.join(map(str, job.seeds))}.txt"
+        file = errors and errors / f"{job.method}-{in_name(job.seeds)}.txt"
         if file is not None:
             file.unlink(missing_ok=True)
         if isinstance(outcome, Exception):

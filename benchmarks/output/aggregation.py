@@ -42,6 +42,11 @@ def _published(protocol: str, *of: Any) -> tuple[float, float] | None:
     return _references(kept) if {record["method"] for record in kept} >= set(REFERENCES) else None
 
 
+def forget() -> None:
+    """Forget what the references of the package were; more records came to it."""
+    _published.cache_clear()
+
+
 def _references(records: Sequence[Record]) -> tuple[float, float]:
     returns = {
         name: [one["returns"][: one["episodes"]] for one in records if named(one) == name] for name in REFERENCES

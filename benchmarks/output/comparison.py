@@ -49,6 +49,19 @@ def outdated(every: Sequence[Record], against: Sequence[str]) -> list[str]:
     ]
 
 
+def _check_alike(task: str, every: Sequence[Record]) -> None:
+    """Raises InputError for records of a task that were not measured alike, or of two versions of a method."""
+    methods = records.grouped(every, lambda record: record["method"])
+    groups: list[tuple[str, Sequence[Record], tuple[str, ...]]]
+    groups = [(task, every, ("task_version", "expert", "expert_version", "eval_trials"))]
+    groups += [(f"{name} on {task}", of, ("method_version",)) for name, of in methods.items()]
+    for what, of, keys in groups:
+        for key in keys:
+            if len(values := list(dict.fromkeys(record[key] for record in of))) > 1:
+                two = " and ".join(str(value)[:12] for value in values[:2])
+                raise InputError(f"records of {what} have {key} {two}; such are not to be compared")
+
+
 def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[str, dict[int, Array]]]:
     """Scores of all methods in records of runs, and of those in `against`: with the package where no run has them.
 
@@ -59,6 +72,9 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
     protocols = list(dict.fromkeys(record.get(records.NAME, STANDARD) for record in every))
     if len(protocols) > 1:
         raise InputError(f"records of protocols {' and '.join(protocols)} are not to be compared; give --protocol")
+
+    for task, of_task in records.grouped(every, lambda record: record["task"]).items():
+        _check_alike(task, of_task)
 
     def add(record: Record) -> None:
         of = scores.setdefault(records.named(record), {}).setdefault(record["task"], {})

@@ -161,7 +161,8 @@ def save(pictures: Sequence[NDArray[Any]], rate: float, file: Path) -> None:
 
 def write(task: envs.Task, clips: Clips, file: Path) -> None:
     """The film as .mp4. Raises InputError where no GL works."""
-    save(film(task, clips).pictures, frame_rate(task), file)
+    made = film(task, clips)
+    save(made.pictures, made.rate, file)
 
 
 def record(env: envs.BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None) -> dict[str, Any]:

@@ -130,9 +130,9 @@ def summarise(
             "deployment": seeds[0]["deployment"],
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
-            "score": scores[:, :episodes].mean(0).round(4).tolist(),
-            **{f"score_{end}": round(float(measures[end].mean()), 4) for end in ("first", "last")},
-            "regret": round(float(measures["regret"].mean()), 4),
+            "score": scores[:, :episodes].mean(0).round(6).tolist(),  # to four, .544963 would be .55 in a table
+            **{f"score_{end}": round(float(measures[end].mean()), 6) for end in ("first", "last")},
+            "regret": round(float(measures["regret"].mean()), 6),
             "ci95": None if band is None else band[episodes - 1].tolist(),
             "ci95_first": None if band is None else band[0].tolist(),
             "ci95_regret": None if intervals is None else intervals[-1].tolist(),

@@ -97,6 +97,6 @@ def over_tasks(figure: Callable[..., Array], *methods: Runs) -> Figure | None:
     rng = np.random.default_rng(0)
     given = [[np.asarray(runs[task]) for task in tasks] for runs in methods]
     drawn = [[x[rng.integers(len(x), size=(RESAMPLES, len(x)))] for x in runs] for runs in given]
-    alone = all(len(x) == 1 for runs in given for x in runs)
+    alone = any(len(x) == 1 for runs in given for x in runs)  # which no bootstrap can draw anew
     low, high = np.percentile(figure(*drawn), [2.5, 97.5], 0)
     return Figure(figure(*given), None if alone else (low, high), sum(map(len, given[0])))

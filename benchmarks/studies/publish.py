@@ -105,6 +105,7 @@ def keep(run: Path) -> None:
             except Exception as error:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
         records.write(DOCS / "records", made)
+        aggregation.forget()
         copy(run / "adaptation.png", DOCS / f"{task.name}.png")
         if small.exists():
             copy(small, DOCS / f"{task.name}.webp")

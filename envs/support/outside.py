@@ -13,6 +13,7 @@ from typing import Any
 from deconfounded.envs.support.errors import InputError, error_line, users_line
 
 SENT = "DECONFOUNDED_OUTSIDE"  # environment variable of a cluster worker: the folder that plug-in files were sent to
+FOLDERS: set[str] = set()  # of plug-in files, which are on the import path for their sake
 PREFIX = "outside_"  # of the module names of plug-in files
 
 
@@ -95,8 +96,9 @@ def _run(file: Path) -> ModuleType:
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
-        if str(path.parent) not in sys.path:
-            sys.path.append(str(path.parent))
+        if (folder := str(path.parent)) not in sys.path:
+            sys.path.append(folder)
+            FOLDERS.add(folder)
         try:
             spec.loader.exec_module(module)
         except BaseException:

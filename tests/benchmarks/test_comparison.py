@@ -101,6 +101,55 @@ class TestSeveralTasks:
         assert "give --resume to go on" in capfd.readouterr().err
 
 
+def test_settings_of_one_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of any type that json has, and of any size; its width stays its author's, on large observations too."""
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    fields = "sizes: tuple[int, ...] = (64, 64)\n    offset: int = 0\n    bias: float = -1.0\n    width: int = 32"
+    config = f"@dataclass(frozen=True)\nclass Config:\n    {fields}\n"
+    head = "from dataclasses import dataclass\nfrom deconfounded.deconf.method import uses\n"
+    fit = "@uses('demonstrations', on_control=Config())\ndef fit(given):\n    pass\n"
+    (tmp_path / "clone.v2.py").write_text(f"{head}{config}{fit}")
+    name = catalogue.add(f"{tmp_path}/clone.v2.py:fit")
+    assert name == "clone_v2"
+    for task in ("slippery_cartpole", "ant_goal"):
+        settings = presets.preset("default", envs.get(task), "cpu")
+        assert settings.configs[name]["width"] == 32
+        for change, field, value in (
+            ("sizes=[32, 8]", "sizes", (32, 8)),
+            ("offset=0", "offset", 0),
+            ("bias=-2", "bias", -2),
+        ):
+            assert presets.changed(settings, [f"{name}.{change}"]).configs[name][field] == value
+        with pytest.raises(InputError, match=r"sizes was '32'; it must be like \[64, 64\]"):
+            presets.changed(settings, [f"{name}.sizes=32"])
+
+
+def test_methods_have_helpers_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Modules of one name in two folders: a method's process finds the one beside it."""
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    head = "import helper\nfrom deconfounded.deconf.method import uses\n"
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "helper.py").write_text(f"NAME = '{folder}'")
+        fit = "@uses('demonstrations')\ndef fit(given):\n    raise ValueError(f'helper of {helper.NAME}')\n"
+        (tmp_path / folder / f"m_{folder}.py").write_text(f"{head}{fit}")
+    names = [catalogue.add(f"{tmp_path}/{folder}/m_{folder}.py:fit") for folder in ("a", "b")]
+    context = Context(envs.get("bandit"), tiny_preset(), [0])
+    for name, folder in zip(names, ("a", "b"), strict=True):
+        method = catalogue.METHODS[name]
+        with pytest.raises(InputError, match=f"helper of {folder}"):
+            Guest(context, name, method.reference, method.uses)
+
+
+@pytest.mark.parametrize("key", ["task_version", "expert", "eval_trials", "method_version"])
+def test_records_of_two_kinds_are_not_compared(key: str) -> None:
+    one, other = record("mine", 0, 0.5), record("mine", 1, 0.6)
+    other = {**other, key: "0" * 64 if key == "expert" else other[key] + 1}
+    with pytest.raises(InputError, match=f"have {key} .*; such are not to be compared"):
+        comparison.gathered([one, other], [])
+
+
 @pytest.mark.slow
 def test_a_method_in_this_process_is_as_in_its_own(mine: Path) -> None:
     """Same data, same random numbers; it may start processes of its own, and its amounts can be set."""

@@ -147,6 +147,9 @@ class TestStatistics:
         spread = statistics.over_tasks(statistics.iqm, {"a": np.array([0.0, 1.0])})  # 0, .5 or 1, of odds 1 to 2 to 1
         assert spread is not None
         assert (spread.value, spread.interval) == (0.5, (0, 1))
+        one = statistics.over_tasks(statistics.iqm, {"a": np.array([0.5]), "b": np.array([0.8, 0.9])})
+        assert one is not None
+        assert one.interval is None, "of a task with one seed nothing can be drawn anew"
         lone = statistics.over_tasks(statistics.improvement, scores, {"b": np.array([2.0]), "a": np.array([])})
         assert lone is not None
         assert (lone.value, lone.n) == (0, 4)
@@ -745,6 +748,15 @@ def test_a_strip_has_each_episode_s_theta() -> None:
     low, high, left, right = 100 + film.STRIP - 8, 124, 8, film.WIDTH - 8
     middle = (left + right) / 2
     assert truths == [(left, low, middle, low), (middle, high, right, high)]
+
+
+def test_a_video_is_as_fast_as_its_film(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Also where only every second step has a picture."""
+    saved: list[Any] = []
+    monkeypatch.setattr(film, "save", lambda pictures, rate, file: saved.append((len(pictures), rate)))
+    monkeypatch.setattr(film, "film", lambda task, clips: film.Film([np.zeros(1)] * 3, 12.5))
+    film.write(Seen(), {}, tmp_path / "video.mp4")
+    assert saved == [(3, 12.5)]
 
 
 def test_a_film_of_few_pictures_takes_as_long() -> None:

@@ -280,6 +280,35 @@ class TestRecords:
         assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two, {**one, "cpu_s": 9.0}]
         assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
 
+    def test_a_kill_before_the_last_write(
+        self, job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """What was superseded then is not superseded again."""
+        one, two = kept(job)
+        records.write(tmp_path, [one, two])
+        newer = {**two, "method_version": 7}
+        write = records.write_atomically
+
+        def killed(file: Path, *content: Any) -> None:
+            if file.parent == tmp_path:
+                raise KeyboardInterrupt
+            write(file, *content)
+
+        monkeypatch.setattr(records, "write_atomically", killed)
+        with pytest.raises(KeyboardInterrupt):
+            records.write(tmp_path, [newer])
+        monkeypatch.setattr(records, "write_atomically", write)
+        records.write(tmp_path, [newer])
+        assert records.read(tmp_path / "bandit.jsonl") == [newer]
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two, one]
+
+    def test_names_of_many_seeds(self, job: BenchmarkJob) -> None:
+        """They fit into a file's name, and groups of seeds have names of their own."""
+        assert replace(job, seeds=(0, 1, 2)).checkpoint.name == ".blind_bc-0-1-2.pt"
+        names = {replace(job, seeds=tuple(range(0, 1000, step))).checkpoint.name for step in (1, 2, 3)}
+        assert len(names) == 3
+        assert all(len(name) < 60 for name in names)
+
     @pytest.mark.parametrize("kind", ["task", "method"])
     def test_texts_from_outside_are_never_mixed(self, job: BenchmarkJob, tmp_path: Path, kind: str) -> None:
         """An edited task supersedes all records of before; an edited method, those of its own."""
