@@ -42,6 +42,8 @@ def main() -> None:
     scores = comparison.gathered(every, against)
     own = list(dict.fromkeys(records.named(record) for record in every))
     methods = [name for name in scores if name in own and (name not in against or len(against) > 1)]
+    if not methods:
+        raise envs.InputError(f"the records given are of {against[0]} alone; give --against another method")
     print(comparison.write(scores, methods, against, args.out))
     if presets := sorted({record["preset"] for record in every} - {"default"}):
         print(f"note: runs of preset {', '.join(presets)}; the records that come with the package are of default")

@@ -48,7 +48,7 @@ def _imports(file: Path, changed: int, roots: frozenset[Path]) -> tuple[Path, ..
     """Files that a file imports, of its own root or of `roots`; `changed`, its time stamp, is there for the cache."""
     own, package = _package(file)
     names: list[str] = []
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in ast.walk(ast.parse(file.read_bytes(), str(file))):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -112,7 +112,7 @@ def mjcf(*files: Path) -> set[Path]:
 @cache
 def _named(file: Path, changed: int) -> tuple[Path, ...]:
     """MJCF files that a Python file names, beside it or in a folder there; `changed` as above."""
-    texts = (node.value for node in ast.walk(ast.parse(file.read_bytes())) if isinstance(node, ast.Constant))
+    texts = (node.value for node in ast.walk(ast.parse(file.read_bytes(), str(file))) if isinstance(node, ast.Constant))
     names = [text for text in texts if isinstance(text, str) and text.endswith(".xml") and "\0" not in text]
     places = (folder / name for name in names for folder in (file.parent, *file.parent.glob("*/")))
     return tuple(place for place in places if place.is_file())
@@ -154,7 +154,7 @@ def content(file: Path) -> bytes:
 @cache
 def _code(file: Path, changed: int) -> bytes:
     """The content of a Python file; `changed` as above."""
-    tree = ast.parse(file.read_bytes())
+    tree = ast.parse(file.read_bytes(), str(file))
     for node in ast.walk(tree):
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
             node.body = node.body[1:]

@@ -14,7 +14,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.__main__ import main as deconf
 from deconfounded.benchmarks import compare
-from deconfounded.benchmarks.engine import catalogue, job_files, presets, progress, published, scheduler
+from deconfounded.benchmarks.engine import catalogue, job_files, presets, progress, published, scheduler, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.guest_host import Guest, fit_guest
@@ -140,6 +140,18 @@ def test_methods_have_helpers_of_their_own(tmp_path: Path, monkeypatch: pytest.M
         method = catalogue.METHODS[name]
         with pytest.raises(InputError, match=f"helper of {folder}"):
             Guest(context, name, method.reference, method.uses)
+
+
+def test_a_helper_that_does_not_parse(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The line names its file, not the method's."""
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "broken_helper.py").write_text("print 'no'")
+    head = "from deconfounded.deconf.method import uses\n@uses('demonstrations')\n"
+    (tmp_path / "late.py").write_text(f"{head}def fit(given):\n    import broken_helper\n")
+    with pytest.raises(SyntaxError) as caught:
+        sources.of_reference(f"{tmp_path}/late.py:fit")
+    assert caught.value.filename == str(tmp_path / "broken_helper.py")
 
 
 @pytest.mark.parametrize("key", ["task_version", "expert", "eval_trials", "method_version"])

@@ -183,6 +183,14 @@ class TestTables:
         with pytest.raises(InterruptedError):
             compare.main()
 
+    def test_compare_with_itself(
+        self, both: tuple[list[Any], list[Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        records.write(tmp_path / "mine", both[0])
+        monkeypatch.setattr("sys.argv", ["compare", str(tmp_path / "mine"), "--against", "dagger"])
+        with pytest.raises(envs.InputError, match="the records given are of dagger alone; give --against another"):
+            compare.main()
+
     def test_compare_refuses_two(self, both: tuple[list[Any], list[Any]]) -> None:
         standard, once = both
         with pytest.raises(envs.InputError, match="records of protocols standard and once are not to be compared"):
