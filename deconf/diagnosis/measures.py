@@ -165,8 +165,8 @@ def measure(
 def episodes_of(trials: Trials) -> Trials:
     """Each episode that took place as a trial of its own; some trials may have fewer than others."""
     split = split_episodes(trials)
-    some = split.mask.any((1, 2))
-    return Trials(split.obs[some], split.action[some], split.mask[some], split.actions)
+    took_place = split.mask.any((1, 2))
+    return Trials(split.obs[took_place], split.action[took_place], split.mask[took_place], split.actions)
 
 
 def near(expert: Trials, explore: Trials) -> Trials:
