@@ -58,17 +58,23 @@ def _references(records: Sequence[Record]) -> tuple[float, float]:
     return random, expert
 
 
+def unlike(records: Sequence[Record], keys: Sequence[str]) -> str:
+    """The first of the keys in which records differ, and two of its values; empty if they are alike."""
+    for key in keys:
+        values = list(dict.fromkeys(str(record.get(key, STANDARD)) for record in records))
+        if len(values) > 1:
+            return f"{key} {values[0]} and {values[1]}"
+    return ""
+
+
 def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, Any]:
     """Records -> results: what they share, and of each method the scores over seeds; methods in that order, first.
 
     Raises InputError for records that do not belong in one table.
     """
     first = records[0]
-    for record in records:
-        for key in COMMON:
-            if record.get(key) != first.get(key):
-                both = " and ".join(str(one.get(key, STANDARD)) for one in (first, record))
-                raise InputError(f"records with {key} {both} do not belong in one table")
+    if difference := unlike(records, COMMON):
+        raise InputError(f"records with {difference} do not belong in one table")
     one_text(records)
     by_method, by_agent = grouped(records, lambda record: record["method"]), grouped(records, named)
     for method, of in by_method.items():

@@ -56,10 +56,8 @@ def _check_alike(task: str, every: Sequence[Record]) -> None:
     groups = [(task, every, ("task_version", "expert", "expert_version", "eval_trials"))]
     groups += [(f"{name} on {task}", of, ("method_version",)) for name, of in methods.items()]
     for what, of, keys in groups:
-        for key in keys:
-            if len(values := list(dict.fromkeys(record[key] for record in of))) > 1:
-                two = " and ".join(str(value)[:12] for value in values[:2])
-                raise InputError(f"records of {what} have {key} {two}; such are not to be compared")
+        if difference := aggregation.unlike(of, keys):
+            raise InputError(f"records of {what} have {difference}; such are not to be compared")
 
 
 def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[str, dict[int, Array]]]:

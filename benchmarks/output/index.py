@@ -30,7 +30,6 @@ QUESTIONS = {
 PEER, NAIVE = "deconfounded", "naive_rnn"
 Scores = Mapping[str, Mapping[str, Mapping[int, float]]]
 """Of the last episode, by task, method and seed."""
-EXACTLY = 6  # decimals of what tables round to two: rounded to four before, .634985 would be .64
 THRESHOLDS = np.linspace(-0.2, 1.2, 57)  # of performance profiles
 COMPARED = (PEER, *EXACT[::-1])  # in paired differences
 Found = Sequence[tuple[envs.Task, dict[str, Any]]]
@@ -58,8 +57,8 @@ def as_json(figure: statistics.Figure | None) -> dict[str, Any] | None:
     """A figure as the page's data has it."""
     if figure is None:
         return None
-    interval = None if figure.interval is None else _short(figure.interval, EXACTLY)
-    return {"value": _short(figure.value, EXACTLY), "interval": interval, "n": figure.n}
+    interval = None if figure.interval is None else _short(figure.interval, scoring.EXACTLY)
+    return {"value": _short(figure.value, scoring.EXACTLY), "interval": interval, "n": figure.n}
 
 
 def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[int, float]]) -> dict[str, Any]:

@@ -242,9 +242,9 @@ def _of_one_text(records: Sequence[Record], new: Sequence[Record]) -> list[Recor
 
 def _append(file: Path, records: Sequence[Record]) -> None:
     check_folder(file.parent)
-    held = file.read_text("utf-8") if file.exists() else ""
-    there = set(held.splitlines(True))  # also if this is done once more, after a kill
-    write_atomically(file, held + "".join(line for line in map(_line, records) if line not in there))
+    before = file.read_text("utf-8") if file.exists() else ""
+    lines = set(before.splitlines(True))  # these are there already if a kill came after this
+    write_atomically(file, before + "".join(line for line in map(_line, records) if line not in lines))
 
 
 def _line(record: Record) -> str:

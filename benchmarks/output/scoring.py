@@ -13,6 +13,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT, REFERENCES
 from deconfounded.envs.streams import Array
 
+EXACTLY = 6  # decimals of what tables round to two: rounded to four before, .634985 would be .64
 VERSION = 3  # raised when the same records come to other figures
 
 
@@ -130,9 +131,9 @@ def summarise(
             "deployment": seeds[0]["deployment"],
             "seeds": [record["seed"] for record in seeds],
             "return": returns[:, :episodes].round(4).tolist(),
-            "score": scores[:, :episodes].mean(0).round(6).tolist(),  # to four, .544963 would be .55 in a table
-            **{f"score_{end}": round(float(measures[end].mean()), 6) for end in ("first", "last")},
-            "regret": round(float(measures["regret"].mean()), 6),
+            "score": scores[:, :episodes].mean(0).round(EXACTLY).tolist(),
+            **{f"score_{end}": round(float(measures[end].mean()), EXACTLY) for end in ("first", "last")},
+            "regret": round(float(measures["regret"].mean()), EXACTLY),
             "ci95": None if band is None else band[episodes - 1].tolist(),
             "ci95_first": None if band is None else band[0].tolist(),
             "ci95_regret": None if intervals is None else intervals[-1].tolist(),

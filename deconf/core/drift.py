@@ -21,6 +21,13 @@ def split_episodes(trials: Trials) -> Trials:
     return Trials(obs, action, trials.mask.reshape(-1, 1, trials.mask.shape[2]), trials.actions)
 
 
+def episodes_of(trials: Trials) -> Trials:
+    """Each episode that took place as a trial of its own; some trials may have fewer than others."""
+    split = split_episodes(trials)
+    took_place = split.mask.any((1, 2))
+    return Trials(split.obs[took_place], split.action[took_place], split.mask[took_place], split.actions)
+
+
 @torch.no_grad()
 def choose_kept(model: LatentModel, episodes: Batch, per_trial: int, draws: Draws) -> None:
     """Set `kept` of each seed's model to the share of highest likelihood on episodes [S, B E, T], E = per_trial."""

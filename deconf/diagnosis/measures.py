@@ -18,7 +18,7 @@ from torch import Tensor
 from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
-from deconfounded.deconf.core.drift import split_episodes
+from deconfounded.deconf.core.drift import episodes_of
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
@@ -160,13 +160,6 @@ def measure(
         findings = findings._replace(trait_gain=of_trial.gain, trait_stakes=stakes[0], paired_trait_stakes=stakes[1])
     report(1)
     return findings
-
-
-def episodes_of(trials: Trials) -> Trials:
-    """Each episode that took place as a trial of its own; some trials may have fewer than others."""
-    split = split_episodes(trials)
-    took_place = split.mask.any((1, 2))
-    return Trials(split.obs[took_place], split.action[took_place], split.mask[took_place], split.actions)
 
 
 def near(expert: Trials, explore: Trials) -> Trials:

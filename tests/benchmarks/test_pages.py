@@ -147,9 +147,9 @@ class TestStatistics:
         spread = statistics.over_tasks(statistics.iqm, {"a": np.array([0.0, 1.0])})  # 0, .5 or 1, of odds 1 to 2 to 1
         assert spread is not None
         assert (spread.value, spread.interval) == (0.5, (0, 1))
-        one = statistics.over_tasks(statistics.iqm, {"a": np.array([0.5]), "b": np.array([0.8, 0.9])})
-        assert one is not None
-        assert one.interval is None, "of a task with one seed nothing can be drawn anew"
+        of_few = statistics.over_tasks(statistics.iqm, {"a": np.array([0.5]), "b": np.array([0.8, 0.9])})
+        assert of_few is not None
+        assert of_few.interval is None, "of a task with one seed nothing can be drawn anew"
         lone = statistics.over_tasks(statistics.improvement, scores, {"b": np.array([2.0]), "a": np.array([])})
         assert lone is not None
         assert (lone.value, lone.n) == (0, 4)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.drift import episodes_of
 from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import Inputs, Scales
@@ -158,7 +159,7 @@ def test_episodes_that_did_not_take_place() -> None:
     trials = world(0.2, True, 6, 0, 4)
     mask = trials.mask.copy()
     mask[1:, 2:] = False
-    episodes = measures.episodes_of(Trials(trials.obs, trials.action, mask))
+    episodes = episodes_of(Trials(trials.obs, trials.action, mask))
     assert len(episodes) == 4 + 5 * 2
     assert episodes.mask.any((1, 2)).all()
     np.testing.assert_array_equal(episodes.action[:4, 0], trials.action[0])

@@ -152,8 +152,8 @@ class TestExploration:
 
     def test_trials_that_begin_one_by_one(self) -> None:
         """As in a program that has one environment: every other one is blind, of all that begin."""
-        one = Draws([np.random.default_rng(0)], "cpu")
-        agent = DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 1), one)
+        of_one_seed = Draws([np.random.default_rng(0)], "cpu")
+        agent = DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 1), of_one_seed)
         made, blind = Explorer(agent, torch.full((1, 4, 3), 7.0), 0.1), []
         for _ in range(6):
             made.begin(1)
