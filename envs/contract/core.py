@@ -5,7 +5,7 @@
 
 A check returns nothing; or it raises AssertionError or InputError with a message, or Skipped if it does not apply or
 cannot be made here. Checks use the task alone, not the registry. Those of interfaces are in protocols.py, those of
-MuJoCo tasks in physics.py.
+densities in densities.py, those of MuJoCo tasks in physics.py.
 """
 
 import re
@@ -16,7 +16,7 @@ import numpy as np
 
 from deconfounded.envs.adapters import GymEnv, GymVectorEnv
 from deconfounded.envs.batch import BatchEnv
-from deconfounded.envs.contract import physics, protocols
+from deconfounded.envs.contract import densities, physics, protocols
 from deconfounded.envs.contract.probe import (
     Skipped,
     actions,
@@ -29,7 +29,7 @@ from deconfounded.envs.contract.probe import (
     streams,
 )
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.task import Array, Task
+from deconfounded.envs.task import Task
 
 STARTS = 12
 
@@ -223,72 +223,6 @@ def reset_options(task: Task) -> None:
         GymEnv(task).step(env.action_space.sample())
 
 
-def _noise(task: Task, m: int) -> Array:
-    return np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
-
-
-def _density_ratio(what: str, fall: Array, pair: str) -> None:
-    """Densities q / p = exp(-fall) at draws from p have mean 1, and are not all the same. what, pair: for messages."""
-    ratio = np.exp(-fall)
-    off, error = abs(ratio.mean() - 1), ratio.std() / np.sqrt(len(ratio))
-    require(off < 4 * error + 1e-9, f"{what}: the mean ratio of densities is {ratio.mean():.4f}, not 1")
-    require(error > 0, f"{what} is the same for two {pair}")
-
-
-def log_prob_is_the_density_of_the_noise(task: Task) -> None:
-    """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
-    needs_likelihood(task)
-    m, (first, *rest) = 4000, task.latents
-    low, high = first.grid(9)[[0, -1]]
-    near = high if first.distribution == "categorical" else low + 0.03 * (high - low)
-    batch, action = BatchEnv(task, 2), np.repeat(actions(task, 1, 1)[0], 2, 0)
-    batch.reset([0, 0], {"theta": [[value, *(lat.low for lat in rest)] for value in (low, near)]})
-    p, q = np.split(batch.simulator.outcome(batch.state, action), 2)
-    if (p == q).all():  # theta has no effect here: use another action's outcome
-        q = batch.simulator.outcome(batch.state, 0.8 * action)[1:]
-    if isinstance(task, MujocoTask):  # at most one standard deviation off, so that the ratio's variance is finite
-        distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
-        q = p + (q - p) / max(1, distance[0])
-    drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
-    ratio = task.log_prob(drawn, p) - task.log_prob(drawn, q)
-    _density_ratio(f"log_prob of {task.name}", ratio, "outcomes that differ")
-    if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate
-        fall = task.log_prob(p, p) - task.log_prob(drawn, p)
-        right, bound = task.noise.size / 2, 4 * fall.std() / np.sqrt(m)
-        message = f"log_prob of {task.name} falls by {fall.mean():.3f} under its own noise; it must be {right:g}"
-        require(abs(fall.mean() - right) < bound, message)
-
-
-def log_sense_is_the_density_of_the_readings(task: Task) -> None:
-    """Log_sense is normalised, and is the density of what sensors read, under two nearby thetas in 4,000 states.
-
-    A task that states that theta moves no state must hold to it, and have readings that depend on theta.
-    """
-    needs_likelihood(task)
-    batch, m = BatchEnv(task, 50), 4000
-    thetas = task.theta_grid(9)[[0, -1]]
-    batch.reset(0)
-    action = actions(task, 1, 1)[0]
-    outcomes = task.outcome(np.repeat(batch.state[:1], 2, 0), np.repeat(action, 2, 0), thetas)
-    if not task.moves_state:
-        same(outcomes[1], outcomes[0], f"outcomes of thetas {thetas.tolist()}, which is said to move no state,")
-    state = np.zeros((0, batch.state.shape[1]))
-    for action in actions(task, batch.n, m // batch.n):
-        batch.step(action)
-        state = np.concatenate([state, batch.state])
-    drawn = task.sense(state.copy(), np.repeat(thetas[:1], m, 0), _noise(task, m))
-    if (drawn == state).all():
-        require(task.moves_state, f"theta of {task.name} moves no state, and its sensors read nothing")
-        raise Skipped("this task has no sensors of theta")
-    near = thetas[1]
-    for _ in range(30):  # until the ratio's variance is small
-        fall = task.log_sense(drawn, thetas[0]) - task.log_sense(drawn, near)
-        if fall.mean() < 0.3:
-            break
-        near = thetas[0] + (near - thetas[0]) / 2
-    _density_ratio(f"log_sense of {task.name}", fall, "thetas")
-
-
 CONTRACT: dict[str, Callable[[Task], None]] = {
     check.__name__: check
     for check in (
@@ -296,8 +230,8 @@ CONTRACT: dict[str, Callable[[Task], None]] = {
         *(no_leak, effect, privileged_view, keep_theta, theta_follows_its_distribution),
         *(any_batch_size, seed_streams, seed_kinds, forced_theta_moves_nothing_else),
         *(starts_vary_and_nothing_is_constant, observations_share_no_memory),
-        *(theta_out_of_bounds, wrong_actions, reset_options, log_prob_is_the_density_of_the_noise),
-        log_sense_is_the_density_of_the_readings,
+        *(theta_out_of_bounds, wrong_actions, reset_options),
+        *densities.CHECKS,
         *physics.CHECKS,
     )
 }
