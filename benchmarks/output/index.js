@@ -24,9 +24,9 @@ const width = (box) => Math.max(Math.round(box.clientWidth), 280);
 function ticks(low, high, n) {
   const raw = (high - low) / n, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((k) => k * power).find((s) => s >= raw);
-  const found = [];
-  for (let x = Math.ceil(low / step - 1e-9) * step; x <= high + 1e-9 * step; x += step) found.push(+x.toPrecision(12));
-  return found;
+  const values = [];
+  for (let x = Math.ceil(low / step - 1e-9) * step; x <= high + 1e-9 * step; x += step) values.push(+x.toPrecision(12));
+  return values;
 }
 
 const nothing = (box) => { box.innerHTML = `<p class="soft">Nothing is chosen.</p>`; };
@@ -100,8 +100,8 @@ function dots(box, rows, o) {
 function adaptation(box, rows, o) {
   const longest = Math.max(...rows.map((r) => r.scores.length)), trained = rows[0].trained;
   if (longest === 1) {
-    const found = rows.slice().sort((a, b) => b.value - a.value).map((r) => ({ name: r.method, colour: D.methods[r.method].colour, value: r.value, interval: r.interval, said: `${r.method} ${two(r.value)}, ${range(r.interval)}, ${seeds(r.n)}` }));
-    return dots(box, found, { x: [-0.1, 1.1], label: "score of each method" });
+    const marks = rows.slice().sort((a, b) => b.value - a.value).map((r) => ({ name: r.method, colour: D.methods[r.method].colour, value: r.value, interval: r.interval, said: `${r.method} ${two(r.value)}, ${range(r.interval)}, ${seeds(r.n)}` }));
+    return dots(box, marks, { x: [-0.1, 1.1], label: "score of each method" });
   }
   const series = rows.map((r) => ({
     name: r.method, colour: D.methods[r.method].colour, dash: dash(r.method), strong: r.method === o.strong, r,
@@ -194,8 +194,8 @@ function chosen() {
   return { tasks, methods, tier, measure, rows: D.rows.filter((r) => tasks.includes(r.task) && methods.includes(r.method)) };
 }
 
-const heading = (table, key, label, cls = "") => {
-  const o = order[table], sorted = o.by === key ? ` aria-sort="${o.down ? "descending" : "ascending"}"` : "";
+const heading = (table, key, label, cls = "", down = order[table].down) => {
+  const sorted = order[table].by === key ? ` aria-sort="${down ? "descending" : "ascending"}"` : "";
   return `<th scope="col" class="${cls}"${sorted}><button data-table="${table}" data-key="${text(key)}">${label}</button></th>`;
 };
 const sorter = (value, down) => (a, b) => {
@@ -211,14 +211,14 @@ function matrix({ tasks, methods, tier, measure }) {
   const value = (m) => (by ? measured(where(by, m), measure)?.value : over[m] && iqm(over[m], measure)?.value);
   const share = (r) => (measure === "regret" ? 1 - r.regret.value / r.trained : measured(r, measure).value);
   const whole = (m) => over[m]?.tasks === D.over[tier].tasks.length;
-  const shown = methods.filter((m) => tasks.some((t) => where(t, m))).sort(sorter(value, down));
-  if (!by) shown.sort((a, b) => whole(b) - whole(a)); // what was run on some tasks alone is not to be compared
+  const listed = methods.filter((m) => tasks.some((t) => where(t, m))).sort(sorter(value, down));
+  if (!by) listed.sort((a, b) => whole(b) - whole(a)); // what was run on some tasks alone is not to be compared
   const groups = [...new Set(tasks.map((t) => tierOf[t]))];
   const starts = new Set(groups.map((g) => tasks.find((t) => tierOf[t] === g)));
   const first = (t) => (starts.has(t) ? "first" : "");
   let out = `<thead><tr><th></th><th></th>${groups.map((g) => `<th colspan="${tasks.filter((t) => tierOf[t] === g).length}">tier ${g}</th>`).join("")}</tr>
-    <tr><th scope="col">method <span class="tier">tier</span></th>${heading("matrix", "", "over tasks", "first")}${tasks.map((t) => heading("matrix", t, breakable(t), first(t))).join("")}</tr></thead><tbody>`;
-  for (const m of shown) {
+    <tr><th scope="col">method <span class="tier">tier</span></th>${heading("matrix", "", "over tasks", "first", down)}${tasks.map((t) => heading("matrix", t, breakable(t), first(t), down)).join("")}</tr></thead><tbody>`;
+  for (const m of listed) {
     const o = over[m];
     out += `<tr><th scope="row"><span class="name">${swatch(m)}<span>${breakable(m)}<span class="tier">${D.methods[m].tier}</span></span></span></th>`;
     out += o ? `<td class="first${whole(m) ? "" : " soft"}">${two(iqm(o, measure).value)}<small>${whole(m) ? range(iqm(o, measure).interval) : `${o.tasks} of ${D.over[tier].tasks.length} tasks`}</small></td>` : `<td class="first"></td>`;
@@ -243,7 +243,7 @@ const COLUMNS = [
   ["regret", "regret", (r) => r.regret.value, (r) => two(r.regret.value)],
   ["regret low", "interval", (r) => r.regret.interval && r.regret.interval[0], (r) => range(r.regret.interval)],
   ["n", "seeds", (r) => r.n, (r) => r.n],
-  ...D.compared.map((other) => [`vs ${other}`, `vs ${other}`, (r) => r.minus[other]?.value, (r) => (r.minus[other] ? `${signed(r.minus[other].value)} <span class="soft">(${r.minus[other].interval ? range(r.minus[other].interval) : ""}${r.minus[other].n < r.n ? `, ${seeds(r.minus[other].n)}` : ""})</span>` : "")]),
+  ...D.compared.map((other) => [`vs ${other}`, `vs ${other}`, (r) => r.minus[other]?.value, (r) => (r.minus[other] ? `${signed(r.minus[other].value)} <span class="soft">(${range(r.minus[other].interval)}${r.minus[other].interval && r.minus[other].n < r.n ? `, ${seeds(r.minus[other].n)}` : ""})</span>` : "")]),
   ["r2", "theta R2", (r) => r.r2.at(-1), (r) => (r.r2.length ? two(r.r2.at(-1)) : "")],
   ["return", "return", (r) => r.return, (r) => r.return.toFixed(1)],
   ["objective", "Eq. (1)", (r) => r.objective, (r) => r.objective.toLocaleString("en")],
@@ -254,30 +254,30 @@ const COLUMNS = [
 
 function all({ rows }) {
   const { by, down } = order.all, get = COLUMNS.find((c) => c[0] === by)[2];
-  const shown = rows.slice().sort((a, b) => b.value - a.value).sort(sorter(get, down));
+  const listed = rows.slice().sort((a, b) => b.value - a.value).sort(sorter(get, down));
   const head = COLUMNS.map(([key, label, , , cls]) => heading("all", key, text(label), cls === "left" ? "left" : "")).join("");
-  const body = shown.map((r) => `<tr>${COLUMNS.map(([, , , cell, cls]) => `<td class="${cls || ""}"${cls === "open" ? ` tabindex="0" data-task="${text(r.task)}" data-method="${text(r.method)}"` : ""}>${cell(r)}</td>`).join("")}</tr>`);
+  const body = listed.map((r) => `<tr>${COLUMNS.map(([, , , cell, cls]) => `<td class="${cls || ""}"${cls === "open" ? ` tabindex="0" data-task="${text(r.task)}" data-method="${text(r.method)}"` : ""}>${cell(r)}</td>`).join("")}</tr>`);
   at("all").firstElementChild.innerHTML = `<thead><tr>${head}</tr></thead><tbody>${body.join("")}</tbody>`;
 }
 
 // ---- over tasks ---------------------------------------------------------------------------------------------------
 
 function overTasks({ methods, tier, measure }) {
-  const { tasks, methods: found } = D.over[tier], whole = (f) => f.tasks === tasks.length;
-  const names = Object.keys(D.methods).filter((m) => methods.includes(m) && found[m] && D.methods[m].kind !== "reference");
+  const { tasks, methods: over } = D.over[tier], whole = (f) => f.tasks === tasks.length;
+  const names = Object.keys(D.methods).filter((m) => methods.includes(m) && over[m] && D.methods[m].kind !== "reference");
   const entry = (m, f, k) => ({ name: m + (k < tasks.length ? ` (${k})` : ""), colour: D.methods[m].colour, value: f.value, interval: f.interval, faint: k < tasks.length, said: `${m} ${two(f.value)}, ${range(f.interval)}, ${f.n} runs on ${k} of ${tasks.length} tasks` });
-  const few = names.filter((m) => !whole(found[m])).length, runs = extent(names.map((m) => found[m].iqm.n));
+  const few = names.filter((m) => !whole(over[m])).length, runs = extent(names.map((m) => over[m].iqm.n));
   at("over-what").textContent = `${tasks.length} task${tasks.length > 1 ? "s" : ""}${tier ? ` of tier ${tier}` : ""}` + (names.length ? "" : ".");
   if (names.length) at("over-what").textContent += `, ${runs[0] === runs[1] ? runs[0] : runs.join(" to ")} runs a method, a run being a seed of a task.` +
     (few ? " A method that was run on some of the tasks is faint, with their number in brackets, and not to be compared with the others." : "");
-  const best = names.slice().sort((a, b) => whole(found[b]) - whole(found[a]) || found[b].iqm.value - found[a].iqm.value);
-  const means = best.map((m) => entry(m, iqm(found[m], measure), found[m].tasks)), high = Math.max(1, ...means.map((r) => r.value));
+  const best = names.slice().sort((a, b) => whole(over[b]) - whole(over[a]) || over[b].iqm.value - over[a].iqm.value);
+  const means = best.map((m) => entry(m, iqm(over[m], measure), over[m].tasks)), high = Math.max(1, ...means.map((r) => r.value));
   at("iqm").previousElementSibling.textContent = `Interquartile mean: ${MEASURES[measure].toLowerCase()}`;
   dots(at("iqm"), means, { x: [-0.05 * high, 1.05 * high], label: "interquartile mean of each method" });
-  dots(at("improvement"), best.filter((m) => found[m].improvement).map((m) => entry(m, found[m].improvement, found[m].improvement.tasks)), { x: [0, 1], label: "probability of improvement over each method" });
+  dots(at("improvement"), best.filter((m) => over[m].improvement).map((m) => entry(m, over[m].improvement, over[m].improvement.tasks)), { x: [0, 1], label: "probability of improvement over each method" });
   const series = best.map((m) => ({
-    name: m, colour: D.methods[m].colour, dash: dash(m), f: found[m], points: D.thresholds.map((t, i) => [t, found[m].profile.value[i]]),
-    band: found[m].profile.interval && D.thresholds.map((t, i) => [t, found[m].profile.interval[0][i], found[m].profile.interval[1][i]]),
+    name: m, colour: D.methods[m].colour, dash: dash(m), f: over[m], points: D.thresholds.map((t, i) => [t, over[m].profile.value[i]]),
+    band: over[m].profile.interval && D.thresholds.map((t, i) => [t, over[m].profile.interval[0][i], over[m].profile.interval[1][i]]),
   }));
   lines(at("profile"), series, { x: extent(D.thresholds), y: [0, 1], h: 280, xlabel: "score", label: "performance profiles", said: (s, k) => `above ${two(s.points[k][0])}: ${Math.round(100 * s.points[k][1])}% of ${s.f.profile.n} runs on ${s.f.tasks} tasks` });
 }
