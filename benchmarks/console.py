@@ -157,8 +157,6 @@ def _from_outside(error: SystemExit) -> bool:
 
 def run_command(main: Callable[[], None], interrupted: str = "nothing was written") -> None:
     """Run a command. Bad input, or a full disk, ends it with a line and exit code 2, signal n with one and 128 + n."""
-    from deconfounded.envs.support.errors import InputError, error_line
-
     escape_output()
     signals = Stoppable()
     try:
@@ -166,6 +164,8 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
             main()
         return
     except (Exception, KeyboardInterrupt, SystemExit) as error:
+        from deconfounded.envs.support.errors import InputError, error_line  # here, as `deconf --help` does without
+
         if isinstance(error, SystemExit):
             if not _from_outside(error):
                 raise

@@ -6,7 +6,7 @@ Each name below is a module whose `main` reads the rest of the line; `deconf NAM
 import importlib
 import sys
 
-from deconfounded.benchmarks.console import ROOT, end, quiet_pipe, run_command, stop_at_once
+from deconfounded.benchmarks.console import ROOT, end, run_command, stop_at_once
 
 STUDIES = "benchmarks.studies."  # of a checkout alone: they make this repository's own pages
 EXTRAS = {"train": "train", "foreign": "foreign", "site": "docs"}  # of commands that need more than bench
@@ -43,16 +43,19 @@ COMMANDS = {  # name: module, what it does, what is said when it is interrupted
 }
 
 
+def print_help() -> None:
+    """What commands there are."""
+    print("usage: deconf COMMAND ...\n")
+    for command, (module, text, _) in COMMANDS.items():
+        print(f"  {command:11} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
+
+
 def main(*first: str) -> None:
     """Run a command; the command line is what is given here, and then this process's arguments."""
     stop_at_once()
     name, *arguments = [*first, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help"):
-        with quiet_pipe():
-            print("usage: deconf COMMAND ...\n")
-            for command, (module, text, _) in COMMANDS.items():
-                print(f"  {command:11} {text}{' (in a checkout)' * module.startswith(STUDIES)}")
-        return
+        return run_command(print_help)
     if name not in COMMANDS:
         end(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}")
     module, _, interrupted = COMMANDS[name]

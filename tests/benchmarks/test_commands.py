@@ -333,6 +333,15 @@ def test_a_closed_pipe_is_no_error(args: tuple[str, ...], code: int, unbuffered:
     assert (done.returncode, done.stderr) == (code, "")
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+@pytest.mark.parametrize("args", [("-m", "deconfounded", "--help"), ("benchmarks/run.py", "--list")])
+def test_a_full_disk_behind_the_output(args: tuple[str, ...]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, *args], cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert (done.returncode, done.stderr) == (2, "error: file: No space left on device\n")
+
+
 def test_another_closed_pipe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Such as that of a process of ours that is gone."""
 
