@@ -155,7 +155,8 @@ class Synthesis:
 
     Each trial has a latent of [S, B, D], and each episode's actions have another one. They are as long as the expert's
     trials, in episodes of at most `horizon` steps from starts [S, K, O]. An episode ends where it leaves the range of
-    the expert's observations: the dynamics were not trained there.
+    the expert's observations: the dynamics were not trained there. A column of at most two values there, a flag for
+    example, takes the nearer one, so that it ends no episode.
     """
 
     model: LinearModel | VariationalModel
@@ -172,7 +173,8 @@ class Synthesis:
         """As many trials, and their latents [S, n, D]."""
         model, policy, latents, starts, draws = self.model, self.policy, self.latents, self.starts, self.draws
         low, high = extent(self.expert.obs, self.expert.mask)
-        varies = low < high
+        ends = (low[:, None] == self.expert.obs) | (high[:, None] == self.expert.obs)
+        flag = (ends | (self.expert.mask[..., None] == 0)).all(2).all(1)[:, None]
         theta_hat = take(latents, draws.integers(latents.shape[1], n))
         obs, action_latent = starts[:, :1], latents[:, :1]  # replaced in the first step
         over = torch.ones(len(draws), n, 1, dtype=torch.bool, device=draws.device)
@@ -184,7 +186,7 @@ class Synthesis:
             action = policy.sample(torch.cat([model.inputs.obs(obs), action_latent], -1), draws)
             action = policy.signature.randomise(action, self.random_share, draws)
             next_obs = model.dynamics.sample(obs, action, theta_hat, draws)
-            next_obs = torch.where(varies, next_obs, low)
+            next_obs = torch.where(flag, torch.where(next_obs < (low + high) / 2, low, high), next_obs)
             steps.append((obs, action, next_obs))
             obs, over = next_obs, ((next_obs < low) | (next_obs > high)).any(-1, keepdim=True)
         obs, action, next_obs = (torch.stack(column, 2) for column in zip(*steps, strict=True))

@@ -332,10 +332,13 @@ def test_synthetic_episodes_end_outside_the_expert_range() -> None:
         assert {tuple(start) for start in acted[:, 1:][ended]} <= starts
 
 
-def test_synthetic_episodes_have_a_constant_column() -> None:
-    """It is what it was, and ends no episode."""
+@pytest.mark.parametrize("values", [(3.0, 3.0), (0.0, 1.0)])
+def test_synthetic_episodes_have_a_constant_column_and_a_flag(values: tuple[float, float]) -> None:
+    """Both have the values that they had, and end no episode."""
     trials, _ = demonstrations("tilted_cartpole", 4)
-    obs = np.concatenate([trials.obs, np.full_like(trials.obs[..., :1], 3)], -1)
+    column = np.random.default_rng(0).choice(np.float32(values), trials.obs[..., :1].shape)
+    column[:, :, 1:][~trials.mask] = 7  # padding
+    obs = np.concatenate([trials.obs, column], -1)
     trials = Trials(obs, trials.action, trials.mask)
     signature, draws = Signature.of(trials), Draws([np.random.default_rng(0)], "cpu")
     data, starts = Batch.of(trials, 1), torch.tensor(obs[:, :, 0]).reshape(1, -1, signature.obs)
@@ -343,7 +346,7 @@ def test_synthetic_episodes_have_a_constant_column() -> None:
     model = VariationalModel("evidence", 1, 8, scales, draws)
     policy_, latents = ActionHead(signature.obs + 1, 8, scales, draws), torch.zeros(1, 2, 1)
     synthetic, _ = Synthesis(model, policy_, latents, data, starts, trials.mask.shape[2], 0.1, draws)(8)
-    assert (synthetic.next_obs[..., -1] == 3).all()
+    assert {*synthetic.next_obs[..., -1].flatten().tolist()} == {*values}
     ended = (synthetic.obs[0, :, 1:] != synthetic.next_obs[0, :, :-1]).any(-1)
     assert ended.float().mean() < 0.9
 
