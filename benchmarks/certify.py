@@ -101,7 +101,8 @@ class EvidenceRecorder(ExpertAgent):
 def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, Array]:
     """Levels [J, L]; scores [J, J] of the expert under the row's theta, given the column's; mean returns [J, J].
 
-    Each row is scored by its own expert and its own random actions. Theta does not switch meanwhile.
+    Each row is scored by its own expert and its own random actions, and is NaN where these are as good: nothing is at
+    stake under that theta. Theta does not switch meanwhile.
     """
     task = task.without_switches()
     levels = np.unique(task.theta_grid(LEVELS), axis=0)
@@ -115,7 +116,8 @@ def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, 
     matrix = returns.reshape(j, j, trials).mean(-1)
     zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
     one = np.diag(matrix)[:, None]
-    return levels, (matrix - zero) / (one - zero), matrix
+    scores = np.full((j, j), np.nan)
+    return levels, np.divide(matrix - zero, one - zero, out=scores, where=one > zero), matrix
 
 
 def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
@@ -183,7 +185,7 @@ def certify(
     curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in policies.items()}
     measured = {
         "blind_bc": float(normalise(blind, zero, one).mean()),
-        "wrong_theta": float(matrix[far_pairs(task, levels)].mean()),
+        "wrong_theta": float(np.nanmean(matrix[far_pairs(task, levels)])),
         **{f"{name}_last": curves[name]["score"][-1] for name in ("conditional", "interventional")},
     }
     checks = {}
@@ -193,6 +195,7 @@ def certify(
     pairs = zip(recorder.estimates, recorder.truths, strict=True)
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
+    score = np.where(np.isnan(matrix), None, matrix).tolist()
     return {
         "task": task.name,
         "task_version": task.version,
@@ -204,7 +207,7 @@ def certify(
         **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
         "inferability": [inferability(task, *pair) for pair in pairs],
-        "stakes": {"levels": levels.tolist(), "score": matrix.tolist(), "return": raw.tolist()},
+        "stakes": {"levels": levels.tolist(), "score": score, "return": raw.tolist()},
         "trials": trials,
         "grid": len(recorder.grid.theta),
         **({"particles": PARTICLES} if many else {}),
@@ -228,11 +231,12 @@ def inferability(task: envs.Task, estimate: Array, truth: Array) -> dict[str, fl
 def picture(result: dict[str, Any], file: Path) -> None:
     """Stakes, exact policies and evidence on one page."""
     with panels(file, 1, 3, size=(13, 3.9)) as [[left, middle, right]]:
-        score, levels = np.array(result["stakes"]["score"]), result["stakes"]["levels"]
+        score, levels = np.array(result["stakes"]["score"], float), result["stakes"]["levels"]
         size, legible = (8, levels) if len(levels) < 9 else (4, [])
         for (i, j), value in np.ndenumerate(score):
             hue = "white" if value < 0.6 else "black"
-            left.text(j, i, f"{value:.2f}", ha="center", va="center", color=hue, fontsize=size)
+            number = "" if np.isnan(value) else f"{value:.2f}"
+            left.text(j, i, number, ha="center", va="center", color=hue, fontsize=size)
         alike = len(levels[0]) > 1 and all(len(set(level)) == 1 for level in levels)  # of patches
         ticks = ["\n".join(f"{x:.3g}" for x in (level[:1] if alike else level)) for level in legible]
         each = ", of each patch" * alike

@@ -433,9 +433,14 @@ def test_how_well_theta_is_inferred() -> None:
 
 
 def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
-    """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1."""
-    _, scores, returns = certify.stakes(PUSH, EXPERT, 32)
-    assert np.diag(scores) == pytest.approx(1)
+    """An expert that is told the opposite force leans the wrong way; one that is told the truth scores 1.
+
+    Where there is no force, random actions are as good as the expert's none, and there is no score.
+    """
+    levels, scores, returns = certify.stakes(PUSH, EXPERT, 32)
+    assert np.diag(scores) == pytest.approx([1, 1, np.nan, 1, 1], nan_ok=True)
+    assert np.isnan(scores[2]).all()
+    assert levels[2] == 0
     assert returns[0, -1] < 0.6 * returns[0, 0]
     assert returns[-1, 0] < 0.6 * returns[-1, -1]
 
