@@ -195,7 +195,7 @@ def certify(
     pairs = zip(recorder.estimates, recorder.truths, strict=True)
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
-    score = np.where(np.isnan(matrix), None, matrix).tolist()
+    score = [[None if np.isnan(value) else value for value in row] for row in matrix.tolist()]
     return {
         "task": task.name,
         "task_version": task.version,

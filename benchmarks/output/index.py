@@ -210,7 +210,7 @@ def answers(scores: Scores) -> list[str]:
 
 
 def _answer(scores: Scores, method: str, question: str) -> str | None:
-    """Whether a method's 95% interval overlaps or exceeds that of PEER, and whether it exceeds that of NAIVE."""
+    """Whether a method's 95% interval ends less than NEAR below that of PEER, and whether it exceeds that of NAIVE."""
     names = (method, NAIVE, PEER)
     tasks = [task for task, of in scores.items() if all(len(of.get(name, ())) > 1 for name in names)]
     if not tasks:
@@ -218,7 +218,7 @@ def _answer(scores: Scores, method: str, question: str) -> str | None:
     runs = {name: {task: np.array(list(scores[task][name].values())) for task in tasks} for name in names}
     means = {name: _figure(statistics.iqm, runs[name]) for name in names}
     (_, low, high), (_, _, naive), (_, peer, _) = means.values()
-    helps, enough = low > naive, high >= peer
+    helps, enough = low > naive, high >= peer - scoring.NEAR
     if peer <= naive or (enough and not helps):
         word = "It cannot be decided yet"
     else:

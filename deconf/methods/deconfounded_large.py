@@ -4,8 +4,9 @@
 so that each latent needs a dimension, or several where its effect is not linear. On `patchy_road` six latents show in
 six places: docs/baselines.md.
 
-The last round begins with new networks. Those of the earlier rounds were trained first on little exploration, most of
-it by random actions, and do not recover when they get more: warm starts generalise worse (Ash and Adams, 2020).
+On control tasks the last round begins with new networks. Those of the earlier rounds were trained first on little
+exploration, most of it by random actions, and do not recover when they get more: warm starts generalise worse (Ash and
+Adams, 2020).
 """
 
 from dataclasses import replace

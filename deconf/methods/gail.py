@@ -1,9 +1,9 @@
 """GAIL with memory, the published paper's baseline: PPO trains a recurrent policy on a discriminator's logit.
 
 A discriminator separates the expert's transitions (s, a, s') from the policy's own (Ho and Ermon, 2016). PPO's
-environments hide theta and the task's reward. They begin new trials each round, and a round takes the first 512 steps
-of each, so that the policy seldom trains in a trial's last episodes. It learns to match the expert's mixture over
-theta; it matches the expert under *this* theta only as far as transitions identify theta.
+environments hide theta and the task's reward. They begin new trials each round, of 512 steps in each environment: one
+whole trial or several, where episodes end early, and else the first episodes of one. It learns to match the expert's
+mixture over theta; it matches the expert under *this* theta only as far as transitions identify theta.
 
 RecurrentPPO is sb3-contrib's. An episode of PPO is a whole trial, so that the LSTM's state outlives the resets. PPO
 trains seeds one after another, each with random numbers of its own; discriminators are trained side by side.

@@ -93,6 +93,7 @@ def test_presets_are_what_tuning_chose() -> None:
     [
         *((0.95, 0.4, 1, "Yes"), (0.7, 0.4, 1, "It helps, but it is not enough"), (0.4, 0.4, 1, "No")),
         *((0.7, 0.4, 20, "It cannot be decided yet"), (0.95, 0.95, 1, "It cannot be decided yet")),
+        *((0.9, 0.4, 0.1, "Yes"), (0.88, 0.4, 0.1, "It helps, but it is not enough")),  # .03 below the other's interval
     ],
 )
 def test_answers(score: float, naive: float, spread: float, word: str) -> None:
