@@ -103,11 +103,11 @@ class TestPastActions:
         np.testing.assert_array_equal(*chosen)
 
     def test_dropout_is_for_training_alone(self) -> None:
-        """In training losses are random, and actions are multiplied by 0 or 2; elsewhere none is dropped."""
+        """In training losses are random, and of the actions a fifth is kept, times 5; elsewhere none is dropped."""
         draws = streams()
         batch = random_batch(draws, 50, 40)
         agent = ActionDropoutAgent.new(8, scales(batch), draws)
-        agent.dropout, state, seen = 0.5, agent.memory.start(50), []
+        agent.dropout, state, seen = 0.8, agent.memory.start(50), []
         embed = agent.memory._embed
 
         def spy(given: Batch) -> torch.Tensor:
@@ -118,8 +118,8 @@ class TestPastActions:
         first, second = (agent.loss(batch, batch.action, state)[0] for _ in range(2))
         assert (first != second).all()
         assert seen[0] is not None
-        assert seen[0].unique().tolist() == [0, 2]
-        assert seen[0].mean().item() == pytest.approx(1, abs=0.1)  # 2,000 draws; four standard errors
+        assert seen[0].unique().tolist() == pytest.approx([0, 5])
+        assert seen[0].mean().item() == pytest.approx(1, abs=0.2)  # 2,000 draws; four standard errors
         assert torch.equal(agent.held_out_loss(batch), agent.held_out_loss(batch))
         agent.begin(50)
         agent.remember(batch[:, :, 0])
