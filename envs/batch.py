@@ -66,17 +66,17 @@ class BatchEnv:
             raise InputError(f"reset options were {options!r}; they must be a dictionary")
         if unknown := set(options) - {"keep_theta", "theta"}:
             raise InputError(f"reset option {min(map(repr, unknown))} is unknown; there are keep_theta and theta")
-        keep, forced = self._keep_mask(options.get("keep_theta", False)), options.get("theta")
+        keep, forced = self._mask("keep_theta", options.get("keep_theta", False)), options.get("theta")
         if keep.any() and forced is not None:
             raise InputError("reset was given keep_theta and theta; give one of them")
-        first = not self.state.size
-        if keep.any() and first:
+        rows = self._all_rows if where is None else np.flatnonzero(self._mask("where", where))
+        if (keep & ~self.alive & (self._steps == 0))[rows].any():
             raise InputError("keep_theta was given before the first reset; reset once without it")
+        first = not self.state.size
         if forced is not None:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
-        rows = self._all_rows if where is None else np.flatnonzero(where)
         if not len(rows):
             return self.observe()
         theta_rng, start_rng, noise_rng, switch_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)
@@ -106,15 +106,15 @@ class BatchEnv:
         """Close what the simulator holds; another reset opens it again."""
         self.simulator.close()
 
-    def _keep_mask(self, keep: object) -> Mask:
+    def _mask(self, name: str, given: object) -> Mask:
         """True, False or booleans [N] -> booleans [N]. Raises InputError for anything else."""
         try:
-            mask = np.asarray(keep)
+            mask = np.asarray(given)
         except ValueError:  # rows of many lengths
-            mask = np.asarray(keep, object)
+            mask = np.asarray(given, object)
         if mask.dtype != bool or mask.shape not in ((), (self.n,)):
             right = f"True, False, or bool of shape ({self.n},), one for each environment"
-            raise InputError(f"keep_theta was {mask.dtype} of shape {mask.shape}; it must be {right}")
+            raise InputError(f"{name} was {mask.dtype} of shape {mask.shape}; it must be {right}")
         return mask if mask.shape else np.full(self.n, mask)
 
     def observe(self) -> Obs:

@@ -55,7 +55,8 @@ class GymSimulator(Simulator):
         """Reset by the seed in `start`, and go on with the random numbers of the seed in `noise`."""
         states = []
         for i, first, then in zip(rows.tolist(), start[:, 0], noise[:, 0, 0], strict=True):
-            env = self._envs[i] = self._envs[i] or self.box.make(self.theta[i])
+            if (env := self._envs[i]) is None:
+                env = self._envs[i] = self.box.make(self.theta[i])
             with part(self.box.name, "reset"):
                 obs, _ = self._values("reset", env.reset(seed=int(first)), "obs, info")
                 bits = env.unwrapped.np_random.bit_generator
@@ -67,8 +68,8 @@ class GymSimulator(Simulator):
         """The next state [M, S], after a step of each row's environment, whatever `state`: it holds its own."""
         after = np.zeros_like(state)
         for k, i in enumerate(range(len(self._envs)) if rows is None else rows.tolist()):
-            env = self._envs[i]
-            assert env is not None
+            if (env := self._envs[i]) is None:
+                raise InputError(f"step of {self.box.name} was called after close; reset once")
             with part(self.box.name, "step"):
                 values = "obs, reward, terminated, truncated, info"
                 obs, reward, over, cut, _ = self._values("step", env.step(self.box.raw(action[k])), values)

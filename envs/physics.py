@@ -26,7 +26,7 @@ STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
 
 def cores() -> int:
     """Number of threads to use: the cores that this process may run on, or OMP_NUM_THREADS if that is fewer."""
-    limit = os.environ.get("OMP_NUM_THREADS", "")
+    limit = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()  # "4,2": of nested levels
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(available, int(limit)) if limit.isdecimal() and int(limit) > 0 else available
 

@@ -202,7 +202,7 @@ class Task(ThetaModel, ABC):
         return self.changed(latents=tuple(replace(latent, switch=0.0) for latent in self.latents))
 
     def changed(self, **attributes: Any) -> Self:
-        """A copy of the task with other attributes."""
+        """A copy of the task with other attributes; it shares what was computed of the rest, such as the model."""
         other = copy.copy(self)
         other.__dict__.update(attributes)
         return other

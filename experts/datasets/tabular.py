@@ -44,18 +44,26 @@ def read_csv(file: Path) -> Table:
 
 def _header(file: Path) -> tuple[list[str], Iterator[list[list[str]]]]:
     """Names of columns, and blocks of rows. Raises InputError for a file that is no csv."""
-    try:
-        with file.open(newline="", encoding="utf-8-sig") as opened:
-            line = opened.readline()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{file} is no csv in UTF-8 ({error.reason} at byte {error.start})") from None
-    separator = max(",;\t", key=line.count)
-    names = [name.strip() for name in next(csv.reader([line], delimiter=separator), [])]
+    heads = {separator: _first_rows(file, separator) for separator in ",;\t"}
+    separator = max(heads, key=lambda each: (1 < len(heads[each][0]) == len(heads[each][1]), len(heads[each][0])))
+    names = [name.strip() for name in heads[separator][0]]
     if not any(names):
         raise InputError(f"{file} has no header; its first line must name the columns")
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(f"{file} has two columns that are called {min(twice)!r}; every name must be its own")
     return names, _blocks(file, separator, len(names))
+
+
+def _first_rows(file: Path, separator: str) -> tuple[list[str], list[str]]:
+    """The header and the first row, which hold as many cells if the separator is the file's; empty if there is none."""
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as opened:
+            reader = csv.reader(opened, delimiter=separator)
+            return next(reader, []), next(filter(None, reader), [])
+    except UnicodeDecodeError as error:
+        raise InputError(f"{file} is no csv in UTF-8 ({error.reason} at byte {error.start})") from None
+    except csv.Error as error:
+        raise InputError(f"{file} cannot be read near its first line: {error}") from None
 
 
 def _blocks(file: Path, separator: str, width: int) -> Iterator[list[list[str]]]:
@@ -129,9 +137,22 @@ def _arrays(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} cannot be read as parquet: {' '.join(str(error).split())}") from None
     if not len(data):
         raise InputError(f"{file} holds no rows")
-    return {
-        name: pyarrow.concat_arrays(column.chunks) for name, column in zip(data.column_names, data.columns, strict=True)
-    }
+    columns = zip(data.column_names, map(_plain, data.columns), strict=True)
+    return {name: pyarrow.concat_arrays(column.chunks) for name, column in columns}
+
+
+def _plain(column: Any) -> Any:
+    """A chunked array; dates as timestamps, times of a day as durations, and views of text as text."""
+    import pyarrow
+    from pyarrow import types
+
+    kind = column.type
+    if types.is_date(kind):
+        return column.cast(pyarrow.timestamp("ms"))
+    if types.is_time(kind):
+        whole = column.cast("int32" if types.is_time32(kind) else "int64").cast("int64")
+        return whole.cast(pyarrow.duration(kind.unit))
+    return column.cast("string") if types.is_string_view(kind) else column
 
 
 def _columns(arrays: dict[str, Any], parts: dict[str, list[str]] | None = None) -> dict[str, Column]:

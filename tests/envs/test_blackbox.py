@@ -152,6 +152,17 @@ def test_a_world_s_own_time_limit() -> None:
     assert discounts == [1.0] * 7
 
 
+def test_a_closed_world_takes_no_step() -> None:
+    """Until it is reset."""
+    env = BatchEnv(task_with(), 2)
+    env.reset(0)
+    env.close()
+    with pytest.raises(envs.InputError, match=r"^step of .* was called after close; reset once$"):
+        env.step(np.zeros((2, 1)))
+    env.reset(0)
+    env.step(np.zeros((2, 1)))
+
+
 def test_worlds_are_closed() -> None:
     """With their environment, or when nobody holds it any more."""
     task = task_of(Whole)()

@@ -117,6 +117,9 @@ class TestTrials:
                 envs.InputError, match=r"^keep_theta was .*must be True, False, or bool of shape \(3,\)"
             ):
                 vec.reset(options={"keep_theta": wrong})
+            if wrong is not None:
+                with pytest.raises(envs.InputError, match=r"^where was .*must be True, False, or bool of shape \(3,\)"):
+                    vec.batch.reset(where=wrong)  # type: ignore[arg-type]
         with pytest.raises(envs.InputError, match=r"must be True, False, or bool of shape \(1,\)"):
             env.reset(options={"keep_theta": np.ones(3, bool)})
         lows = [lat.low for lat in vec.task.latents]
@@ -124,6 +127,14 @@ class TestTrials:
             vec.reset(options={"keep_theta": [True, False, False], "theta": lows})
         with pytest.raises(envs.InputError, match="before the first reset"):
             envs.make_vec(name, 3).reset(options={"keep_theta": [False, False, True]})
+        begun = envs.make_vec(name, 3).batch
+        begun.reset(0, where=np.array([True, True, False]))
+        begun.reset(options={"keep_theta": np.array([True, True, False])})
+        assert begun.alive.all()
+        begun = envs.make_vec(name, 3).batch
+        begun.reset(0, where=np.array([True, True, False]))
+        with pytest.raises(envs.InputError, match="before the first reset"):
+            begun.reset(options={"keep_theta": True})
         with pytest.raises(
             envs.InputError, match=r"^the number of episodes was 0; it must be a whole number from 1 up$"
         ):

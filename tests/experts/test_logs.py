@@ -339,6 +339,16 @@ class TestNames:
         assert log.names == tuple(names)
         assert log.mask.shape == (len(names), 1, 2)
 
+    @pytest.mark.parametrize("separator", [",", ";", "\t"])
+    def test_csv_of_quoted_names(self, separator: str, tmp_path: Path) -> None:
+        """Separators and line breaks in them separate nothing."""
+        names = ["speed, in m/s; or none\tof it", "a,b,c,d,e,f", "u\nv"]
+        made = [{**dict(zip(names, (t, t, t / 10), strict=True)), "run": t // 3} for t in range(6)]
+        file = write_csv(tmp_path / "x.csv", made, separator)
+        log = datasets.read(file, trial="run", obs=names[:2], action=names[2:])
+        assert (log.units.obs, log.units.action) == (tuple(names[:2]), tuple(names[2:]))
+        assert log.obs[1, 0, :, 1].tolist() == [3, 4, 5]
+
     def test_csv_of_plain_numbers(self, tmp_path: Path) -> None:
         """1.0 and 1 are one number."""
         made = [
@@ -386,6 +396,19 @@ class TestNames:
         columns = {name: pyarrow.array(ticks, kind) for name, kind in zip(("at", "took"), kinds, strict=True)}
         read = parquet_columns(write_parquet(tmp_path / "times.parquet", columns))
         assert {name: x.tolist() for name, x in read.items()} == {"at": [0, 2, 5], "took": [0, 2, 5]}
+
+    def test_days_times_of_a_day_and_views_of_text(self, tmp_path: Path) -> None:
+        """Both are seconds; names of trials are whole."""
+        pyarrow, day = pytest.importorskip("pyarrow"), 24 * 3600
+        columns = {
+            "day": pyarrow.array([19000, 19001, 19003], pyarrow.date32()),
+            "hour": pyarrow.array([7200, 7205, 3600], pyarrow.time32("s")),
+            "run": pyarrow.array(["a", "b", "a"], pyarrow.string_view()),
+        }
+        read = parquet_columns(write_parquet(tmp_path / "x.parquet", columns))
+        assert {name: x.tolist() for name, x in read.items()} == {
+            **{"day": [0, day, 3 * day], "hour": [3600, 3605, 0], "run": ["a", "b", "a"]}
+        }
 
     def test_times_of_several_files(self, tmp_path: Path) -> None:
         """A trial that is named by when it began: times are not counted from each file's own first."""
