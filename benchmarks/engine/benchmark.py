@@ -17,6 +17,7 @@ from deconfounded.benchmarks.engine.job_files import in_name
 from deconfounded.benchmarks.engine.jobs import Job, JobMonitor
 from deconfounded.benchmarks.engine.provider import deployed, fit
 from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.core.monitor import Training
 from deconfounded.deconf.equations import imitation_objective
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import Array
@@ -107,6 +108,11 @@ class CurveMonitor(JobMonitor):
                 self.kept.setdefault(kind, []).append((done, loss))
                 if self.writer is not None:
                     self.writer.add_scalar(f"loss/{kind}", loss, done)
+
+    def load(self) -> Training | None:
+        training = super().load()
+        self.noted = max((points[-1][0] for points in self.kept.values()), default=0)
+        return training
 
     def close(self) -> float:
         if self.writer is not None:

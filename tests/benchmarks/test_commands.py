@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -25,6 +26,7 @@ from deconfounded.__main__ import COMMANDS
 from deconfounded.benchmarks import certify, data
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, scheduler
+from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS
 from deconfounded.benchmarks.output import film, records, scoring
@@ -490,11 +492,13 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         assert kept() == ["bandit.webp"]
     file.write_text(whole)
     (run / "video.mp4").unlink()
-    for text in ("{}", "[", '{"task": "bandit"}', certificate.read_text().replace('"passed"', '"<script>"', 1)):
+    fine = certificate.read_text()
+    changed = [fine.replace(*change) for change in (('"passed"', '"<script>"', 1), ('_version": 0', '_version": 9'))]
+    for text in ("{}", "[", '{"task": "bandit"}', *changed):
         certificate.write_text(text)
         with pytest.raises(envs.InputError, match=r"bandit.json is no certificate of bandit v0"):
             publish.keep(run)
-    certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
+    certificate.write_text(fine)
     (run / "video.mp4").symlink_to("/etc/passwd")
     with pytest.raises(envs.InputError, match=r"video.mp4 is a link"):
         publish.keep(run)
@@ -509,6 +513,23 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert (docs / "records" / "bandit.jsonl").read_text() == whole
     with pytest.raises(envs.InputError, match="holds no records"):
         publish.keep(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"preset": "paper"}, {"set": ["eval_trials=9"]}, {"salt": "x"}, {"protocol_name": "once"}]
+)
+def test_publish_refuses_what_pages_do_not_show(
+    change: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run of other amounts, thetas or protocol than theirs."""
+    run, docs = tmp_path / "run", tmp_path / "docs"
+    shown = records.of_task(ROOT / "docs" / "records", "bandit")
+    records.write(run / "records", [{**record, **change} for record in shown if record["method"] in REFERENCES])
+    (run / "adaptation.png").write_bytes(b"a picture")
+    monkeypatch.setattr(publish, "DOCS", docs)
+    with pytest.raises(envs.InputError, match="pages show the default preset and the standard protocol alone"):
+        publish.keep(run)
+    assert not docs.exists()
 
 
 @pytest.mark.slow

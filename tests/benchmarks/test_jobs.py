@@ -14,13 +14,16 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import benchmark, job_files, jobs, progress, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.studies import paper
 from deconfounded.benchmarks.studies.paper import FigureJob
+from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.methods import naive_rnn, references
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.experts.agent import Agent
+from deconfounded.experts.agent import Agent, ExpertAgent
+from deconfounded.experts.rollout import run_trials
 
 
 def settings(name: str, fresh: bool) -> Any:
@@ -97,6 +100,68 @@ def test_interrupted_training_goes_on(
         }
         assert len(resumed["meta"]["spans"]) == 2
     assert not list(broken.folder.glob(".*.pt"))
+
+
+def test_cpu_seconds_are_those_before_an_interruption_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven until the checkpoint and two in the process that went on are nine."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr(jobs.time, "process_time", iter([100.0, 107.0, 0.0, 2.0]).__next__)
+    job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
+    CurveMonitor(job, 0.8).save(lambda: {"done": 3})
+    resumed = CurveMonitor(job, 0.8)
+    assert resumed.load() == {"done": 3}
+    assert resumed.cpu() == 9
+
+
+def test_a_checkpoint_is_written_once_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A minute after the job began at the earliest, and then after the checkpoint before."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    now, written = 0.0, []
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: now)
+    monitor = CurveMonitor(BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path), 0.8)
+    for now in (30.0, 61.0, 62.0, 90.0, 122.0):
+        monitor.save(lambda: {"done": 3})
+        if monitor.file.exists():
+            monitor.file.unlink()
+            written.append(now)
+    assert written == [61, 122]
+
+
+def test_a_resumed_curve_is_of_the_same_updates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every tenth of 4000, wherever the job was interrupted."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
+    job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
+    begun, resumed = CurveMonitor(job, 0.8), CurveMonitor(job, 0.8)
+    for done in range(1, 26):
+        begun.update(done, 4000, {"imitation": 1 / done})
+    begun.save(lambda: {"done": 25})
+    assert resumed.load() == {"done": 25}
+    for monitor in (begun, resumed):
+        for done in range(26, 61):
+            monitor.update(done, 4000, {"imitation": 1 / done})
+        assert monitor.kept == {"imitation": [(done, 1 / done) for done in (10, 20, 30, 40, 50, 60)]}
+
+
+def test_held_out_trials_are_no_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loss of figure 3c is of expert trials that are neither imitated nor of those that agents are scored in."""
+    watched: list[Any] = []
+
+    def stop(self: paper.FigureMonitor, *given: Any) -> None:
+        watched.extend(given)
+        raise InterruptedError
+
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(paper.FigureMonitor, "watch", stop)
+    with pytest.raises(InterruptedError):
+        FigureJob("bandit", settings("bandit", False), "naive_rnn", (0, 1), tmp_path).run()
+    context, held_out, _ = watched
+    seeds = [stream(EVALUATION, seed) for seed in context.seeds]
+    scored = run_trials(context.env, ExpertAgent(context.env, context.expert), 1, seeds).trials
+    every = [Batch.of(trials, 2).obs for trials in (context.demonstrations, scored)]
+    payouts = [row.numpy().tobytes() for obs in (held_out.obs, *every) for row in obs.flatten(0, 1)]
+    assert len(payouts) == len(set(payouts)) == 3 * 2 * 8
 
 
 @pytest.mark.slow

@@ -99,6 +99,23 @@ class Told(Here):
                 say(job, error)
 
 
+class Failing(BenchmarkJob):
+    """It leaves a checkpoint, and no more."""
+
+    def run(self) -> str:
+        self.checkpoint.touch()
+        raise envs.InputError("out of memory")
+
+
+def test_a_failed_job_s_checkpoint_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that the same command goes on from there."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    job = Failing("bandit", tiny_preset(), "blind_bc", (0,), tmp_path)
+    _, _, failed = scheduler.run_all([job], "cpu", "failing", Told())
+    assert [str(error) for error in failed] == ["out of memory"]
+    assert job.checkpoint.exists()
+
+
 class Noting(Here):
     """It notes the methods whose jobs it runs."""
 

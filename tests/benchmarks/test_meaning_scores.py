@@ -21,12 +21,13 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.output import aggregation, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
+from deconfounded.deconf import learned_reference
 from deconfounded.deconf.exact import Grid
 from deconfounded.deconf.methods import memoryless_bc
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import run_trials, thetas
+from deconfounded.experts.rollout import Rollout, run_trials, thetas
 from deconfounded.experts.trials import Trials
 from tests import toys
 from tests.tools import tiny_preset
@@ -503,3 +504,19 @@ def test_a_certificate_s_scores_are_of_its_returns(monkeypatch: pytest.MonkeyPat
         assert certificate[name]["score"] == pytest.approx(scores)
         assert certificate["checks"][f"{name}_last"]["measured"] == pytest.approx(scores[-1], abs=1e-4)
     assert certificate["checks"]["blind_bc"]["measured"] == 0
+
+
+def test_learned_dynamics_are_of_other_thetas_than_a_certificate_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[Array] = []
+
+    def stop(rollouts: list[Rollout], which: Any) -> None:
+        trained.extend(rollout.theta for rollout in rollouts)
+        raise InterruptedError
+
+    monkeypatch.setattr(learned_reference, "steps", stop)
+    monkeypatch.setattr(toys.Push, "has_likelihood", False)
+    with pytest.raises(InterruptedError):
+        certify.certify(PUSH, EXPERT, trials=12)
+    assert len(trained) == 3
+    scored = thetas(PUSH, 12, certify.EPISODES, certify.SEED)
+    assert not np.isin(np.concatenate(trained), scored).any()

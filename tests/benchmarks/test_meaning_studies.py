@@ -33,7 +33,7 @@ from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.rollout import of_steps, run_trials
 from tests import toys
 from tests.tools import deconf, tiny_preset
 
@@ -147,6 +147,19 @@ class TestCertificates:
         ratio = 0.5 * ((apart / PUSH.std[1]) ** 2 + (0.5 * apart / PUSH.std[0]) ** 2).mean()
         assert np.concatenate(recorder.dynamics).mean() == pytest.approx(ratio, rel=0.2)
 
+    def test_evidence_is_of_the_steps_that_took_place(self) -> None:
+        """That of actions: the mean over them of what the expert's log-likelihood is above that under the grid."""
+        env = envs.BatchEnv(PUSH, 64)
+        grid = Grid(env, EXPERT, 5)
+        recorder = certify.EvidenceRecorder(env, EXPERT, grid)
+        trials, _, theta = run_trials(env, recorder, 1, 0)
+        mask = trials.mask
+        obs, action = trials.obs[:, :, :-1][mask], trials.action[mask].astype(float)
+        expert = EXPERT.log_prob(obs, action, of_steps(theta, mask.shape[2])[mask])
+        assert mask.mean() < 0.9
+        evidence = (expert[:, None] - grid.log_policy(obs, action)).mean()
+        assert np.concatenate(recorder.actions).mean() == pytest.approx(evidence, rel=1e-3)
+
 
 class TestCommands:
     """Settings of the command line reach what they are of."""
@@ -177,6 +190,17 @@ class TestCommands:
         monkeypatch.setattr(scheduler, "run_all", seen)
         with pytest.raises(Stopped):
             verify.rerun(record, envs.get("curling"), "naive_rnn", None, "cpu")
+
+    def test_a_deployment_is_verified_by_its_own_record(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of the deployments of an agent, which are all made again."""
+        (record, *_) = [r for r in records.of_task(RECORDS, "curling") if r["deployment"] == "mode"]
+        made = [{**record, "deployment": way} for way in ("", "episode", "mode")]
+        monkeypatch.setattr(scheduler, "run_all", lambda *_: ([], 0, []))
+        monkeypatch.setattr(records, "of_run", lambda *_: made)
+        assert verify.rerun(record, envs.get("curling"), record["method"], None, "cpu") == record
+        made.pop()
+        with pytest.raises(envs.InputError, match=f"left no {records.named(record)} to compare with"):
+            verify.rerun(record, envs.get("curling"), record["method"], None, "cpu")
 
     def test_another_range_is_scored(self) -> None:
         """All three agents are in it; the expert has less force there to act against than in the whole range."""

@@ -133,7 +133,10 @@ class TestDrift:
         assert self.off(trials, labels, kept[0].theta) == pytest.approx([0.1, 0.1], abs=0.02)
         assert self.off(trials, labels, kept[0].theta[:, ::-1])[1] > 0.15
 
-    def test_thetas_of_demonstrations(self, context: Context) -> None:
+    @pytest.mark.parametrize("salt", ["", "salt"])
+    def test_thetas_of_demonstrations(self, salt: str, context: Context) -> None:
+        """Those of a guest too, whose data is salted."""
+        context.salt = salt
         trials, theta = context.demonstrations, context.demonstrated_theta
         assert self.off(trials, trials.action, theta) == pytest.approx([0.1, 0.1], abs=0.02)
         assert self.off(trials, trials.action, theta[:, ::-1])[1] > 0.15

@@ -902,6 +902,22 @@ class TestPlay:
             for x, y in zip(one, other, strict=True):
                 np.testing.assert_array_equal(x, y)
 
+    def test_all_episodes_are_under_the_trial_s_theta(self) -> None:
+        """That which was drawn by the seed, or given."""
+        env, thetas = envs.GymEnv(toys.Push()), list[float]()
+
+        class Noting(RandomAgent):
+            def reset(self, rngs: Sequence[np.random.Generator]) -> None:
+                super().reset(rngs)
+                thetas.append(env.batch.theta.item())
+
+        agent = Noting(env.task.action_space)
+        for seed, theta in ((5, None), (6, None), (6, [0.25])):
+            play.play(agent, env, 3, seed, theta)
+        first, second = thetas[0], thetas[3]
+        assert thetas == [first] * 3 + [second] * 3 + [0.25] * 3
+        assert first != second
+
 
 class TestSentences:
     """What is used out of order, or is not what it should be, is told in a line."""
@@ -950,6 +966,7 @@ class TestSentences:
         ("seeds=-1", "--set seeds was '-1'"),
         ("naive_rnn.cooled=1", "must be like true"),
         ("seeds=0", "must be like 3"),
+        ("eval_trials=3", "must be like 128, and at least 4"),
         ("blind_bc.learning_rate=NaN", "must be like"),
         ("blind_bc.device=tpu", "amount 'blind_bc.device' is unknown"),
     ],

@@ -70,6 +70,26 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert lines[6:8] == ["| palr | a | 0.20 | 5 |  |", "| gail | a | 0.20 | 5 |  |"]
 
 
+@pytest.mark.parametrize("older", [{"method_version": -1}, {"task_versions": {}}, {"amounts": {}}])
+def test_tuning_goes_on_with_what_is_not_of_today(
+    older: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A setting's scores are done if they are of today's versions and amounts."""
+    today = {task: tune.began(preset("default", envs.get(task), "cpu")).configs["gail"] for task in tune.TASKS}
+    row = {"method": "gail", "setting": "the preset", "amounts": today, "method_version": METHODS["gail"].version}
+    row["task_versions"] = {task: envs.get(task).version for task in tune.TASKS}
+    monkeypatch.setattr(tune, "DOCS", tmp_path)
+    monkeypatch.setattr(tune, "TRIED", {"gail": ()})
+    monkeypatch.setattr(tune.runs, "run", Mock(side_effect=InterruptedError))
+    monkeypatch.setattr("sys.argv", ["tune", "--methods", "gail", "--out", str(tmp_path / "tuning")])
+    tune.keep(row, tmp_path / "tuning.json")
+    tune.main()
+    assert "gail, the preset: it is in tuning.json" in capsys.readouterr().out
+    tune.keep({**row, **older}, tmp_path / "tuning.json")
+    with pytest.raises(InterruptedError):
+        tune.main()
+
+
 def test_presets_are_what_tuning_chose() -> None:
     """Today's preset is the setting that docs/tuning.json says, which can be tried again."""
     rows = json.loads((DOCS / "tuning.json").read_text())["rows"]
@@ -197,6 +217,12 @@ class TestCurves:
         mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5]}
         assert scoring.mean_curve([seed_0, seed_1]) == {"a": mean}
         assert scoring.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
+
+    def test_losses_of_other_updates_are_not_averaged(self) -> None:
+        """Of seeds whose losses were noted at other updates, the curve is that of the first and those like it."""
+        seed_0, seed_1 = ({"a": {"update": [10, 20], "loss": loss}} for loss in ([1.0, 2.0], [3.0, 6.0]))
+        fewer, apart = ({"a": {"update": update, "loss": [9.0] * len(update)}} for update in ([10], [11, 21]))
+        assert scoring.mean_curve([seed_0, fewer, apart, seed_1]) == {"a": {"update": [10, 20], "loss": [2, 4]}}
 
     def test_records(self) -> None:
         """A record has a curve of its training, and needs none."""

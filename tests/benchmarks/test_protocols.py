@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import compare
+from deconfounded.benchmarks import compare, report
 from deconfounded.benchmarks.engine import progress, protocols
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.catalogue import METHODS
@@ -21,6 +21,7 @@ from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import aggregation, comparison, records
 from deconfounded.benchmarks.studies import table
 from deconfounded.envs.streams import Array, Streams
+from deconfounded.envs.support.files import write_sealed
 from deconfounded.experts.agent import RandomAgent
 from tests import toys
 from tests.tools import deconf, tiny_preset
@@ -112,6 +113,16 @@ def test_trials_of_one_episode() -> None:
     assert envs.get("rolling_deck").episodes == protocols.applied("scarce", envs.get("rolling_deck")).episodes == 5
 
 
+def test_demonstrations_in_a_folder_are_of_their_protocol(tmp_path: Path) -> None:
+    """Those of the standard protocol are not taken for those without unseen thetas, which are as many and as long."""
+    standard, unseen = (context(PUSH, name) for name in ("standard", "unseen"))
+    standard.folder = unseen.folder = tmp_path
+    first = standard.demonstrations
+    assert standard.has_demonstrations(0)
+    assert not unseen.has_demonstrations(0)
+    assert unseen.demonstrations.sha256 != first.sha256
+
+
 def test_no_other_protocol_is_asked_of_a_task() -> None:
     """Not even what would not do under it."""
     odd = PUSH.changed(latents=("force",))
@@ -134,6 +145,21 @@ def test_a_job_s_record_names_its_protocol(tmp_path: Path, monkeypatch: pytest.M
     assert (
         replace(job, protocol="standard").unfit(0, data) == "it was made with another protocol_name (was once, is none)"
     )
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_report_is_of_the_run_s_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one episode where the run was, and not of as many as the task's trials have."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    (tmp_path / "jobs").mkdir()
+    for method in ("random", "expert"):
+        BenchmarkJob("weak_thruster", tiny_preset(), method, (0,), tmp_path / "jobs", protocol="once").run()
+    about = {"reference": "weak_thruster", "kind": "BenchmarkJob", "preset": "default", "set": []}
+    write_sealed(tmp_path / "settings.json", {**about, "protocol_name": "once"})
+    monkeypatch.setattr("sys.argv", ["report", str(tmp_path)])
+    report.main()
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert (results["protocol_name"], results["episodes"]) == ("once", 1)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +226,7 @@ class TestTables:
             comparison.gathered(once, ["naive_rnn"])
 
     def test_what_is_missing(self, both: tuple[list[Any], list[Any]]) -> None:
-        """A deployment without record, or a record of another protocol, is missing."""
+        """A deployment without record, or a record of another protocol or preset, is missing."""
         task = envs.get("curling")
         job = BenchmarkJob("curling", preset("default", task, "cpu", ["random"]), "random", (0, 1), Path())
         today = identity(job)
@@ -208,6 +234,7 @@ class TestTables:
         fresh = [one for one in fresh if one["method"] == "random"]
         assert table.missing(job, "default", fresh) == ()
         assert table.missing(replace(job, protocol="once"), "default", fresh) == (0, 1)
+        assert table.missing(job, "default", [{**record, "preset": "paper"} for record in fresh]) == (0, 1)
         way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
         assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
 

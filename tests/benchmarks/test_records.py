@@ -5,10 +5,12 @@ import platform
 import queue
 import shutil
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numpy as np
 import pytest
 
@@ -302,6 +304,15 @@ class TestRecords:
         assert records.read(tmp_path / "bandit.jsonl") == [newer]
         assert records.read(tmp_path / "superseded" / "bandit.jsonl") == [two, one]
 
+    def test_writers_take_turns(self, job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Nothing is written while another program writes; a lock that does not wait says so."""
+        monkeypatch.setattr(filelock, "FileLock", partial(filelock.FileLock, timeout=0))
+        with filelock.FileLock(tmp_path / ".lock"), pytest.raises(filelock.Timeout):
+            records.write(tmp_path, kept(job))
+        assert not (tmp_path / "bandit.jsonl").exists()
+        records.write(tmp_path, kept(job))
+        assert records.read(tmp_path / "bandit.jsonl") == kept(job)
+
     def test_names_of_many_seeds(self, job: BenchmarkJob) -> None:
         """They fit into a file's name, and groups of seeds have names of their own."""
         assert replace(job, seeds=(0, 1, 2)).checkpoint.name == ".blind_bc-0-1-2.pt"
@@ -399,7 +410,7 @@ class TestRecords:
             records.check({**record, **change}, "it")
         assert "\n" not in str(caught.value)
 
-    @pytest.mark.parametrize("key", ["task_version", "preset", "salt", "eval_trials", "expert"])
+    @pytest.mark.parametrize("key", ["task_version", "preset", "set", "salt", "eval_trials", "episodes", "expert"])
     def test_never_mixed(self, job: BenchmarkJob, key: str) -> None:
         one, two = kept(job)
         with pytest.raises(envs.InputError, match=f"records with {key} .* do not belong in one table"):
@@ -454,6 +465,13 @@ class TestVerify:
         ):
             with pytest.raises(envs.InputError, match=says):
                 verify.pick(file, method, seed)
+
+    def test_of_another_version(self, job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of its task: that is no longer here to run."""
+        records.write(tmp_path, [{**kept(job)[0], "task_version": 9}])
+        monkeypatch.setattr("sys.argv", ["verify", "bandit", "blind_bc", "0", "--records", str(tmp_path)])
+        with pytest.raises(envs.InputError, match="the record is of bandit v9; here is bandit v0"):
+            verify.main()
 
     def test_verdict(self, job: BenchmarkJob) -> None:
         record = {**kept(job)[0], "eval_trials": 100, "returns": [20.0], "returns_sd": [4.0]}

@@ -159,6 +159,16 @@ def test_the_calls_are_those_of_the_library(
     inspect.signature(real.CommitOperationAdd).bind("README.md", b"")
 
 
+def test_what_is_fetched_is_of_the_revision_that_was_asked_for(
+    agent: Path, hub: Hub, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Its commit is looked up, and the files are those of that commit."""
+    assert call(monkeypatch, push, agent, "me/x") == 0
+    assert call(monkeypatch, pull, "me/x", "--out", tmp_path / "x", "--revision", "audited") == 0
+    revisions = {name: options["revision"] for name, _, options in hub.calls if "revision" in options}
+    assert revisions == {"repo_info": "audited", "snapshot_download": "c0ffee" * 6}
+
+
 def test_a_data_set_comes_back(hub: Hub, monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Path) -> None:
     """From the folder that `deconf data` wrote, however deep the data set is in it."""
     place = tmp_path / "data/deconf/bandit/expert2s0-v0/data"
@@ -209,7 +219,10 @@ def test_what_is_amiss_is_one_line(
 
 
 def test_interval_of_a_card() -> None:
-    """1.96 standard errors on either side, which are of as many trials as there were, whatever their episodes."""
+    """1.96 standard errors on either side, which are of as many trials as there were, whatever their episodes.
+
+    The mean beside it is of the last episode too.
+    """
     kept = records.of_task(ROOT / "docs/records", "slippery_cartpole")
     [own] = [each for each in kept if (records.named(each), each["seed"]) == ("naive_rnn", 1)]
     _, section = card._scores(own, kept)
@@ -219,6 +232,9 @@ def test_interval_of_a_card() -> None:
     low, high = (score + side * 1.96 * sd / np.sqrt(own["eval_trials"]) for side in (-1, 1))
     assert own["episodes"] > 1
     assert f"95% interval {low:.2f} to {high:.2f}" in section
+    returns = [each["returns"][last] for each in kept if records.named(each) == "naive_rnn"]
+    mean = (np.mean(returns) - by_random) / unit
+    assert f"The {len(returns)} seeds of its run: {mean:.2f}, " in section
 
 
 def test_card_without_a_record(tmp_path: Path) -> None:

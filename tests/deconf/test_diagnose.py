@@ -368,7 +368,7 @@ def test_gain_by_memory() -> None:
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     """A page that needs no other file, a json that says the same; a second time nothing is measured again.
 
-    A diagnosis of other data does not take the place of a finished one.
+    A diagnosis of other data, or with another seed, does not take the place of a finished one.
     """
     monkeypatch.setattr(diagnose.DiagnoseConfig, "__init__", _tiny_init)
     monkeypatch.setattr(type(envs.get("bandit")), "horizon", 20)
@@ -392,9 +392,10 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     command.main()
     assert "measured in" not in capsys.readouterr().out
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["figures"] == written["figures"]
-    monkeypatch.setattr("sys.argv", ["diagnose", *options[:2], "--out", str(tmp_path / "out")])
-    with pytest.raises(InputError, match=r"out holds a run that differs in its explore .*; give another --out"):
-        command.main()
+    for other, differs in ((options[:2], "explore"), ([*options, "--seed", "1"], "seed")):
+        monkeypatch.setattr("sys.argv", ["diagnose", *other, "--out", str(tmp_path / "out")])
+        with pytest.raises(InputError, match=rf"out holds a run that differs in its {differs} .*; give another --out"):
+            command.main()
     assert json.loads((tmp_path / "out" / "diagnosis.json").read_text())["figures"] == written["figures"]
     monkeypatch.setattr("sys.argv", ["diagnose", *options[:2], "--out", str(tmp_path / "alone")])
     command.main()
