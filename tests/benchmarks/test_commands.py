@@ -523,8 +523,8 @@ def test_publish_refuses_what_pages_do_not_show(
 ) -> None:
     """A run of other amounts, thetas or protocol than theirs."""
     run, docs = tmp_path / "run", tmp_path / "docs"
-    shown = records.of_task(ROOT / "docs" / "records", "bandit")
-    records.write(run / "records", [{**record, **change} for record in shown if record["method"] in REFERENCES])
+    published = records.of_task(ROOT / "docs" / "records", "bandit")
+    records.write(run / "records", [{**record, **change} for record in published if record["method"] in REFERENCES])
     (run / "adaptation.png").write_bytes(b"a picture")
     monkeypatch.setattr(publish, "DOCS", docs)
     with pytest.raises(envs.InputError, match="pages show the default preset and the standard protocol alone"):

@@ -117,6 +117,7 @@ def test_cpu_seconds_are_those_before_an_interruption_too(tmp_path: Path, monkey
 def test_a_checkpoint_is_written_once_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A minute after the job began at the earliest, and then after the checkpoint before."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(jobs, "SAVE_EVERY_S", 60.0)
     now, written = 0.0, []
     monkeypatch.setattr(jobs.time, "monotonic", lambda: now)
     monitor = CurveMonitor(BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path), 0.8)
