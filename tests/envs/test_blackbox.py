@@ -164,13 +164,14 @@ def test_a_closed_world_takes_no_step() -> None:
 
 
 def test_worlds_are_closed() -> None:
-    """With their environment, or when nobody holds it any more."""
+    """With their environment, as a new theta makes others, or when nobody holds it any more."""
     task = task_of(Whole)()
     assert task.horizon == 12  # a probe is made, and closed
     before = Steps.opened[0]
     for made in (envs.GymEnv(task), envs.GymVectorEnv(task, 3)):
-        made.reset(seed=0)
-        assert Steps.opened[0] == before + (1 if isinstance(made, envs.GymEnv) else 3)
+        for seed in (0, 1):
+            made.reset(seed=seed)
+            assert Steps.opened[0] == before + (1 if isinstance(made, envs.GymEnv) else 3)
         made.close()
         assert Steps.opened[0] == before
     run_trials(BatchEnv(task, 4), RandomAgent(task.action_space), 2, 0)
@@ -244,6 +245,29 @@ def test_actions_are_in_the_world_s_units() -> None:
     assert np.isfinite(expert.log_prob(obs, expert.act(obs, env.theta, np.random.default_rng(0)), env.theta)).all()
     with pytest.raises(envs.InputError, match="black box"):
         task.log_prob(obs, obs)
+
+
+def test_an_expert_without_noise_has_a_density() -> None:
+    """Eq. (1) needs it: of a hundredth of half the range."""
+    task, zeros = task_with(noise=0.0), np.zeros((2, 1))
+    expert = policy.load(task)
+    assert task.expert_noise == pytest.approx(0.01)
+    likely, unlikely = (expert.log_prob(zeros, zeros + off, zeros)[0] for off in (0.0, 0.01))
+    assert likely == pytest.approx(-np.log(0.01 * np.sqrt(2 * np.pi)))
+    assert likely - unlikely == pytest.approx(0.5)
+
+
+def test_worlds_get_copies_of_theta() -> None:
+    """What they do to theirs does not change an environment's."""
+
+    def make(self: Any, theta: Any) -> Any:
+        made = Slide(theta[0])
+        theta *= 0
+        return made
+
+    env = BatchEnv(task_with(make=make), 2)
+    env.reset(0, {"theta": [0.7]})
+    np.testing.assert_array_equal(env.theta, [[0.7]] * 2)
 
 
 def test_discrete_actions_start_anywhere() -> None:
@@ -343,6 +367,14 @@ def wide(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"step": step})(0.0)
 
 
+def nowhere(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"step": lambda self, action: ([np.nan], *Slide.step(self, action)[1:])})(0.0)
+
+
+def other_actions(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"action_space": spaces.Box(0.0, 4.0 + float(theta[0] > 0), (1,))})(theta[0])
+
+
 def paid(reward: Any) -> Callable[..., Any]:
     """`make` of an environment that gives this reward."""
 
@@ -365,6 +397,8 @@ class TestErrors:
         ("make", old_reset, "reset of Sliding takes no seed; it must be reset.seed=None, options=None., as gymn"),
         ("make", reset_of_one, "reset of sliding returned a ndarray; it must return obs, info, as gymnasium.Env"),
         ("make", wide, r"step of sliding gave an observation of shape \(2,\); it must be 1 finite numbers"),
+        ("make", nowhere, r"step of sliding gave an observation of \[nan\]; it must be 1 finite numbers"),
+        ("make", other_actions, r"make of sliding gave spaces .* for another theta$"),
         ("make", paid(None), "step of sliding gave the reward None; it must be a number"),
         ("make", paid(np.ones(2)), r"step of sliding gave the reward array\(\[1., 1.\]\); it must be a number"),
         ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),

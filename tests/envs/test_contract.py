@@ -42,6 +42,19 @@ def test_registered(name: str) -> None:
     np.testing.assert_array_equal(envs.make_dm(name, seed=3).reset().observation, first[0])
 
 
+def test_each_interface_has_the_privileged_view() -> None:
+    """The same, to the bit, and of the width that its space states."""
+    name = "tilted_cartpole"
+    single, vec = envs.make(name, privileged=True), envs.make_vec(name, 1, privileged=True)
+    dm = envs.make_dm(name, privileged=True, seed=3)
+    first = single.reset(seed=3)[0]
+    np.testing.assert_array_equal(vec.reset(seed=3)[0], first[None])
+    np.testing.assert_array_equal(dm.reset().observation, first)
+    width = len(single.task.observation) + 1
+    assert single.observation_space.shape == vec.single_observation_space.shape == (width,)
+    assert dm.observation_spec().shape == first.shape == (width,)
+
+
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 def test_renderers_are_independent() -> None:
     """A renderer draws the same before and after another one is gone."""
@@ -92,3 +105,13 @@ def test_expert_loads_and_acts(name: str) -> None:
     own, foreign = expert.log_prob(obs, action, batch.theta), expert.log_prob(obs, action, other)
     assert own.shape == (32,)
     assert own.mean() > foreign.mean()
+
+
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+def test_a_network_s_mean_is_in_bounds(end: float) -> None:
+    """An output beyond them is the bound; so densities are those of the actions that are taken."""
+    task = envs.get("tilted_cartpole")
+    width = len(task.observation)
+    weights = {"0.weight": np.zeros((1, width + task.seen_width), "f4"), "0.bias": np.full(1, 3 * end, "f4")}
+    mean = policy.NetworkExpert(task, weights).mean(np.zeros((2, width)), np.zeros((2, 1)))
+    np.testing.assert_array_equal(mean, [[end]] * 2)

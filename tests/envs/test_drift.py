@@ -12,17 +12,24 @@ from deconfounded.deconf.core.drift import SHARES, choose_kept
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.envs.contract.probe import streams
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.tilted_cartpole import TiltedCartpole
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent
 from deconfounded.experts.rollout import run_trials, thetas
+from tests.toys import Push
 
 
 class Walking(TiltedCartpole):
     """tilted_cartpole with a drifting tilt."""
 
     latents = (envs.Latent("tilt", "rad", -0.3, 0.3, drift=0.15),)
+
+
+def drifting(*drifts: float) -> envs.Task:
+    """Push with a latent of each drift."""
+    return Push().changed(latents=tuple(envs.Latent(f"x{i}", "", -1.0, 1.0, drift=d) for i, d in enumerate(drifts)))
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "loguniform"])
@@ -36,6 +43,29 @@ def test_transition_is_that_of_the_walk(distribution: str) -> None:
         ends = latent.cdf(latent.drifted(np.full(n, value), rng.standard_normal(n)))
         share = np.bincount(np.minimum((ends * k).astype(int), k - 1), minlength=k) / n
         np.testing.assert_allclose(share, matrix[i], atol=5 * np.sqrt(0.25 / n) + 0.002)
+
+
+@pytest.mark.parametrize("drifts", [(0.3, 0.0), (0.0, 0.3)])
+def test_the_matrix_of_two_latents_moves_the_drifting_one(drifts: tuple[float, float]) -> None:
+    """To each of its values; the value of the other stays."""
+    task, still = drifting(*drifts), drifts.index(0)
+    grid = task.theta_grid(21)
+    stays = grid[:, None, still] == grid[:, still]
+    assert not stays.all()
+    np.testing.assert_array_equal(task.transition(21) > 0, stays)
+
+
+def test_latents_drift_independently() -> None:
+    """The correlation of 2,000 steps of two latents is 0, within 5 standard errors."""
+    theta = drifting(0.1, 0.1).drifted(np.zeros((2000, 2)), streams(*range(2000)))
+    assert abs(np.corrcoef(theta.T)[0, 1]) < 5 / np.sqrt(2000)
+
+
+def test_a_drift_is_from_0_to_1() -> None:
+    """Anything else is refused."""
+    for wrong in (-0.1, 1.1, np.nan):
+        with pytest.raises(envs.InputError, match="drift of x was"):
+            envs.Latent("x", "", 0, 1, drift=wrong)
 
 
 def test_what_does_not_drift_stays() -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.envs.contract.probe import actions, gl_works, streams
 from deconfounded.envs.streams import Array
+from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 
 TASKS = envs.names()
 CONTROL = "slippery_cartpole"
@@ -283,6 +284,34 @@ def test_odd_arguments() -> None:
     batch.reset(4)
     np.testing.assert_array_equal(batch.theta, thetas_of_range)
     np.testing.assert_array_equal(batch.reset(where=np.zeros(3, bool)), first)
+
+
+def test_actions_beyond_the_bounds_are_the_bounds() -> None:
+    """In what follows, and in pictures."""
+    wide, ends = (envs.BatchEnv(envs.get(CONTROL), 2) for _ in range(2))
+    for env, size in ((wide, 3.0), (ends, 1.0)):
+        env.reset(0)
+        for sign in (1, -1):
+            env.step(np.full((2, 1), sign * size))
+    np.testing.assert_array_equal(wide.state, ends.state)
+    np.testing.assert_array_equal(wide.action, ends.action)
+
+
+def test_observations_are_in_their_space() -> None:
+    """Where the state exceeds the bounds, too."""
+    narrow = {**SlipperyCartpole.observation, "velocity": (-0.01, 0.01)}
+    task = type("Narrow", (SlipperyCartpole,), {"observation": narrow})()
+    env = envs.BatchEnv(task, 8)
+    assert all(task.observation_space.contains(row) for row in env.reset(0))
+    assert np.abs(task.qvel(env.state, "slider")).max() > 0.01
+
+
+def test_without_a_seed_every_environment_is_new() -> None:
+    """Starts and thetas, of one batch and of another."""
+    batches = [envs.BatchEnv(envs.get(CONTROL), 3) for _ in range(2)]
+    starts = np.concatenate([batch.reset() for batch in batches])
+    assert len(np.unique(starts, axis=0)) == 6
+    assert len(np.unique([batch.theta for batch in batches])) == 6
 
 
 Pictures = Callable[[Array, Array], Array]

@@ -1,6 +1,7 @@
 """MuJoCo as tasks from outside use it: a simulation that fails says so, and edits mean what the MJCF means."""
 
 import copy
+import ctypes
 from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
+from deconfounded.envs import models, physics
 from deconfounded.envs.contract.physics import same_model
 from deconfounded.envs.contract.probe import gl_works
 from deconfounded.envs.edits import Edit, ModelEdit, SpecEdit
@@ -264,3 +266,23 @@ def test_pictures_show_a_tilt() -> None:
     state = task.state(slider=(0.0, 0.0))[0]
     level, up = (task.renderer(np.array([angle]))(state, np.zeros(1)) for angle in (0.0, 0.5))
     assert (level != up).any()
+
+
+def test_threads_are_at_most_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """OMP_NUM_THREADS lowers their number, and never raises it."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    available = physics.cores()
+    for limit, threads in (("1", 1), (str(available + 1), available), ("0", available), ("all", available)):
+        monkeypatch.setenv("OMP_NUM_THREADS", limit)
+        assert physics.cores() == threads
+
+
+def test_the_clock_of_mujoco_is_put_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a failed step, too."""
+    monkeypatch.setattr(models, "CLOCK", ctypes.c_void_p(7))
+    with models.no_clock():
+        assert models.CLOCK.value is None
+    assert models.CLOCK.value == 7
+    with pytest.raises(envs.InputError), models.no_clock():
+        raise envs.InputError("failed")
+    assert models.CLOCK.value == 7

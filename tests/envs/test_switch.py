@@ -13,6 +13,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials, thetas
+from tests.toys import Push
 
 
 @pytest.mark.parametrize("distribution", ["uniform", "loguniform", "categorical"])
@@ -26,6 +27,15 @@ def test_switches_come_at_their_rate(distribution: str) -> None:
     counts = np.histogram(latent.cdf(after[after != before]), 4, (0, 1))[0] / (after != before).sum()
     expected = [1 / 3, 0, 1 / 3, 1 / 3] if distribution == "categorical" else 0.25  # one category is the one before
     np.testing.assert_allclose(counts, expected, atol=0.02)
+
+
+def test_latents_switch_independently() -> None:
+    """Of two that switch in a fifth of 8,000 steps, both do in a twenty-fifth, within 5 standard errors."""
+    latents = tuple(envs.Latent(name, "", -1.0, 1.0, switch=0.2) for name in "ab")
+    task = Push().changed(latents=latents, horizon=400)
+    moved = np.diff(task.theta_path(np.zeros((20, 2)), streams(*range(20))), axis=1) != 0
+    np.testing.assert_allclose(moved.mean((0, 1)), 0.2, atol=5 * 0.4 / np.sqrt(8000))
+    assert moved.all(-1).mean() == pytest.approx(0.04, abs=5 * 0.2 / np.sqrt(8000))
 
 
 def test_a_rate_is_a_probability() -> None:

@@ -111,3 +111,25 @@ def test_a_reset_in_the_middle_starts_a_new_trial() -> None:
     whole.step(whole.action_space.sample())
     whole.reset()
     assert (batch.theta != first).all()
+
+
+def test_a_seed_in_the_middle_starts_a_new_trial() -> None:
+    """Whose theta is the seed's, where a reset without one goes on with the trial."""
+    for env in (envs.make(NAME, episodes=3), envs.make_vec(NAME, 2, episodes=3)):
+        thetas = []
+        for seed in (0, None, 5, None, 0):
+            env.reset(seed=seed)
+            thetas.append(env.batch.theta.copy())
+        first, kept, new, kept_too, again = thetas
+        same((kept, kept_too, again), (first, new, first))
+        assert (new != first).all()
+
+
+def test_a_trial_has_the_action_that_was_taken() -> None:
+    """Of an action beyond the bounds it is the bound."""
+    whole = envs.TrialEnv(envs.make(NAME, episodes=2))
+    whole.reset(seed=0)
+    for sign in (1, -1):
+        obs = whole.step(np.array([3.0 * sign], np.float32))[0]
+        assert obs[-2] == sign
+        assert whole.observation_space.contains(obs)
