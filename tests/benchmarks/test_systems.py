@@ -253,6 +253,15 @@ class TestAsGymnasiumHasIt:
         with pytest.raises(envs.InputError, match=f"action of {name} held NaN"):
             vec.step(wrong)
 
+    def test_spaces_of_single_environments(self) -> None:
+        """Each has its own, whose samples are those of its seed, whatever is done to another's."""
+        env, other = envs.make(CONTROL), envs.make(CONTROL)
+        env.action_space.seed(0)
+        first = env.action_space.sample()
+        env.action_space.seed(0)
+        other.action_space.seed(1)
+        assert env.action_space.sample() == first
+
     def test_counts_of_stable_baselines(self) -> None:
         """A reset in the middle of episodes starts their counts, too."""
         vec = Sb3VecEnv(envs.get("bandit"), 2, 0)
@@ -264,6 +273,18 @@ class TestAsGymnasiumHasIt:
         for _ in range(horizon):
             infos = vec.step(action)[3]
         assert [info["episode"]["l"] for info in infos] == [horizon, horizon]
+
+    def test_returns_of_stable_baselines(self) -> None:
+        """The rewards of the episode that is over, all of them."""
+        vec, paid, ended = Sb3VecEnv(Push(), 4, 0), np.zeros(4), 0
+        vec.reset()
+        for _ in range(3 * Push.horizon):
+            _, reward, done, infos = vec.step(np.zeros((4, 1)))
+            paid += reward
+            returns = [infos[i]["episode"]["r"] for i in np.flatnonzero(done)]
+            np.testing.assert_allclose(returns, paid[done], rtol=1e-5)
+            paid[done], ended = 0, ended + done.sum()
+        assert ended >= 12
 
     def test_seeds_of_stable_baselines(self) -> None:
         """They are those of the next reset alone, which the constructor's seed gives, too."""

@@ -372,7 +372,7 @@ def nowhere(self: Any, theta: Any) -> Any:
 
 
 def other_actions(self: Any, theta: Any) -> Any:
-    return type("Odd", (Slide,), {"action_space": spaces.Box(0.0, 4.0 + float(theta[0] > 0), (1,))})(theta[0])
+    return type("Odd", (Slide,), {"action_space": spaces.Box(0.0, 4.0 + float(theta[0]), (1,))})(theta[0])
 
 
 def paid(reward: Any) -> Callable[..., Any]:

@@ -72,5 +72,5 @@ def test_the_contract_catches_a_picture_that_is_not_level(monkeypatch: pytest.Mo
     """No task can have such a picture by itself: cameras are rolled until gravity points down."""
     CONTRACT["down_is_down_in_pictures"](Sloping())
     monkeypatch.setattr("deconfounded.envs.contract.physics.level", lambda model: None)
-    with pytest.raises(AssertionError, match="gravity points .* to the right and .* up in the picture"):
+    with pytest.raises(AssertionError, match=r"gravity points .* to the right and .* up in the picture"):
         CONTRACT["down_is_down_in_pictures"](Sloping())

@@ -10,10 +10,11 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.output import records
 from deconfounded.deconf import exact
-from deconfounded.envs.contract.probe import actions
+from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
+from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
@@ -195,6 +196,15 @@ def test_a_grid_is_of_mid_quantiles(distribution: Any) -> None:
     np.testing.assert_allclose(latent.grid(5), by_hand)
 
 
+def test_quantiles_of_categories() -> None:
+    """Of five, each begins a fifth after the one before, and is that of all quantiles up to the next."""
+    latent = envs.Latent("x", "", 2, 6, "categorical")
+    begins, values = latent.cdf(latent.grid(0)), [2, 3, 4, 5, 6]
+    np.testing.assert_allclose(begins, [0, 0.2, 0.4, 0.6, 0.8])
+    for share in (0.01, 0.19):
+        np.testing.assert_array_equal(latent.ppf(begins + share), values)
+
+
 SERVOS = (  # task, joint, and its velocity under an action held at .5, without noise, as the task's page has it
     ("dragged_sled", "hand", 2 + 3 * 0.5),
     ("heavy_payload", "hook", 3 * 0.5),
@@ -212,6 +222,68 @@ def test_servos_reach_the_speed_that_is_asked_for(name: str, joint: str, velocit
     for _ in range(30):
         state = env.simulator.outcome(state, np.full((1, 1), 0.5))
     assert task.qvel(state, joint)[0] == pytest.approx(velocity, rel=0.05)
+
+
+ENDS = (  # task, joints, and whether an episode ends there, as the task's page has it
+    ("tilted_cartpole", {"hinge": ([1.1, -1.1, 1.3, -1.3], 0.0)}, [False, False, True, True]),
+    ("slippery_walker", {"rooty": ([0.55, -0.55, 0.65, -0.65], 0.0)}, [False, False, True, True]),
+    ("swapped_lander", {"z": ([0.05, 0.05, 0.05, 1.0], [-0.9, -1.1, 1.1, -1.1])}, [False, True, False, False]),
+)
+
+
+@pytest.mark.parametrize(("name", "joints", "ends"), ENDS)
+def test_episodes_end_with_a_fall_or_a_crash(name: str, joints: dict[str, Any], ends: list[bool]) -> None:
+    """To either side; by falling fast to the ground, and neither by rising from it nor high above it."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    assert task.terminated(task.state(**joints)).tolist() == ends
+
+
+@pytest.mark.parametrize("side", [0.0, 1.0])
+def test_a_bump_is_on_the_side_away_from_the_goal(side: float) -> None:
+    """8 cm off the middle, so that it pushes to the goal's."""
+    task, theta = ForkedPath(), np.array([side])
+    bump, goal = task.edited(task.model, theta).body("bump").pos[0], task.goal(theta[None])[0, 0]
+    assert bump == pytest.approx(-0.08 * goal)
+
+
+def test_an_axle_starts_at_its_set_point() -> None:
+    """It does not slip in the first observation."""
+    task = envs.get("slippery_cartpole")
+    obs = envs.BatchEnv(task, 4).reset(0)
+    np.testing.assert_array_equal(obs[:, list(task.observation).index("slip")], 0)
+
+
+def test_slip_is_that_of_an_axle_s_own_wheels() -> None:
+    """Of a car at rest whose front wheels turn at 20 rad/s, 5 cm from their axle: 1 m/s in front, none behind."""
+    task = envs.get("icy_road")
+    assert isinstance(task, MujocoTask)
+    state = task.state(front_left=(0.0, 20.0), front_right=(0.0, 20.0))
+    seen = dict(zip(task.observation, task.observe(state)[0].tolist(), strict=True))
+    assert (seen["front_slip"], seen["rear_slip"]) == (pytest.approx(1.0), 0)
+
+
+def test_slow_driving_is_worth_nothing() -> None:
+    """Backwards, at rest and at .6 m/s alike; 2 m/s above that, along the road, are worth a half."""
+    task = envs.get("icy_road")
+    assert isinstance(task, MujocoTask)
+    speeds, direction = np.array([-1.0, 0.0, 0.6, 2.6]), np.arctan(2 * np.pi / 8)  # the road's where x is 0
+    way = speeds * task.control_dt
+    before = task.state(x=(np.zeros(4), 0.0))
+    after = task.state(x=(way * np.cos(direction), 0.0), y=(way * np.sin(direction), 0.0))
+    made = task.reward(before, np.zeros((4, 2)), after, np.full((4, 1), 0.3))
+    np.testing.assert_allclose(made, [0, 0, 0, 0.5], atol=1e-9)
+
+
+@pytest.mark.parametrize("turn", [1, -1])
+def test_an_arm_turns_the_shorter_way(turn: int) -> None:
+    """To a mark behind its shoulder, across the angle at which bearings change their sign."""
+    task = envs.get("loaded_arm")
+    assert isinstance(task, MujocoTask)
+    x, y = 0.21 * np.cos(3.0), -0.21 * turn * np.sin(3.0)
+    state = task.state(joint0=(3.0 * turn, 0.0), joint1=(0.0, 0.0), target_x=(x, 0.0), target_y=(y, 0.0))
+    push = task.expert_mean(task.observe(state), np.array([[0.0, 0.0, 1.0, 1.0]]))
+    assert np.sign(push[0, 0]) == turn
 
 
 def test_a_weak_leg_gets_larger_commands() -> None:
@@ -237,6 +309,15 @@ def test_bearings_point_to_the_goal() -> None:
     state, goals = task.state(root=(place, 0)), np.array([[0.5, 1.0], [-1.0, 0.0]])
     seen = task.observe(task.sense(state, goals, np.zeros((2, 3))))[:, -3:]
     np.testing.assert_allclose(seen, [[1.0, 0.0, 1.0], [1.5, -1.0, 0.0]], atol=1e-9)
+
+
+def test_bearings_have_the_density_of_their_noise() -> None:
+    """Three normal numbers of std 1.6, on their means, and as far off as one of them is."""
+    task, goal = envs.get("ant_goal"), np.array([[0.5, -0.5]])
+    start = task.init_state(streams(0))
+    for noise in (np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]])):
+        log_density = task.log_sense(task.sense(start.copy(), goal, noise), goal)[0]
+        assert log_density == pytest.approx(-3 * np.log(1.6 * np.sqrt(2 * np.pi)) - noise.sum() / 2)
 
 
 def test_a_push_of_a_stone_costs_a_little() -> None:

@@ -6,7 +6,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.deconf.equations import belief_update
 from deconfounded.deconf.exact import Grid, PatchGrid
-from deconfounded.envs.contract.probe import actions
+from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.drifting_raft import LAG, THRUST, DriftingRaft
 from deconfounded.envs.tasks.patchy_road import PatchyRoad
@@ -67,6 +67,17 @@ def rafts(n: int, raft: DriftingRaft) -> Array:
     state = raft.state(x=(x, along), y=(y, across), mark_x=(x, along), mark_y=(y, across))
     state[:, -2:] = np.stack([along, across], -1)
     return state
+
+
+def test_marks_cross_the_streams_to_either_side() -> None:
+    """At .9 to 1.4 m/s, at most 45 degrees off the x axis; half of 400, within 5 standard errors, against it."""
+    raft = DriftingRaft()
+    state = raft.init_state(streams(*range(400)))
+    along, across = raft.qvel(state, "mark_x"), raft.qvel(state, "mark_y")
+    assert (along > 0).mean() == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(400))
+    assert (np.abs(across) <= np.abs(along)).all()
+    speed = np.hypot(along, across)
+    assert ((speed > 0.9) & (speed < 1.4)).all()
 
 
 def test_the_current_of_the_present_stream_carries_the_raft() -> None:

@@ -35,6 +35,7 @@ from deconfounded.experts import datasets, policy
 from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
+from tests.toys import Push
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
 MASK = np.ones((2, 1, 3), bool)
@@ -213,6 +214,14 @@ class TestTrials:
         np.testing.assert_array_equal(trials.obs[1, 0, [1, 2, 4, 5]], obs[1, 0, [1, 2, 4, 5]].astype("f4"))
         np.testing.assert_array_equal(trials.action[..., 0], np.where(mask, action[..., 0], 0).astype("f4"))
 
+    def test_arrays_are_copies(self) -> None:
+        """What is done to the arrays that were given does not change the trials, also where no type is converted."""
+        obs, action, mask = OBS.astype("f4"), ACTION.astype("f4"), MASK.copy()
+        trials = Trials(obs, action, mask)
+        before = trials.sha256
+        obs[:], action[:], mask[:] = 1, 1, False
+        assert trials.sha256 == before
+
 
 class Rude(SlipperyCartpole):
     def reward(self, state: Array, action: Array, next_state: Array, theta: Array) -> Array:
@@ -263,6 +272,14 @@ class TestTasks:
     def test_reset_options(self, options: Any) -> None:
         with pytest.raises(envs.InputError, match=r"^reset option .* is unknown; there are keep_theta and theta"):
             envs.make("bandit").reset(options=options)
+
+    @pytest.mark.parametrize("arm", [0.5, 3.999])
+    def test_a_category_is_a_whole_number(self, arm: float) -> None:
+        """Also between those that there are."""
+        with pytest.raises(
+            envs.InputError, match=f"^best_arm of bandit was {arm}; it must be a whole number from 0 to 4"
+        ):
+            envs.make("bandit").reset(options={"theta": [arm]})
 
     def test_a_reward_that_ends_the_command(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
         """In silence, and as if all were well: in a check, in a command, and in a worker process of one."""
@@ -342,6 +359,18 @@ class TestRunTrials:
 
         trials = run_trials(envs.BatchEnv(envs.get("tilted_cartpole"), 2), Wild(), 1, 0).trials
         assert (trials.action[trials.mask] == 1).all()
+
+    def test_an_agent_observes_the_steps_that_take_place(self) -> None:
+        """An episode's last step too, and none after it, as the mask of the trials has it."""
+        observed = list[Any]()
+
+        class Noting(RandomAgent):
+            def observe(self, obs: Any, action: Any, next_obs: Any, alive: Any) -> None:
+                observed.append(alive.copy())
+
+        trials = run_trials(envs.BatchEnv(Push(), 8), Noting(Push.action_space), 1, 0).trials
+        assert not trials.mask.all()
+        np.testing.assert_array_equal(np.stack(observed, 1), trials.mask[:, 0, : len(observed)])
 
     def test_random_numbers_of_an_agent_are_new_in_each_episode(self) -> None:
         """And of each seed its own."""

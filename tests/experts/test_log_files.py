@@ -1,0 +1,105 @@
+"""Logs as other programs write them: byte-order marks, tabs, dictionaries, large numbers, rows in any order."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.experts import datasets
+from deconfounded.experts.datasets.logs import trials_of
+from deconfounded.experts.datasets.rows import Roles
+from deconfounded.experts.datasets.table import Table
+from deconfounded.experts.datasets.units import Units
+from tests.experts.test_logs import ROLES, expected, of_lerobot, rows, write_csv, write_parquet
+
+
+def test_a_byte_order_mark(tmp_path: Path) -> None:
+    """As spreadsheets begin a csv file: it is no part of the first column's name."""
+    file = write_csv(tmp_path / "x.csv", rows())
+    file.write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
+    assert datasets.read(file, **ROLES).sha256 == expected().sha256
+
+
+def test_tabs(tmp_path: Path) -> None:
+    assert datasets.read(write_csv(tmp_path / "x.tsv", rows(), "\t"), **ROLES).sha256 == expected().sha256
+
+
+def test_dictionaries_of_parquet(tmp_path: Path) -> None:
+    """As pandas writes categories: they are the texts that they stand for."""
+    pyarrow = pytest.importorskip("pyarrow")
+    made = rows(None)
+    columns: dict[str, Any] = {key: [row[key] for row in made] for key in made[0]}
+    columns["vehicle"] = pyarrow.array(columns["vehicle"]).dictionary_encode()
+    log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), **ROLES)
+    assert (log.sha256, log.names) == (expected().sha256, ("a", "b", "c"))
+
+
+def test_the_row_of_an_error_is_that_of_the_file(tmp_path: Path) -> None:
+    """In a later episode, too."""
+    made = rows()
+    made[7]["speed x"] = ""
+    with pytest.raises(envs.InputError, match=r"'speed x' of .*x.csv holds no number in row 8"):
+        datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+
+
+def demonstrations(file: Path, *demos: dict[str, Any]) -> Path:
+    """A file of robomimic's, with these columns of each demonstration's observations, and attribute `run`."""
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(file, "w") as opened:
+        for i, obs in enumerate(demos):
+            demo = opened.create_group(f"data/demo_{i}")
+            demo["actions"], demo.attrs["run"] = np.full((3, 1), i / 2), 2**60 + i
+            for name, values in obs.items():
+                demo[f"obs/{name}"] = values
+    return file
+
+
+def test_whole_numbers_that_float64_rounds_name_demonstrations(tmp_path: Path) -> None:
+    column = np.arange(3.0)[:, None]
+    file = demonstrations(tmp_path / "x.hdf5", {"x": column}, {"x": column})
+    assert datasets.read(file, "run").names == (str(2**60), str(2**60 + 1))
+
+
+@pytest.mark.parametrize("lacking", [0, 1])
+def test_demonstrations_of_different_arrays(lacking: int, tmp_path: Path) -> None:
+    """Whichever of them has more."""
+    both, less = {"x": np.zeros((3, 1)), "y": np.zeros((3, 1))}, {"x": np.zeros((3, 1))}
+    file = demonstrations(tmp_path / "x.hdf5", *((less, both) if lacking == 0 else (both, less)))
+    with pytest.raises(
+        envs.InputError, match=r"demo_1 and demo_0 of .* hold different arrays; obs/y.0 is in one alone"
+    ):
+        datasets.read(file)
+
+
+def test_frames_of_lerobot_in_any_order(tmp_path: Path) -> None:
+    """They are in that of their numbers, not of their rows."""
+    log = of_lerobot(tmp_path)
+    parquet = pytest.importorskip("pyarrow.parquet")
+    for file in (tmp_path / "set" / "data").rglob("*.parquet"):
+        table = parquet.read_table(file)
+        parquet.write_table(table.take(list(reversed(range(len(table))))), file)
+    assert datasets.read(tmp_path / "set", "vehicle").sha256 == log.sha256
+
+
+def test_a_declared_range_holds_what_was_done() -> None:
+    """An action beyond the range that a format declares widens it, and comes back as it was."""
+    columns = {"lap": np.repeat([0.0, 1.0], 3), "x": np.arange(6.0), "push": np.array([0.0, 0.5, 0, 3.0, 0.2, 0])}
+    table = Table("a", columns, limits={"push": (-1.0, 1.0)})
+    (log,) = trials_of([[table]], Roles(None, "lap", ("x",), ("push",)))
+    assert (log.units.low, log.units.high) == ((-1.0,), (3.0,))
+    raw = log.units.unscaled(log.action[:, 0].astype(float))
+    np.testing.assert_allclose(raw[..., 0], [[0, 0.5], [3, 0.2]], atol=1e-6)
+
+
+def test_actions_of_agents_stay_in_the_range() -> None:
+    """An action beyond -1 or 1 is the end of the range."""
+    units = Units(("x",), ("y",), (0.0,), (100.0,))
+    np.testing.assert_array_equal(units.unscaled(np.array([[-1.5], [0.0], [1.5]])), [[0.0], [50.0], [100.0]])
+
+
+def test_the_first_part_of_a_name_ends_at_a_dot() -> None:
+    """A column whose name goes on otherwise is another one."""
+    table = Table("a", {name: np.zeros(2) for name in ("speed.0", "speed.1", "speed_limit")})
+    assert table.select("obs", ["speed"]) == ("speed.0", "speed.1")
