@@ -317,7 +317,7 @@ def test_bearings_have_the_density_of_their_noise() -> None:
     start = task.init_state(streams(0))
     for noise in (np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]])):
         log_density = task.log_sense(task.sense(start.copy(), goal, noise), goal)[0]
-        assert log_density == pytest.approx(-3 * np.log(1.6 * np.sqrt(2 * np.pi)) - noise.sum() / 2)
+        assert log_density == pytest.approx(-3 * np.log(1.6 * np.sqrt(2 * np.pi)) - np.square(noise).sum() / 2)
 
 
 def test_a_push_of_a_stone_costs_a_little() -> None:
