@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, whole
-from deconfounded.benchmarks.engine import identity
+from deconfounded.benchmarks.engine import identity, sources
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.benchmarks.output.pictures import panels
@@ -199,6 +199,7 @@ def certify(
     return {
         "task": task.name,
         "task_version": task.version,
+        **({"text": sources.digest(files)} if (files := sources.of_task(task)) else {}),  # of a task from outside
         **({"learned_dynamics": learned} if learned else {}),  # of the references, which are exact without them
         "verdict": "passed" if all(check["passed"] for check in checks.values()) else "failed",
         "checks": checks,
@@ -284,7 +285,8 @@ def main() -> None:
         fit = "R2 {r2:.3f} on held-out trials, likelihood to the power {exponent:g}".format(**learned)
         print(f"conditional, interventional and evidence are of learned dynamics, not exact: {fit}")
     nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
-    print(f"evidence a step: {nats}; theta from expert trials: {result['inferability'][-1]}")
+    inferred = ", ".join(f"{name} {value:.2f}" for name, value in result["inferability"][-1].items())
+    print(f"evidence a step: {nats}; theta from expert trials, R2: {inferred}")
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
     if result["verdict"] == "failed":
         raise SystemExit(1)

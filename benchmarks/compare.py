@@ -45,9 +45,10 @@ def main() -> None:
     if not methods:
         raise envs.InputError(f"the records given are of {against[0]} alone; give --against another method")
     print(comparison.write(scores, methods, against, args.out))
-    if presets := sorted({record["preset"] for record in every} - {"default"}):
+    package = comparison.published(every, against)  # with which the runs were compared
+    if package and (presets := sorted({record["preset"] for record in every} - {"default"})):
         print(f"note: runs of preset {', '.join(presets)}; the records that come with the package are of default")
-    for key in ("set", "salt"):
+    for key in ("set", "salt") if package else ():
         if changed := sorted({str(record[key]) for record in every if record[key]}):
             print(f"note: runs of {key} {', '.join(changed)}; the records that come with the package have none")
     for line in comparison.outdated(every, against):

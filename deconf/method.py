@@ -74,7 +74,8 @@ class Method:
         if not bandit and len(task.latents) == 2:
             config = replace(config, **self.two_latents)
         if preset == "smoke":
-            config = replace(config, **(self.smoke_bandit if bandit else self.smoke))
+            own = self.smoke_bandit or ({} if self.on_bandit else self.smoke)  # one configuration, one set of changes
+            config = replace(config, **(own if bandit else self.smoke))
         if preset == "paper" and bandit and self.paper is not None:
             config = self.paper
         values = asdict(config)

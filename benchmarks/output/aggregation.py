@@ -86,6 +86,7 @@ def gather(records: Sequence[Record], order: Sequence[str] = ()) -> dict[str, An
     names = sorted(by_agent, key=lambda name: rank.get(by_agent[name][0]["method"], len(rank)))
     return {
         **{key: first[key] for key in COMMON if first.get(key) not in ("", [], None)},
+        **({"text": text} if (text := first["outside"].get("task")) else {}),
         "seeds": sorted({record["seed"] for record in records}),
         "commits": sorted({record["commit"] or "unknown" for record in records}),
         "versions": _versions(records),

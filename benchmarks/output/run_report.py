@@ -144,13 +144,17 @@ PICTURES = {
 }
 
 
-def certificate(task: str, version: int, run: Path) -> Path | None:
-    """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/."""
+def certificate(task: str, version: int, run: Path, text: str | None = None) -> Path | None:
+    """The picture of a task's certificate: beside the run, as certify.py leaves it, or in a checkout's docs/.
+
+    text: the digest of the files of a task from outside, which has no version.
+    """
     beside = run.absolute().parent / "certificates" / f"{task}.png"
     for picture in (beside, published.certificate(task, ".png")):
         try:
             certified = json.loads(picture.with_suffix(".json").read_bytes())
-            if (certified["task"], certified["task_version"]) == (task, version) and picture.is_file():
+            of = (certified["task"], certified["task_version"], certified.get("text"))
+            if of == (task, version, text) and picture.is_file():
                 return picture
         except (OSError, ValueError, KeyError, TypeError):
             pass
@@ -160,7 +164,7 @@ def certificate(task: str, version: int, run: Path) -> Path | None:
 def page(results: dict[str, Any], folder: Path) -> str:
     """The report as one HTML file that needs no other."""
     pictures = [(*texts, encoded(folder / name)) for name, texts in PICTURES.items() if (folder / name).exists()]
-    if certified := certificate(results["task"], results["task_version"], folder):
+    if certified := certificate(results["task"], results["task_version"], folder, results.get("text")):
         command = f"deconf certify --task {results['task']}"
         pictures.append(("Is it confounded?", f"The task's certificate, of {command}.", encoded(certified)))
     movie = encoded(folder / "video.mp4") if (folder / "video.mp4").exists() else None

@@ -73,7 +73,7 @@ class LearnedAgent(Agent):
 
     def begin(self, n: int) -> None:
         if not isinstance(n, int | np.integer) or n < 1 or n % self.seeds:
-            right = "it must be a multiple of the number of seeds"
+            right = "it must be a multiple of the number of seeds, from that number up"
             raise InputError(f"an agent of {self.seeds} seeds was given {n} trials; {right}")
         self._n = n // self.seeds
         self._draws = Draws([], self.device)
@@ -92,7 +92,10 @@ class LearnedAgent(Agent):
     def act(self, obs: NDArray[np.float32]) -> Array:
         if not len(self._draws):
             raise InputError("act was called before begin and reset; begin(n) trials, reset([generator]), then act")
-        return self.choose(self._tensor(obs)).double().cpu().numpy().reshape(len(obs), -1)
+        seen = self._tensor(obs)
+        if not np.isfinite(obs).all():
+            raise InputError("observations held NaN or infinity, of which no action follows")
+        return self.choose(seen).double().cpu().numpy().reshape(len(obs), -1)
 
     def _tensor(self, obs: NDArray[np.float32]) -> Tensor:
         shape, width = np.shape(obs), self.policy.signature.obs

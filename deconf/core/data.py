@@ -1,7 +1,7 @@
 """Random numbers and trials of S seeds side by side, as tensors with a leading axis of S."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -86,17 +86,25 @@ class Signature:
     binary: bool
 
     @staticmethod
-    def of(trials: Trials) -> "Signature":
-        """The signature of trials. Observations that are all 0 or 1 are modelled as Bernoulli, others as Gaussian."""
+    def of(trials: Trials, *more: Trials) -> "Signature":
+        """The signature of trials. Observations that are all 0 or 1 are modelled as Bernoulli, others as Gaussian.
+
+        more: exploration, whose observations may be others than an expert's.
+        """
         trials = trials_of(trials)
-        binary = bool(np.isin(trials.obs, (0, 1)).all())
+        binary = all(np.isin(part.obs, (0, 1)).all() for part in (trials, *more))
         return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
 
     def checked(self, explored: Source) -> Trials:
         """Explored trials. Raises InputError if they are of another kind than demonstrations of this signature."""
         trials = trials_of(explored)
-        if (signature := Signature.of(trials)) != self:
+        signature = Signature.of(trials)
+        if replace(signature, binary=self.binary) != self:
             raise InputError(f"exploration is {signature}, demonstrations are {self}; they must agree")
+        if self.binary and not signature.binary:
+            raise InputError(
+                "observations of exploration were not all 0 or 1, as they were before; explore more at first"
+            )
         return trials
 
     @property

@@ -268,8 +268,8 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
     elif blind:
         odd = True
         text = (
-            "Trials do not differ in their dynamics, as far as a smooth fit shows: an imitator could infer nothing from"
-            " what its actions do."
+            "Trials do not differ in their dynamics, as far as a smooth fit shows. If that is so, an imitator can infer"
+            " nothing from what its actions do."
         )
         if unshown := [names[i] for i in state.incomplete(trials)]:
             text += (
@@ -279,6 +279,6 @@ def _dynamics(trials: Trials, steps: Steps, names: tuple[str, ...], blind: bool)
     else:
         text = (
             "No difference in dynamics is seen between trials. The expert's actions can hide one, as they make up for"
-            " it; exploration would show it (--explore)."
+            " it; exploration can show it (--explore)."
         )
     yield Remark("dynamics", text, odd)

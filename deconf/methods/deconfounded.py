@@ -83,7 +83,7 @@ def train(
     seeds = len(rngs)
     unit = split_episodes if config.drifts else lambda trials: trials
     demonstrations, first = unit(trials_of(trials)), trials_of(lambda: explore(None))
-    signature = Signature.of(demonstrations)
+    signature = Signature.of(demonstrations, first)
     episodes, first = first.mask.shape[1], unit(signature.checked(first))
     expert, explored = (Batch.of(x, seeds, device) for x in (demonstrations, first))
     draws = Draws(rngs, device)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take_steps, trials_of
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
@@ -129,8 +129,8 @@ def train(trials: Trials, explore: Explore, config: MeanConfig, rng: Rngs, monit
     exploration and trials do not fit each other.
     """
     rngs, device, monitor = as_generators(rng), config.device, monitor or Monitor()
-    signature = Signature.of(trials)
-    expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, signature.checked(explore(None))))
+    signature = Signature.of(trials, first := trials_of(lambda: explore(None)))
+    expert, explored = (Batch.of(x, len(rngs), device) for x in (trials, signature.checked(first)))
     draws = Draws(rngs, device)
     scales = Scales.of(signature, expert, explored)
     agent = MeanAgent.new(config.model, config.latent, config.width, scales, draws)

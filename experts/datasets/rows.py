@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.datasets.table import EMPTY, Column, Odd, Table, number
 
-CLOCKS = ("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock")  # in lower case
+CLOCKS = (  # in lower case
+    *("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock"),
+    *("date", "datetime", "minutes", "minute", "ms", "tick", "ticks", "index"),
+)
 NO_LABEL = EMPTY - {"none"}  # of a trial: "none" may be a condition
 GAP = 1.5  # times the usual time between rows
 
@@ -23,6 +26,11 @@ class Roles:
     episode: str | None = None
     obs: Sequence[str] = ()
     action: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        for what, name in (("trial", self.trial), ("episode", self.episode)):
+            if not isinstance(name, str | None):
+                raise InputError(f"{what} was {name!r}; it must be the name of a column, or a pattern such as 'goal*'")
 
 
 class Episode(NamedTuple):
@@ -229,11 +237,21 @@ def _notes(
     rows = np.stack([table.columns[name] for name in (*obs, *action)], 1)
     same = (rows[1:] == rows[:-1]).all(1) & inside
     clock = next((name for name in table.columns if name.lower() in CLOCKS and name not in (*obs, *action)), None)
-    if clock is not None and table.columns[clock].dtype != object:
-        notes += _of_time(table, clock, np.diff(table.columns[clock]), inside)
+    if clock is not None and (times := _times(table.columns[clock])) is not None:
+        notes += _of_time(table, clock, np.diff(times), inside)
     elif same.any():
         notes.append(f"{same.sum():,} rows repeat the row before them (the first: row {np.flatnonzero(same)[0] + 2}).")
     return notes
+
+
+def _times(column: Column) -> NDArray[np.float64] | None:
+    """A column of time as numbers, in seconds where it is of ISO 8601 texts; None for other texts."""
+    if column.dtype != object:
+        return column
+    try:
+        return np.array([str(text).strip().removesuffix("Z") for text in column], "datetime64[us]").astype(float) / 1e6
+    except ValueError:
+        return None
 
 
 def _constant(column: Column) -> bool:

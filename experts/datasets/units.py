@@ -41,7 +41,11 @@ class Units:
         return any(low != -1 or high != 1 for low, high in zip(self.low, self.high, strict=True))
 
     def scaled(self, action: NDArray[Any]) -> Array:
-        """Actions [..., A] of the log as those of Trials. Raises InputError for one that is none of `values`."""
+        """Actions [..., A] of the log as those of Trials; those beyond the log's range become its ends.
+
+        Logs of exploration often go beyond it: `datasets.read_together` has one range for both. Raises InputError for
+        an action that is none of `values`.
+        """
         if self.values:
             numbers = {value: i for i, value in enumerate(self.values)}
             flat = np.asarray(action).ravel().tolist()

@@ -695,6 +695,7 @@ def test_certificate_of_a_report(tmp_path: Path) -> None:
     run, folder = tmp_path / "bandit-default", tmp_path / "certificates"
     assert run_report.certificate("bandit", 0, run) == DOCS / "certificates" / "bandit.png"
     assert run_report.certificate("bandit", 9, run) is None
+    assert run_report.certificate("bandit", 0, run, "text of a file that was edited") is None
     assert run_report.certificate("loaded_arm", 0, run) == DOCS / "certificates" / "hard" / "loaded_arm.png"
     folder.mkdir()
     (folder / "bandit.json").write_text('{"task": "bandit", "task_version": 0}')

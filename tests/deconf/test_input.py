@@ -22,11 +22,11 @@ from deconfounded.deconf.methods.flow_bc import FlowConfig
 from deconfounded.deconf.methods.naive_dropout import DropoutConfig
 from deconfounded.deconf.particles import Particles
 from deconfounded.envs.streams import Streams
-from deconfounded.experts.agent import Agent, ExpertAgent
+from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
 from tests.deconf.test_particles import Three, expert
-from tests.tools import tiny_preset
+from tests.tools import FEW, tiny_preset
 
 CONTROL = "tilted_cartpole"
 
@@ -145,6 +145,31 @@ def test_exploration_of_another_kind(method: str, wrong_round: int) -> None:
     with pytest.raises(envs.InputError, match=r"exploration is Signature\(obs=3, .* they must agree"):
         module.train(trials, explore, config(**tiny), rng)  # type: ignore[operator]
     assert len(rounds) == wrong_round + 1
+
+
+@pytest.mark.parametrize(
+    ("train", "config"), [(deconfounded.train, DeconfoundedConfig), (deconfounded_mean.train, MeanConfig)]
+)
+def test_observations_that_are_0_or_1_in_demonstrations_alone(train: Any, config: Any) -> None:
+    """As a count of errors, where the expert makes none: they are modelled as numbers, and not as coins."""
+    task = envs.get("bandit")
+    env = envs.BatchEnv(task, 4)
+    coins = run_trials(env, RandomAgent(task.action_space), 1, 0).trials
+    counts = Trials(coins.obs.cumsum(2), coins.action, coins.mask, coins.actions)
+    agent = train(coins, lambda behaviour: counts, config(**FEW), [np.random.default_rng(0)])
+    assert not agent.policy.signature.binary
+    agent.begin(2)
+    agent.reset([np.random.default_rng(0)])
+    assert agent.act(np.full((2, 1), 7.0, np.float32)).shape == (2, 1)
+
+
+def test_an_agent_takes_no_nan(agents: dict[str, Agent]) -> None:
+    """No action follows of it."""
+    agent = agents["bandit"]
+    agent.begin(2)
+    agent.reset([np.random.default_rng(0)])
+    with pytest.raises(envs.InputError, match="observations held NaN or infinity"):
+        agent.act(np.array([[0.0], [np.nan]], np.float32))
 
 
 def test_the_expert_of_other_environments() -> None:

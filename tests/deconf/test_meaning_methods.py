@@ -21,6 +21,7 @@ from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis.exploration import SHARE, ExplorationPolicy
 from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.method import Method
 from deconfounded.deconf.methods import dadp, dagger, deconfounded, dml_il, palr, rma, sequence_bc
 from deconfounded.deconf.methods.dadp import DadpConfig
 from deconfounded.deconf.methods.dagger import DaggerAgent, DaggerConfig
@@ -258,6 +259,13 @@ def test_an_exact_policy_has_the_grid_that_it_is_set_to() -> None:
     agent = fit(Context(envs.get("tilted_cartpole"), settings, [0], Monitor()), "conditional")
     assert isinstance(agent, ExactAgent)
     assert len(agent.grid.theta) == 5
+
+
+@pytest.mark.parametrize(("on_bandit", "updates"), [(None, 3), (RecurrentConfig(updates=9), 9)])
+def test_a_method_of_one_configuration_has_one_smoke(on_bandit: RecurrentConfig | None, updates: int) -> None:
+    """Its changes hold on the bandit too, unless that has a configuration of its own."""
+    method = Method(("demonstrations",), on_control=RecurrentConfig(), on_bandit=on_bandit, smoke={"updates": 3})
+    assert method.amounts("smoke", envs.get("bandit"), "cpu")["updates"] == updates
 
 
 @pytest.mark.parametrize(("columns", "width"), [(LARGE_OBSERVATION - 1, 64), (LARGE_OBSERVATION, WIDE)])

@@ -298,6 +298,15 @@ class TestNotes:
         )
         assert "runs backwards" not in " ".join(of_csv(tmp_path).notes)
 
+    @pytest.mark.parametrize("name", ["date", "minute", "Index"])
+    def test_columns_of_time(self, name: str, tmp_path: Path) -> None:
+        """Also texts as ISO 8601 has them; of other texts nothing is known."""
+        times = [f"2026-11-29T10:00:{second:02}Z" for second in (1, 2, 4, 3, 5)]
+        for stamps, notes in ((times, 1), ([f"{i}." for i in (1, 2, 4, 3, 5)], 1), ([*"abdce"], 0)):
+            made = [{"run": 0, name: stamp, "x": i, "u": i / 10} for i, stamp in enumerate(stamps)]
+            log = datasets.read(write_csv(tmp_path / "x.csv", made), trial="run", obs=["x"], action=["u"])
+            assert sum("runs backwards 1 times" in note for note in log.notes) == notes
+
     def test_duplicates_without_a_clock(self, tmp_path: Path) -> None:
         made = [{key: value for key, value in row.items() if key != "time"} for row in rows()]
         log = datasets.read(write_csv(tmp_path / "x.csv", [*made[:3], made[2], *made[3:]]), **ROLES)
@@ -365,6 +374,13 @@ class TestNames:
             datasets.read(file, trial="run", obs=["x"], action=["u"])
         file = write_csv(tmp_path / "y.csv", self.named(["heavy", "none"]))
         assert datasets.read(file, trial="run", obs=["x"], action=["u"]).names == ("heavy", "none")
+
+    @pytest.mark.parametrize("role", ["trial", "episode"])
+    def test_names_that_are_no_text(self, role: str, tmp_path: Path) -> None:
+        file = write_csv(tmp_path / "x.csv", self.named([1, 2]))
+        for name in (["run"], ("run",), 3):
+            with pytest.raises(envs.InputError, match=rf"^{role} was .*; it must be the name of a column"):
+                datasets.read(file, obs=["x"], action=["u"], **{role: name})
 
     def test_several_columns(self, tmp_path: Path) -> None:
         """As a goal of two numbers: together they are a trial's name, and no observations."""
