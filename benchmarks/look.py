@@ -36,9 +36,12 @@ def columns(args: argparse.Namespace) -> dict[str, Any]:
 
 def read(data: list[Path], explore: list[Path] | None, chosen: dict[str, Any]) -> "tuple[Log, Log | None]":
     """Logs of the expert, and of exploration if there are any. Raises InputError for what cannot be read."""
+    from deconfounded.envs.support.errors import InputError
     from deconfounded.experts import datasets
 
     logs = datasets.read_together([data] if explore is None else [data, explore], **chosen)
+    if explore is not None and logs[0].sha256 == logs[1].sha256:
+        raise InputError("--data and --explore hold the same trials; --explore is for those of who does not see theta")
     return logs[0], logs[1] if len(logs) > 1 else None
 
 

@@ -431,6 +431,15 @@ def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: py
     assert (tmp_path / "agent" / "agent.json").is_file()
 
 
+def test_an_expert_is_no_explorer(tmp_path: Path) -> None:
+    """The same trials twice, though from two files, are refused."""
+    files = tmp_path / "a.csv", tmp_path / "b.csv"
+    for file in files:
+        write_csv(file, driven(), 1)
+    with pytest.raises(envs.InputError, match="--data and --explore hold the same trials"):
+        look_command.read([files[0]], [files[1]], _roles())
+
+
 def _roles() -> dict[str, Any]:
     return {"trial": "vehicle", "episode": "lap", "obs": ["speed*"], "action": ["throttle"]}
 
