@@ -361,6 +361,27 @@ class TestComparison:
             held.append(figure.interval[0] <= 0 <= figure.interval[1])
         assert np.mean(held) == pytest.approx(0.95, abs=0.025)
 
+    def test_runs_unlike_the_package_s_are_named(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """Their presets, settings and salts; a run that is given twice counts once."""
+        read: list[records.Record] = []
+        monkeypatch.setattr(comparison, "gathered", lambda every, against: (read.extend(every), {"mine": {}})[1])
+        monkeypatch.setattr(comparison, "write", lambda *_: "written")
+        monkeypatch.setattr(comparison, "outdated", lambda *_: [])
+        changes = ({}, {"preset": "smoke"}, {"salt": "x"}, {"set": ["seeds=2"], "preset": "paper"})
+        made = [record("mine", seed, 0.5) | change for seed, change in enumerate(changes)]
+        for name, kept in (("plain", made[:1]), ("all", made)):
+            records.write(tmp_path / name, kept)
+            monkeypatch.setattr("sys.argv", ["compare", *[str(tmp_path / name)] * 2, "--out", str(tmp_path / "out")])
+            compare.main()
+        assert [each["seed"] for each in read] == [0, 0, 1, 2, 3]
+        kinds = ("preset paper, smoke", "set ['seeds=2']", "salt x")
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + [
+            f"note: runs of {kind}" for kind in kinds
+        ]
+
     def test_bad_input(self, tmp_path: Path) -> None:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
         with pytest.raises(InputError, match="two records of mine on curling with seed 0"):

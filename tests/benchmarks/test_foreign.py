@@ -1,13 +1,19 @@
 """Foreign worlds: their cases, scores and filter, in those simulators that are ours too."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
 from deconfounded.benchmarks.studies import findings, validate
-from deconfounded.benchmarks.studies.foreign import report, world
+from deconfounded.benchmarks.studies.foreign import cases, report, world
 from deconfounded.benchmarks.studies.foreign.cases import CASES, Case
 from deconfounded.benchmarks.studies.foreign.measure import scores
+from deconfounded.deconf.diagnosis import exploration
+from deconfounded.deconf.diagnosis.diagnose import VERSION
 from deconfounded.experts.agent import RandomAgent
+from deconfounded.experts.trials import Trials
 
 OURS = [case for case in CASES if case.reference.split(":")[0] in ("arm", "classic", "mujoco")]
 NAMES = [case.name for case in OURS]
@@ -50,6 +56,27 @@ def test_experts_have_their_habits() -> None:
     mean = world.task(made).expert_mean(trials.obs[:, 0, :-1].reshape(-1, 10), np.zeros((4 * made.steps, 2)))
     left = (trials.action[:, 0] - mean.reshape(4, made.steps, 2)).transpose(0, 2, 1).reshape(-1, made.steps)
     assert 0.7 < np.corrcoef(left[:, 1:].ravel(), left[:, :-1].ravel())[0, 1] < 0.97
+
+
+def test_logs_of_exploration_are_half_at_random_and_half_by_the_clone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clone is of the expert's trials that are kept beside them; logs that are there are not made again."""
+
+    def trials(n: int, value: float) -> Trials:
+        return Trials(np.full((n, 1, 2, 1), value), np.full((n, 1, 1, 1), value), np.ones((n, 1, 1), bool))
+
+    def explorer(world: Any, n: int, rng: Any) -> Any:
+        return lambda agent: trials(n, -1.0 if agent is None else agent)
+
+    monkeypatch.setattr(cases, "demonstrations", lambda world, n, seed: type("Made", (), {"trials": trials(n, 0.5)}))
+    monkeypatch.setattr(cases, "explorer", explorer)
+    monkeypatch.setattr(exploration, "fit", lambda expert, config, rng: float(expert.action.max()))
+    expert, explored = map(Trials.load, OURS[0].logs(tmp_path))
+    assert (len(expert), expert.action.min(), expert.action.max()) == (cases.TRIALS, 0.5, 0.5)
+    assert explored.action.ravel().tolist() == [-1.0] * cases.EXPLORED + [0.5] * cases.EXPLORED
+    monkeypatch.setattr(cases, "explorer", None)
+    OURS[0].logs(tmp_path)
 
 
 @pytest.mark.slow
@@ -99,6 +126,16 @@ def test_how_often_verdicts_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
     said = findings.right()
     assert said.startswith("Verdicts are right in 1 of 2 cases on tasks of this suite (0 of the 1 by which no")
     assert "and in 2 of 4 worlds on simulators of others (2 of the 3 by which no" in said
+
+
+def test_verdicts_of_earlier_versions_of_the_diagnosis_are_named() -> None:
+    """Those that name no version too; what was not diagnosed has no verdict."""
+    old = [{"case": "old", "verdict": "", "diagnosis": VERSION - 1}, {"case": "first", "verdict": ""}, {"case": "none"}]
+    new = {"case": "new", "verdict": "", "diagnosis": VERSION}
+    said = " Verdicts of an earlier version of the diagnosis: "
+    assert findings._outdated([new, *old]) == f"{said}old, first."
+    assert findings._outdated(old) == f"{said}all."
+    assert findings._outdated([new, old[-1]]) == ""
 
 
 def test_report_says_of_which_version_scores_are() -> None:

@@ -29,9 +29,11 @@ from deconfounded.benchmarks.engine.provider import Provider, fit
 from deconfounded.deconf import methods, wire
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.given import Given
+from deconfounded.deconf.guest import ChannelAsk, ChannelMonitor, live, serve
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.deconf.wall import Wall
 from deconfounded.envs import registry
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support import outside
@@ -449,6 +451,103 @@ class TestWire:
                 wire.unpack(data)
         with pytest.raises(envs.InputError, match="it gave object"):
             wire.pack(object())
+
+    def test_what_is_read_may_be_changed(self) -> None:
+        back = wire.unpack(wire.pack(np.zeros(3)))
+        back += 1
+        assert back.tolist() == [1, 1, 1]
+
+
+class Scripted:
+    """A connection whose other end says what is given; `sent` is what it hears."""
+
+    def __init__(self, *messages: Any) -> None:
+        self.messages, self.sent = list(messages), list[Any]()
+
+    def recv(self) -> Any:
+        if not self.messages:
+            raise EOFError
+        return self.messages.pop(0)
+
+    def send_bytes(self, data: bytes) -> None:
+        self.sent.append(wire.unpack(data))
+
+
+class TestEndOfGuest:
+    """A guest's end of the connection, in this process."""
+
+    about = {
+        **{"observations": 2, "action_space": Bandit.action_space, "episodes": 1, "horizon": 3, "fresh": False},
+        **{"config": {}, "rng": 0},
+    }
+
+    def lived(self, folder: Path, text: str, *messages: Any, **about: Any) -> list[Any]:
+        """What a method of that text sends."""
+        channel: Any = Scripted(*messages)
+        (folder / "mine.py").write_text(HEAD + text)
+        live(f"{folder}/mine.py:fit", channel, {**self.about, **about})
+        return channel.sent
+
+    def test_progress_is_a_share(self) -> None:
+        channel: Any = Scripted()
+        ChannelMonitor(channel).update(3, 4, {"imitation": 0.5})
+        assert channel.sent == [["progress", 0.75, {"imitation": 0.5}]]
+
+    def test_its_agent_asks_for_nothing_while_it_is_rolled_out(self) -> None:
+        """Afterwards the method may ask again."""
+        channel: Any = Scripted(("act", np.zeros((1, 2))), ("over", 3))
+        ask = ChannelAsk(channel)
+        agent: Any = SimpleNamespace(act=lambda obs: ask("queries"))
+        with pytest.raises(envs.InputError, match="queries were asked for by an agent's method"):
+            ask("exploration", None, agent=agent)
+        assert ask("demonstrations") == 3
+        assert channel.sent == [["exploration", True, None], ["demonstrations", False]]
+
+    def test_nothing_is_asked_for_after_fitting(self, tmp_path: Path) -> None:
+        text = "class Asks(Still):\n    def __init__(self, given): self.given = given\n"
+        text += "    def act(self, obs): return self.given.explore()\ndef fit(given): return Asks(given)"
+        fitted, failed = self.lived(tmp_path, text, ("act", np.zeros((1, 2))))
+        assert fitted == ["fitted"]
+        assert failed[0] == "failed"
+        assert "exploration were asked for by an agent's method, or after fitting" in failed[1]
+
+    def test_its_configuration_is_that_of_the_run(self, tmp_path: Path) -> None:
+        text = "from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig\n"
+        text += "@uses('demonstrations', on_control=MemorylessConfig())\n"
+        text += "def fit(given): given.progress(0.0, updates=given.config.updates)"
+        assert self.lived(tmp_path, text, config={"updates": 7})[0] == ["progress", 0.0, {"updates": 7}]
+
+    def test_random_numbers_are_of_the_seeds_that_it_is_sent(self) -> None:
+        drawn: list[float] = []
+        agent: Any = SimpleNamespace(reset=lambda rngs: drawn.extend(rng.random() for rng in rngs))
+        channel: Any = Scripted(("reset", [3, 4]), ("over", None))
+        serve(channel, agent)
+        assert drawn == [np.random.default_rng(seed).random() for seed in (3, 4)]
+
+    def test_its_cost_is_cpu_time(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("time.process_time", lambda: 5.0)
+        channel: Any = Scripted(("act", np.zeros((1, 2))), ("over", None))
+        agent: Any = SimpleNamespace(act=lambda obs: obs)
+        serve(channel, agent)
+        assert channel.sent[0][2] == 5
+
+    @pytest.mark.parametrize(
+        ("module", "closed"),
+        [
+            *((f"deconfounded.{name}", True) for name in ("envs.task", "benchmarks.engine.context", "deconf.exact")),
+            *((f"deconfounded.experts.{name}", True) for name in ("policy", "sb3", "train", "datasets.rows")),
+            *((name, True) for name in ("mujoco", "dm_control.suite")),
+            *((f"deconfounded.envs.{name}", False) for name in ("streams", "support.errors")),
+            *((f"deconfounded.{name}", False) for name in ("experts.trials", "deconf.methods.dagger")),
+        ],
+    )
+    def test_what_it_may_import(self, module: str, closed: bool) -> None:
+        """No task, no expert, no simulator, and no exact posterior, which needs them."""
+        if closed:
+            with pytest.raises(ImportError, match=f"{module} cannot be imported here"):
+                Wall().find_spec(module)
+        else:
+            Wall().find_spec(module)
 
 
 def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,6 +20,7 @@ from deconfounded.benchmarks.output import aggregation, card, records
 from deconfounded.deconf.core.data import Draws, Signature
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts import saved_agents
 
 ROOT = Path(__file__).parents[2]
@@ -218,6 +219,18 @@ def test_what_is_amiss_is_one_line(
     assert "pip install deconfounded-imitation[hub]" in refused(pull, "me/x", "--out", out)
 
 
+def test_which_of_several_data_sets_is_for_the_user_to_say(tmp_path: Path) -> None:
+    """None is pushed of a folder that holds two; each is, by its own folder."""
+    for name in ("first", "second"):
+        (tmp_path / name / "data").mkdir(parents=True)
+        (tmp_path / name / "data" / "metadata.json").write_text(json.dumps({"dataset_id": name}))
+    with pytest.raises(InputError, match="and 2 Minari data sets; give a folder"):
+        push.contents(tmp_path, "me/x")
+    kind, name, files, _ = push.contents(tmp_path / "second", "me/x")
+    assert (kind, name) == (push.DATA, "second")
+    assert files == {"data/metadata.json": tmp_path / "second" / "data" / "metadata.json"}
+
+
 def test_interval_of_a_card() -> None:
     """1.96 standard errors on either side, which are of as many trials as there were, whatever their episodes.
 
@@ -235,6 +248,25 @@ def test_interval_of_a_card() -> None:
     returns = [each["returns"][last] for each in kept if records.named(each) == "naive_rnn"]
     mean = (np.mean(returns) - by_random) / unit
     assert f"The {len(returns)} seeds of its run: {mean:.2f}, " in section
+
+
+def test_card_of_a_data_set() -> None:
+    """Each number stands beside what it is of; what the metadata lack is left out."""
+    text = card.of_data({"dataset_id": "me/x-v0", "total_episodes": 7, "ref_min_score": 1, "ref_max_score": 9}, "me/x")
+    for row in ("episodes | 7", "mean return of random actions | 1", "mean return of the expert | 9"):
+        assert f"| {row} |" in text
+    assert "| steps |" not in text
+
+
+def test_a_card_has_the_versions_of_its_own_record() -> None:
+    """Of the task, the method and the expert, which count apart."""
+    record = records.of_task(ROOT / "docs/records", "curling")[0]
+    made = card._made({**record, "method": "x", "deployment": "", "task_version": 3, "method_version": 5})
+    assert "| task | curling, version 3 |" in made
+    assert f"| method | x, version 5, tier {record['tier']} |" in made
+    made = card._made({**record, "expert_version": 7, "expert": "0123456789abcdef" * 4, "seed": 9})
+    assert "| expert | version 7, sha256 0123456789abcdef |" in made
+    assert "| seed | 9 |" in made
 
 
 def test_card_without_a_record(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The documentation site: every task and method has its page, links lead somewhere, and Sphinx has no warnings."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,30 @@ def test_links(tmp_path: Path) -> None:
     assert (tmp_path / "source/files/docs/gap.png").is_file()
     with pytest.raises(envs.InputError, match=r"a link of speed leads to docs/absent\.md, which does not exist"):
         made.resolved("[a](absent.md)", "speed", "docs/speed.md")
+
+
+@pytest.mark.parametrize(
+    ("link", "becomes"),
+    [
+        ("results.md#bandit", "../results.html#bandit"),
+        ("hard.md", "../hard.html"),
+        ("tasks.md", "../tasks/index.html"),
+        ("records/bandit.jsonl", "records/bandit.jsonl"),
+        ("#curling", "#curling"),
+    ],
+)
+def test_links_of_the_interactive_page(link: str, becomes: str) -> None:
+    """They lead to the site's pages, one folder up, and to their anchors; what lies beside it stays there."""
+    match = re.fullmatch(r'href="([^"#]*)(#[\w-]*)?"', f'href="{link}"')
+    assert match is not None
+    assert site._from_interactive(match) == f'href="{becomes}"'
+
+
+def test_what_lies_beside_the_interactive_page() -> None:
+    """Of docs/ its clips, certificates and records; of these no page."""
+    names = ["bandit.webp", "bandit.md", "certificates", "records", "tutorials", "speed.json"]
+    assert site._not_shown(str(site.DOCS), names) == {"bandit.md", "tutorials", "speed.json"}
+    assert site._not_shown(str(site.DOCS / "records"), ["README.md", "bandit.jsonl"]) == {"README.md"}
 
 
 def test_dead_links(tmp_path: Path) -> None:

@@ -440,6 +440,19 @@ def test_an_expert_is_no_explorer(tmp_path: Path) -> None:
         look_command.read([files[0]], [files[1]], _roles())
 
 
+def test_a_look_at_exploration_is_one_at_exploration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It does not matter how its actions are chosen; remarks on it say that they are."""
+
+    def remark(log: str, blind: bool = False) -> list[Any]:
+        return [Remark("size", f"{log}{' as exploration' * blind}")]
+
+    monkeypatch.setattr("deconfounded.deconf.diagnosis.look.look", remark)
+    log, explored = "the expert's", "the explorer's"
+    made = [each.text for each in look_command.look(log, explored)]  # type: ignore[arg-type]
+    assert made == [log, f"Exploration: {explored} as exploration"]
+    assert [each.text for each in look_command.look(log, None)] == [log]  # type: ignore[arg-type]
+
+
 def _roles() -> dict[str, Any]:
     return {"trial": "vehicle", "episode": "lap", "obs": ["speed*"], "action": ["throttle"]}
 

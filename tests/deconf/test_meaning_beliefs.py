@@ -12,11 +12,14 @@ from deconfounded import envs
 from deconfounded.deconf import learned_reference
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.drift import choose_kept
+from deconfounded.deconf.core.dynamics import DynamicsHead
+from deconfounded.deconf.core.gru import GruBelief
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent, Explorer
 from deconfounded.deconf.core.linear_model import LinearModel
 from deconfounded.deconf.core.models import VariationalModel, new_model
-from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.nets import Inputs, Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
+from deconfounded.deconf.learned_reference import LearnedDynamics
 from deconfounded.deconf.methods.deconfounded_offline import exact
 from deconfounded.deconf.particles import Particles
 from deconfounded.envs.latent import Latent
@@ -258,3 +261,34 @@ def test_the_reference_s_likeliest_action_is_no_error() -> None:
     for action, error in ((0, 0), (1, 0.5)):
         measured = LearnedEnv._action_error(env, torch.zeros(1, 1, 1), torch.full((1, 1, 1), float(action)))
         assert measured.item() == pytest.approx(error)
+
+
+def test_a_gru_says_a_variance() -> None:
+    """Its numbers are a mean and a softplus variance, of which the std is the root."""
+    data = numbered()
+    belief = GruBelief(2, 8, Scales.of(FLAT, data), draws())
+    memory = belief(data)
+    mean, raw = belief.out(memory).chunk(2, -1)
+    said = belief.posterior(memory)
+    torch.testing.assert_close(said[0], mean)
+    torch.testing.assert_close(said[1].square(), torch.nn.functional.softplus(raw), rtol=0, atol=1e-5)
+
+
+def test_the_mean_change_of_a_bit() -> None:
+    """Of one that is 1 with probability .5: down by .5 from 1, up by .5 from 0."""
+    bits = Signature(obs=1, action=1, actions=0, binary=True)
+    head = DynamicsHead(1, 8, Inputs(Scales.plain(bits, 1)), draws())
+    head.forward = lambda obs, *rest: torch.zeros_like(obs)[..., None, :]  # type: ignore[method-assign]
+    obs = torch.tensor([[[0.0], [1.0]]])
+    mean = head.change.inverse(head.mean(obs, obs, obs))
+    assert mean.flatten().tolist() == pytest.approx([0.5, -0.5])
+
+
+def test_an_exponent_is_a_power_of_the_likelihood() -> None:
+    residual = np.array([[1.0, 2.0], [0.0, 3.0]])
+    missing: Any = None
+    for exponent in (1.0, 0.1):
+        dynamics = LearnedDynamics(toys.Push(), missing, missing, np.ones(2), np.eye(2), exponent)
+        dynamics.residual = lambda *_: residual  # type: ignore[method-assign]
+        log_prob = dynamics.log_prob(residual, residual, residual, residual)
+        assert log_prob == pytest.approx([-0.5 * exponent * 5, -0.5 * exponent * 9])

@@ -1,22 +1,33 @@
 """Parts of a diagnosis by what they mean: what a figure is of, and which of two explanations is believed."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from deconfounded.benchmarks.output import diagnosis as page
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.monitor import Monitor
-from deconfounded.deconf.diagnosis import advice, fits, latent, measures, trait
+from deconfounded.deconf.diagnosis import advice, diagnose, fits, labels, latent, measures, state, trait
+from deconfounded.deconf.diagnosis.deviation import paired_score
+from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
+from deconfounded.deconf.diagnosis.held_out import PartMonitor, Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import Explanation
+from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
 from deconfounded.deconf.diagnosis.measures import Amounts, split
-from deconfounded.deconf.diagnosis.thresholds import MISFIT
+from deconfounded.deconf.diagnosis.thresholds import GOOD, MISFIT, NEGLIGIBLE, STAKES
+from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials
+from tests.deconf.test_deviation import lines, walks
 from tests.deconf.test_diagnose import CLEAR
 from tests.deconf.test_latent import CLONING, EXPLORING, world
+from tests.deconf.test_termination import Walker
 
 
 def draws() -> Draws:
@@ -35,6 +46,51 @@ def test_half_of_the_splits_are_enough() -> None:
     """A verdict falls where fewer than half of them give it alone."""
     diagnosis = judge([CLEAR, CLEAR._replace(latent_gain=2.0)])
     assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.refits) == ("confounded", 1, 2)
+
+
+def test_a_bar_of_the_page_is_of_the_figure_beside_it(figures: list[Any]) -> None:
+    """From 0 to its mean, with a line from its least to its greatest over splits, and the threshold that decides."""
+    made = judge([CLEAR, CLEAR._replace(memory_gain=1.5, stakes=4.0, exploration_evidence=0.4, naive_by_actions=0.3)])
+    page._findings(made.figures)
+    names = {
+        "memory": "memory_gain",
+        "latent from dynamics": "latent_gain",
+        "dynamics, in exploration": "exploration_evidence",
+        "dynamics, in expert trials": "expert_evidence",
+        "the expert's actions": "action_evidence",
+        "from all with right latents": "stakes",
+        "paired by latent and start": "paired_stakes",
+        "naive clone": "naive",
+        "infers the latent": "latent",
+        "naive clone, Eq. (1)": "naive_by_actions",
+        "infers the latent, Eq. (1)": "latent_by_actions",
+    }
+    labels = list[str]()
+    for drawn, threshold in zip(figures, (NEGLIGIBLE, NEGLIGIBLE, STAKES, GOOD), strict=True):
+        (axes,) = drawn.axes
+        *ranges, zero, decides = axes.lines
+        assert [line.get_xdata()[0] for line in (zero, decides)] == [0, threshold]
+        for i, text in enumerate(axes.get_yticklabels()):
+            value, low, high = made.figures[names[text.get_text()]]
+            bar = axes.patches[i]
+            assert bar.get_y() < axes.get_yticks()[i] < bar.get_y() + bar.get_height()
+            assert (bar.get_x(), bar.get_width()) == (0, value)
+            assert list(ranges[i].get_xdata()) == [low, high]
+            labels.append(text.get_text())
+    assert labels == list(names)
+
+
+def test_printed_lines_explore_by_the_log_of_exploration() -> None:
+    """It is read beside the expert's; where there is none, the expert's own log is all that there is."""
+    units = {"obs": ("x",), "action": ("a",), "low": (-1.0,), "high": (1.0,), "values": ()}
+    about = {"trials": {"from": "expert.npz"}, "explore": {"from": "explored.npz"}, "columns": {}, "units": units}
+    made = Diagnosis("confounded", {}, (), 2, advice.EXPLORE)
+    lines = page._code(made, about)
+    assert "trials, explored = datasets.read_together(['expert.npz', 'explored.npz'])" in lines
+    assert "    return explored\n" in lines
+    lines = page._code(made, about | {"explore": None})
+    assert "trials = datasets.read('expert.npz')\n" in lines
+    assert "    return trials\n" in lines
 
 
 @pytest.mark.parametrize(
@@ -93,3 +149,96 @@ def test_a_trait_is_of_the_half_before() -> None:
     config = MemorylessConfig(updates=100, batch=256, width=32, learning_rate=6e-3)
     fitted = trait.fit(Batch.of(train, 1), Batch.of(held_out, 1), Signature.of(train), config, draws())
     assert fitted.gain < 0.1
+
+
+class TestSplits:
+    """A diagnosis measures several splits of the trials, each by random numbers of its own."""
+
+    def test_each_is_another(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """And another one with another generator; progress goes from 0 to 1 over all of them."""
+        drawn, shares = list[float](), list[float]()
+
+        def measure(trials: Trials, explore: object, amounts: Amounts, rng: np.random.Generator, report: Report) -> Any:
+            drawn.append(rng.random())
+            report(0.5)
+            return CLEAR
+
+        monkeypatch.setattr(diagnose, "measure", measure)
+        data = world(0.2, True, 24, 0)
+        for seed in range(2):
+            diagnose.diagnose(data, None, DiagnoseConfig(refits=3), np.random.default_rng(seed), shares.append)
+        assert len({*drawn}) == 6
+        assert shares == pytest.approx([1 / 6, 3 / 6, 5 / 6] * 2)
+
+    def test_columns_are_judged_by_exploration(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Where there is any: an expert's actions go with what is hidden."""
+        judged = list[Trials]()
+        for module, name in ((labels, "of_dynamics"), (state, "incomplete")):
+            monkeypatch.setattr(module, name, lambda data: judged.append(data) or [])
+        expert, explore = (world(0.2, kind, 24, seed) for seed, kind in enumerate((True, False)))
+        diagnose.conclude([CLEAR], expert, explore)
+        assert [data is explore for data in judged] == [True, True]
+        diagnose.conclude([CLEAR], expert, None)
+        assert [data is expert for data in judged[2:]] == [True]
+
+
+def test_exploration_has_the_expert_s_kind_of_actions() -> None:
+    """Numbers 0 and 1 that are names, and numbers."""
+    data = world(0.2, False, 24, 0)
+    action = (data.action > 0).astype(float)
+    numbers, names = (Trials(data.obs, action, data.mask, actions) for actions in (0, 2))
+    with pytest.raises(InputError, match="exploration has other observations or actions"):
+        diagnose.check(numbers, names, DiagnoseConfig())
+
+
+def test_the_progress_of_a_part_ends_where_the_part_does() -> None:
+    shares = list[float]()
+    monitor = PartMonitor(shares.append, 0.25, 0.8)
+    for done in (0, 1, 2):
+        monitor.update(done, 2, {})
+    assert shares == pytest.approx([0.25, 0.525, 0.8])
+
+
+def test_paired_stakes_are_1_by_chance() -> None:
+    """In the mean of 40 draws of 32 trajectories: the largest of 16 deviations is compared with the largest, too."""
+    stakes = [measures.stakes_of([walks(32, 4 * draw + i) for i in range(4)])[1] for draw in range(40)]
+    assert np.mean(stakes) == pytest.approx(1, abs=0.1)
+
+
+def test_nothing_is_lost_where_wrong_latents_lead_nowhere_else() -> None:
+    """In the mean of 30 draws: one repeat is chance for the clone, and another for wrong latents."""
+    scores = []
+    for draw in range(30):
+        right, *repeats, paths, wrong = (lines(32, 5 * draw + i) for i in range(5))
+        scores.append(paired_score(paths, wrong, right, tuple(repeats)))
+    assert np.mean(scores) > 0.8
+
+
+class Noisy(Walker):
+    """Reference and actor: both stay where they are, in noise."""
+
+    def next_obs(self, obs: torch.Tensor, action: torch.Tensor, draws: Draws) -> torch.Tensor:
+        return obs + 0.1 * draws.normal(*obs.shape[1:])
+
+
+class TestLearnedEnv:
+    def test_a_repeat_is_another_rollout(self) -> None:
+        """From the same starts, by other random numbers; and the same again from the same generator."""
+        expert = Batch.of(world(0.2, True, 24, 0), 1)
+        make: Any = LearnedEnv
+        actor = Noisy()
+        env, paths = make(actor, expert, [expert], 2, 5, None), []
+        for _ in range(2):
+            rngs = [np.random.default_rng(0)]
+            paths += [env.rollout(actor, rngs).paths, env.rollout(actor, rngs).paths]
+        assert torch.equal(paths[0], paths[2])
+        assert (paths[0] != paths[1]).all()
+
+    def test_errors_of_actions_are_in_units_of_what_latents_do(self) -> None:
+        """Of what two latents differ by on average, .2 here; more than that is 1."""
+        signature = SimpleNamespace(policy=SimpleNamespace(signature=SimpleNamespace(actions=0)), theta_hat=None)
+        reference = SimpleNamespace(point=lambda obs, latent: torch.zeros(1, 1, 2), **vars(signature))
+        env: Any = SimpleNamespace(reference=reference, scale=torch.tensor([[0.2]]))
+        for action, error in ((0.0, 0.0), (0.05, 0.5), (0.3, 1.0)):
+            measured = LearnedEnv._action_error(env, torch.zeros(1, 1, 1), torch.full((1, 1, 2), action))
+            assert measured.item() == pytest.approx(error)

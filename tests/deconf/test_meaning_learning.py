@@ -185,6 +185,24 @@ def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
     assert rates[-1] == pytest.approx(0, abs=1e-9)
 
 
+def test_an_optimizer_that_is_restored_goes_on_as_before() -> None:
+    """With both moments, the count and the rate of each seed."""
+    layer, restored = Linear(2, 1, draws()), Linear(2, 1, draws())
+    optimizer = Adam([layer], 0.1, 10)
+
+    def updated(of: Linear, by: Adam, size: float) -> Tensor:
+        by.step((size * of(torch.ones(2, 3, 2))).flatten(1).mean(1))
+        return by.parameters[0].clone()
+
+    for size in (0.3, 0.01, 0.2):
+        updated(layer, optimizer, size)
+    other = Adam([restored], 0.1, 10)
+    restored.load_state_dict(layer.state_dict())
+    other.load_state_dict(optimizer.state_dict())
+    for size in (0.1, 0.4):
+        torch.testing.assert_close(updated(restored, other, size), updated(layer, optimizer, size), rtol=0, atol=0)
+
+
 def test_later_rounds_get_more_updates() -> None:
     """In proportion to the labels that there are; at least one."""
     assert dagger_method.by_round(100, 4) == [10, 20, 30, 40]

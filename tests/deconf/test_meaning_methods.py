@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,27 +16,50 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis.exploration import SHARE, ExplorationPolicy
 from deconfounded.deconf.exact import ExactAgent
+from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import Method
-from deconfounded.deconf.methods import dadp, dagger, deconfounded, dml_il, palr, rma, sequence_bc
+from deconfounded.deconf.methods import (
+    dadp,
+    dagger,
+    deconfounded,
+    deconfounded_mean,
+    deconfounded_offline,
+    dml_il,
+    dpt,
+    memoryless_bc,
+    naive_rnn,
+    naive_transformer,
+    palr,
+    rma,
+    sequence_bc,
+)
 from deconfounded.deconf.methods.dadp import DadpConfig
 from deconfounded.deconf.methods.dagger import DaggerAgent, DaggerConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
-from deconfounded.deconf.methods.deconfounded_offline import Synthesis
+from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig, Synthesis
 from deconfounded.deconf.methods.dml_il import DmlConfig, MeanHead, Rollouts
+from deconfounded.deconf.methods.dpt import DptAgent, DptConfig
 from deconfounded.deconf.methods.flow_bc import ChunkFlow, FlowAgent
+from deconfounded.deconf.methods.gail import Discriminator, GailConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
+from deconfounded.deconf.methods.naive_dropout import ActionDropoutAgent, DropoutConfig
+from deconfounded.deconf.methods.naive_transformer import TransformerConfig
 from deconfounded.deconf.methods.palr import PalrAgent, PalrConfig
 from deconfounded.deconf.methods.rma import RmaAgent, RmaConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentConfig, RecurrentTrainer
-from deconfounded.experts.agent import Agent
+from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.trials import Trials
+from tests import toys
 from tests.deconf.test_baselines import gail_env
-from tests.tools import FEW, tiny_preset
+from tests.tools import FEW, OFFLINE, tiny_preset
 
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 N, EPISODES, STEPS = 8, 2, 6
@@ -92,6 +116,57 @@ class TestRounds:
         agent = rma.train(trials(), np.zeros((N, EPISODES, 1)), explore, config, [rng()])
         assert behaviours == [None, agent]
 
+    def test_of_dpt(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Each label stays with its trial: here it is the trial's number."""
+        behaviours, sizes, beginnings = list[Agent | None](), list[int](), Batch.beginnings
+        query_loss = DptAgent.query_loss
+
+        def query(behaviour: Agent | None) -> tuple[Trials, np.ndarray]:
+            behaviours.append(behaviour)
+            rolled = trials()
+            return rolled, rolled.obs[:, :, :-1, :1] / 10
+
+        def beginnings_spy(self: Batch, *rest: Any) -> Batch:
+            sizes.append(len(self))
+            return beginnings(self, *rest)
+
+        def loss_spy(self: DptAgent, own: Batch, label: Tensor, context: Batch, *where: Tensor) -> Tensor:
+            for number in (own.obs[..., 0], context.obs[..., 0]):
+                torch.testing.assert_close(label[:, :, : number.shape[2], 0], number / 10)
+            return query_loss(self, own, label, context, *where)
+
+        monkeypatch.setattr(Batch, "beginnings", beginnings_spy)
+        monkeypatch.setattr(DptAgent, "query_loss", loss_spy)
+        agent = dpt.train(query, DptConfig(16, 1, 2, rounds=3, updates=3, batch=4), [rng()])
+        assert behaviours == [None, agent, agent]
+        assert sorted({*sizes}) == [N, 2 * N, 3 * N]
+
+    def test_of_deconfounded_mean(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The policy is cloned given the beliefs of the model of its round, and at last of the last."""
+        behaviours, sizes, beginnings = list[Agent | None](), list[int](), Batch.beginnings
+        means, imitation = list[Tensor](), MeanAgent.imitation
+
+        def explore(behaviour: Agent | None) -> Trials:
+            behaviours.append(behaviour)
+            return trials()
+
+        def beginnings_spy(self: Batch, *rest: Any) -> Batch:
+            sizes.append(len(self))
+            return beginnings(self, *rest)
+
+        def imitation_spy(self: MeanAgent, expert: Batch, mean: Tensor, *rest: Any) -> Tensor:
+            means.append(mean)
+            return imitation(self, expert, mean, *rest)
+
+        monkeypatch.setattr(Batch, "beginnings", beginnings_spy)
+        monkeypatch.setattr(MeanAgent, "imitation", imitation_spy)
+        config = MeanConfig(**{**FEW, "width": 8, "latent": 2, "inference_steps": 64})
+        agent = deconfounded_mean.train(trials(), explore, config, [rng()])
+        assert behaviours == [None, agent]
+        assert sizes == [N, N, 2 * N, 2 * N]
+        assert [torch.equal(*pair) for pair in pairwise(means)] == [True, False, True, True, True]
+        torch.testing.assert_close(means[-1], deconfounded_mean.running_mean(agent.model, batch()))
+
     def test_how_much_is_kept_where_theta_drifts_is_of_the_last(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Its exploration is the nearest to what the agent does when it is deployed."""
         marks, chosen = iter((0.0, 100.0)), list[Batch]()
@@ -100,6 +175,49 @@ class TestRounds:
         deconfounded.train(trials(), lambda behaviour: trials(next(marks)), config, [rng()])
         assert len(chosen[0]) == N * EPISODES
         assert (chosen[0].obs[..., 0] >= 100).all()
+
+
+class TestRequests:
+    """What a method asks for when it is given data: see deconf/given.py."""
+
+    def given(self, fresh: bool = False) -> tuple[Given, list[tuple[Any, ...]]]:
+        """And a list of what was asked for, with the agent that is to be rolled out."""
+        asked = list[tuple[Any, ...]]()
+        about = {"observations": 2, "action_space": toys.Push.action_space, "episodes": 2, "horizon": 6, "fresh": fresh}
+
+        def ask(kind: str, *details: Any, agent: Agent | None = None) -> Any:
+            asked.append((kind, *details, agent))
+
+        return Given(ask, about, None, [rng()], Monitor()), asked
+
+    def test_roll_outs_are_of_the_agent(self) -> None:
+        """As many as asked for, and environments of the seed that was asked for."""
+        (given, asked), agent = self.given(), RandomAgent(toys.Push.action_space)
+        given.explore(agent, 3)
+        given.explore_with_theta(agent)
+        given.query(agent, 5)
+        given.environments(1, 4)
+        assert asked == [
+            ("exploration", 3, agent),
+            ("exploration with theta", None, agent),
+            ("queries", 5, agent),
+            ("environments", 1, 4, None),
+        ]
+
+    @pytest.mark.parametrize("fresh", [False, True])
+    def test_demonstrations_are_fresh_where_the_preset_says_so(self, fresh: bool) -> None:
+        """At each call."""
+        given, asked = self.given(fresh)
+        source = given.source
+        if callable(source):
+            source()
+            source()
+        assert asked == ([("fresh demonstrations", None)] * 2 if fresh else [("demonstrations", None)])
+
+    @pytest.mark.parametrize(("share", "loss"), [(np.nan, 1.0), (0.5, np.inf)])
+    def test_progress_is_of_finite_numbers(self, share: float, loss: float) -> None:
+        with pytest.raises(envs.InputError, match="it must be finite numbers"):
+            self.given()[0].progress(share, imitation=loss)
 
 
 class TestMemories:
@@ -132,6 +250,18 @@ class TestMemories:
         optimizer, theta = sequence_bc.Adam([agent.adapter], 1e-3), torch.zeros(*data.mask.shape, 1)
         self.spied(agent, lambda: rma._pass(agent, optimizer, data, theta, 4) and None, monkeypatch)
 
+    def test_the_last_chunk_is_as_long_as_what_is_left(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """All steps of a trial are learned, each in one update of a pass."""
+        data, lengths = batch(), list[int]()
+        agent = RecurrentAgent.new(8, Scales.of(FLAT, data), draws())
+        trainer = RecurrentTrainer(agent, RecurrentConfig(width=8, updates=3, chunk=5), EPISODES * STEPS, Monitor())
+        loss = agent.loss
+        spy = lambda part, *rest: (lengths.append(part.mask.shape[2]), loss(part, *rest))[1]  # noqa: E731
+        monkeypatch.setattr(agent, "loss", spy)
+        trainer.learn(data, data.action)
+        assert lengths == [5, 5, 2]
+        assert trainer.done == trainer.total == 3
+
     def test_a_history_ends_with_its_episode(self) -> None:
         """flow_bc reads the latest steps of the episode alone."""
         shape = {"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}
@@ -142,6 +272,18 @@ class TestMemories:
         assert agent.features().any()
         agent.reset([rng()])
         assert not agent.features().any()
+
+    def test_a_chunk_ends_with_its_episode(self) -> None:
+        """Actions that flow_bc has not executed by then are never executed."""
+        shape, acted = {"width": 8, "history": 3, "ahead": 4, "executed": 4, "integration": 2}, []
+        for seen in (0.0, 1.0):
+            agent = FlowAgent.blank(shape, Scales.plain(FLAT, 1), draws())
+            agent.begin(N)
+            for obs in (0.0, seen):
+                agent.reset([rng()])
+                acted.append(agent.act(np.full((N, 2), obs, np.float32)))
+        np.testing.assert_array_equal(acted[0], acted[2])
+        assert (acted[1] != acted[3]).any()
 
 
 class TestInstruments:
@@ -230,6 +372,16 @@ def test_synthetic_actions_are_random_as_often_as_asked(share: float, std: float
     assert synthetic.action.mean().item() == pytest.approx(0.5 * (1 - share), abs=0.08)
 
 
+def test_the_unit_of_an_online_belief_is_of_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """deconfounded_offline: those that it infers on whole trials of the expert."""
+    inferred = list[Tensor]()
+    spy = lambda *parts: (inferred.append(parts[2]), Synthesis(*parts))[1]  # noqa: E731
+    monkeypatch.setattr(deconfounded_offline, "Synthesis", spy)
+    agent = deconfounded_offline.train(trials(), OfflineConfig(**{**OFFLINE, "width": 8, "online_steps": 64}), [rng()])
+    torch.testing.assert_close(agent.model.latent_stds(), inferred[0].std(1, correction=0).clamp(min=0.05))
+    assert inferred[0].shape[1] == N
+
+
 def test_an_exploration_policy_acts_at_random_now_and_then() -> None:
     """By a share of SHARE; in the other steps as the clone does, which always says .5 here."""
     policy = ActionHead(FLAT.obs, 8, Scales.plain(FLAT, 1), draws())
@@ -275,3 +427,107 @@ def test_large_observations_have_wide_networks(columns: int, width: int) -> None
     task.drifts = False
     assert METHODS["naive_rnn"].amounts("default", task, "cpu")["width"] == width
     assert (LARGE_OBSERVATION, WIDE) == (16, 128)
+
+
+def test_each_batch_of_a_function_is_fresh_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first are for scales alone."""
+    marks, learned = iter((0.0, 100.0, 200.0)), list[float]()
+    learn = RecurrentTrainer.learn
+
+    def spy(self: RecurrentTrainer, data: Batch, label: Tensor) -> None:
+        learned.append(data.obs[0, 0, 0, 0].item())
+        learn(self, data, label)
+
+    monkeypatch.setattr(RecurrentTrainer, "learn", spy)
+    naive_rnn.train(lambda: trials(next(marks)), RecurrentConfig(width=8, updates=2), [rng()])
+    assert learned == [100, 200]
+
+
+def test_ppo_has_the_settings_of_gail() -> None:
+    from deconfounded.deconf.methods.gail_ppo import new_ppo
+
+    config = GailConfig(width=8, envs=3, steps=8, epochs=2, minibatch=12, gamma=0.5, policy_rate=0.25)
+    ppo = new_ppo(gail_env()[0], config, 0)
+    assert (ppo.n_steps, ppo.n_epochs, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (8, 2, 12, 0.5, 0.25)
+
+
+def test_each_seed_of_gail_is_rewarded_by_its_own_discriminator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the environments of its own, before the first round and in each."""
+    rewarded, of_seed = list[int](), Discriminator.of_seed
+    spy = lambda self, i: (rewarded.append(i), of_seed(self, i))[1]  # noqa: E731
+    monkeypatch.setattr(Discriminator, "of_seed", spy)
+    fit(Context(envs.get("tilted_cartpole"), tiny_preset().configured("gail", rounds=1), [0, 1], Monitor()), "gail")
+    assert rewarded == [0, 1, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "value"),
+    [
+        ("deconfounded_gru", "model", "gru"),
+        ("deconfounded_forgetting", "model", "forgetting"),
+        ("deconfounded_discrete", "model", "discrete"),
+        ("deconfounded_large", "latent", 16),
+        ("deconfounded_large", "width", WIDE),
+    ],
+)
+@pytest.mark.parametrize(
+    ("preset", "task"), [("default", "tilted_cartpole"), ("default", "bandit"), ("paper", "bandit")]
+)
+def test_what_a_variant_is_named_for(name: str, setting: str, value: object, preset: str, task: str) -> None:
+    """On control and on the bandit, in each preset."""
+    assert METHODS[name].amounts(preset, envs.get(task), "cpu")[setting] == value
+
+
+def test_the_large_variant_begins_anew_on_control() -> None:
+    tasks = ("tilted_cartpole", "bandit")
+    restarts = [METHODS["deconfounded_large"].amounts("default", envs.get(name), "cpu")["restart"] for name in tasks]
+    assert restarts == [True, False]
+
+
+def test_a_clone_is_trained_with_its_own_settings() -> None:
+    """The dropout and the penalty of those of naive_rnn's family that have one."""
+    dropping, penalised = DropoutConfig(width=8, updates=1, dropout=0.3), PalrConfig(width=8, updates=1, penalty=3.0)
+    assert sequence_bc.train_recurrent(ActionDropoutAgent, trials(), dropping, [rng()]).dropout == 0.3
+    assert sequence_bc.train_recurrent(PalrAgent, trials(), penalised, [rng()]).config is penalised
+
+
+def test_a_transformer_reads_as_many_tokens_as_a_trial_of_training_has() -> None:
+    config = TransformerConfig(width=16, layers=1, heads=2, updates=1, batch=4)
+    assert naive_transformer.train(trials(), config, [rng()]).net.window == EPISODES * STEPS
+
+
+@pytest.mark.parametrize("method", ["dagger", "dpt"])
+def test_labels_are_in_units_of_their_own(method: str) -> None:
+    """And not of the actions of roll-outs, which are the imitator's."""
+    label = 0.3 + 5 * trials().action
+    agents: dict[str, Callable[..., Any]] = {
+        "dagger": lambda query: dagger.train(query, DaggerConfig(16, 3, rounds=1, updates=1, batch=4), [rng()]),
+        "dpt": lambda query: dpt.train(query, DptConfig(16, 1, 2, rounds=1, updates=1, batch=4), [rng()]),
+    }
+    scaler = agents[method](lambda behaviour: (trials(), label)).policy.scaler
+    assert scaler.mean.item() == pytest.approx(label.mean(), abs=1e-5)
+    assert scaler.std.item() == pytest.approx(label.std(), abs=1e-5)
+
+
+def test_contexts_are_read_by_the_encoder_that_was_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    """dadp: its policy is cloned on them, and they are as long as all episodes but one."""
+    read, contexts = list[Tensor](), dadp.contexts
+    spy = lambda memories, of: (read.append(memories), contexts(memories, of))[1]  # noqa: E731
+    monkeypatch.setattr(dadp, "contexts", spy)
+    config = DadpConfig(width=8, inference_updates=2, inference_batch=4, inference_steps=16, imitation_updates=1)
+    agent = dadp.train(trials(), config, rng())
+    with torch.no_grad():
+        memories = agent.encoder(Batch.of(split_episodes(trials()), 1))[:, :, -1]
+    torch.testing.assert_close(read[-1], memories.unflatten(1, (N, EPISODES)))
+    assert agent.encoder.longest == (EPISODES - 1) * STEPS
+
+
+def test_a_teacher_has_settings_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rma: its updates, batch and learning rate are not the student's."""
+    taught, clone = list[MemorylessConfig](), memoryless_bc.train
+    spy = lambda data, config, *rest: (taught.append(config), clone(data, config, *rest))[1]  # noqa: E731
+    monkeypatch.setattr(memoryless_bc, "train", spy)
+    config = RmaConfig(8, 2, 4, rounds=1, learning_rate=0.1, teacher_updates=3, teacher_batch=16, teacher_rate=0.2)
+    theta = np.zeros((N, EPISODES, 1))
+    rma.train(trials(), theta, lambda behaviour: (trials(), theta), config, [rng()])
+    assert taught == [MemorylessConfig(8, 3, 16, 0.2)]

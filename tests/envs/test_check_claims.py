@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from deconfounded import envs
+from deconfounded.envs.contract import probe
 from deconfounded.envs.contract.core import CONTRACT
 from deconfounded.envs.edits import Edit
 from deconfounded.envs.physics import Physics
@@ -61,6 +62,41 @@ class Inexact(SlipperyCartpole):
 def test_the_contract_catches(task: type[envs.Task], check: str, says: str) -> None:
     with pytest.raises(AssertionError, match=f"^{says}"):
         CONTRACT[check](task())
+
+
+class LoudExpert(SlipperyCartpole):
+    expert_noise = float("inf")
+
+
+def test_an_expert_s_noise_is_finite() -> None:
+    with pytest.raises(envs.InputError, match="expert_noise of slippery_cartpole was inf; it must be above 0, and fin"):
+        envs.check_task(LoudExpert())
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "says"),
+    [
+        ([1.0, np.nan, 3.0], [1.0, 2.0, 3.0], r"nan and 2.0 at \[1\], the first of 1 such places"),
+        ([1.0, 2.0, 3.0], [0.0, np.nan, 3.0], r"1.0 and 0.0 at \[0\], the first of 2 such places"),
+        ([1.0, 2.0], [1.0, 2.0, 3.0], r"their shapes are \(2,\) and \(3,\)"),
+    ],
+)
+def test_arrays_that_differ_are_not_the_same(left: list[float], right: list[float], says: str) -> None:
+    """A number differs from what is none, which is the same as what is none."""
+    probe.same([np.nan, 1.0], [np.nan, 1.0], "states")
+    with pytest.raises(AssertionError, match=f"^states differ: {says}"):
+        probe.same(left, right, "states")
+
+
+def test_a_refusal_is_one_by_its_words() -> None:
+    """An InputError for another reason does not show that the input was looked at."""
+    with probe.refused("a theta", "out of its bounds"):
+        raise envs.InputError("theta was 2, out of its bounds")
+    says = "a theta was refused by 'no such file', which does not match 'out of its bounds'"
+    with pytest.raises(AssertionError, match=says), probe.refused("a theta", "out of its bounds"):
+        raise envs.InputError("no such file")
+    with pytest.raises(AssertionError, match="a theta was let through"), probe.refused("a theta", "bounds"):
+        pass
 
 
 class Sloping(SlipperyCartpole):

@@ -1,5 +1,6 @@
 """What comes in from outside is what it says it is, or one line: nothing is converted, cut or broadcast in silence."""
 
+import json
 import os
 import pickle
 import re
@@ -324,6 +325,46 @@ class TestTasks:
         weights = {"0.weight": np.ones((1, width), np.int64), "0.bias": np.ones(1, np.float32)}
         save_file(weights, tmp_path / "x.safetensors")
         with pytest.raises(envs.InputError, match="is of int64 and float32, not of float32"):
+            policy.load(task, tmp_path / "x.safetensors")
+
+    @pytest.mark.parametrize(("version", "stated"), [(3, 3), ("3", 0), (None, 0), ([3], 0)])
+    def test_version_of_given_weights(self, version: Any, stated: int, tmp_path: Path) -> None:
+        """That of the card beside them, if it is a number; not that of the task's own."""
+        task, file = envs.get("slippery_cartpole"), tmp_path / "x.safetensors"
+        file.with_suffix(".json").write_text(json.dumps({"version": version}))
+        assert policy.version(task, file) == stated
+        assert policy.version(task) == json.loads(policy.path(task).with_suffix(".json").read_bytes())["version"]
+
+    def test_rows_that_are_drawn_need_not_be_normalised(self) -> None:
+        """Each index as often as its share of its own row."""
+        probs = np.repeat([[1.0, 3.0, 0.0], [0.1, 0.1, 0.2]], 20_000, 0)
+        drawn = policy.sample_rows(probs, np.random.default_rng(0)).reshape(2, -1)
+        shares = [np.bincount(row, minlength=3) / len(row) for row in drawn]
+        np.testing.assert_allclose(shares, [[0.25, 0.75, 0], [0.25, 0.25, 0.5]], atol=0.015)
+
+    @pytest.mark.parametrize(
+        ("change", "says"),
+        [
+            ({"1.weight": np.ones((1, 3), np.float32)}, "layer 1 of .* takes 3 inputs, not 4"),
+            ({"1.weight": np.full((1, 4), np.inf, np.float32)}, "layer 1 of .* holds NaN or infinity"),
+            ({"1.bias": np.full(1, np.nan, np.float32)}, "layer 1 of .* holds NaN or infinity"),
+            ({"0.bias": np.full(4, np.nan, np.float32)}, "layer 0 of .* holds NaN or infinity"),
+            ({"1.bias": np.ones(2, np.float32)}, "lack a whole layer 1"),
+        ],
+    )
+    def test_expert_weights_of_each_layer(self, change: dict[str, Any], says: str, tmp_path: Path) -> None:
+        task = envs.get("slippery_cartpole")
+        shapes = {
+            "0.weight": (4, len(task.observation) + task.theta_width),
+            "0.bias": 4,
+            "1.weight": (1, 4),
+            "1.bias": 1,
+        }
+        weights = {name: np.ones(shape, np.float32) for name, shape in shapes.items()}
+        save_file(weights, tmp_path / "x.safetensors")
+        policy.load(task, tmp_path / "x.safetensors")
+        save_file(weights | change, tmp_path / "x.safetensors")
+        with pytest.raises(envs.InputError, match=says):
             policy.load(task, tmp_path / "x.safetensors")
 
 

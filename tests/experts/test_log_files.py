@@ -10,7 +10,7 @@ from deconfounded import envs
 from deconfounded.experts import datasets
 from deconfounded.experts.datasets.logs import trials_of
 from deconfounded.experts.datasets.rows import Roles
-from deconfounded.experts.datasets.table import Table
+from deconfounded.experts.datasets.table import Table, number, of_episodes
 from deconfounded.experts.datasets.units import Units
 from tests.experts.test_logs import ROLES, expected, of_lerobot, rows, write_csv, write_parquet
 
@@ -83,6 +83,31 @@ def test_frames_of_lerobot_in_any_order(tmp_path: Path) -> None:
     assert datasets.read(tmp_path / "set", "vehicle").sha256 == log.sha256
 
 
+def test_text_is_no_observation_of_lerobot(tmp_path: Path) -> None:
+    """By itself; it may say which trial a row is of."""
+    log = of_lerobot(tmp_path)
+    parquet, pyarrow = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("pyarrow")
+    for file in (tmp_path / "set" / "data").rglob("*.parquet"):
+        table = parquet.read_table(file)
+        modes = pyarrow.array([f"mode {i}" for i in table["episode_index"].to_pylist()])
+        parquet.write_table(table.append_column("observation.mode", modes), file)
+    again = datasets.read(tmp_path / "set", "vehicle")
+    assert (again.sha256, again.units.obs) == (log.sha256, log.units.obs)
+    assert datasets.read(tmp_path / "set", "observation.mode").names == tuple(f"mode {i}" for i in range(5))
+
+
+def test_what_each_episode_says_of_itself_is_a_column_of_its_rows() -> None:
+    """What one of them leaves out, or says at length, is none."""
+    both = {"driver": "a", "wind": 0.5, "tasks": ["turn", "stop"], "notes": "x" * 101, "seed": 2**60}
+    columns = of_episodes([{**both, "late": 1}, {**both, "driver": "b", "wind": 2}], [2, 1])
+    assert {name: column.tolist() for name, column in columns.items()} == {
+        "driver": ["a", "a", "b"],
+        "wind": [0.5, 0.5, 2.0],
+        "tasks": ["turn, stop"] * 3,
+        "seed": [str(2**60)] * 3,
+    }
+
+
 def test_a_declared_range_holds_what_was_done() -> None:
     """An action beyond the range that a format declares widens it, and comes back as it was."""
     columns = {"lap": np.repeat([0.0, 1.0], 3), "x": np.arange(6.0), "push": np.array([0.0, 0.5, 0, 3.0, 0.2, 0])}
@@ -103,3 +128,21 @@ def test_the_first_part_of_a_name_ends_at_a_dot() -> None:
     """A column whose name goes on otherwise is another one."""
     table = Table("a", {name: np.zeros(2) for name in ("speed.0", "speed.1", "speed_limit")})
     assert table.select("obs", ["speed"]) == ("speed.0", "speed.1")
+
+
+def test_a_column_that_two_patterns_match_is_taken_once() -> None:
+    table = Table("a", {name: np.zeros(2) for name in ("speed x", "speed y", "push")})
+    assert table.select("obs", ["speed y", "speed*", "push", "push"]) == ("speed y", "speed x", "push")
+
+
+@pytest.mark.parametrize(("count", "values"), [(32, tuple(range(32))), (33, ())])
+def test_up_to_32_whole_numbers_are_discrete_actions(count: int, values: tuple[int, ...]) -> None:
+    """More are a continuous action."""
+    columns = {"lap": np.zeros(count + 1), "x": np.arange(count + 1.0), "push": np.append(np.arange(count), 0.0)}
+    (log,) = trials_of([[Table("a", columns)]], Roles(None, "lap", ("x",), ("push",)))
+    assert (log.units.values, log.actions) == (values, len(values))
+
+
+@pytest.mark.parametrize("cell", ["", " ", "NA", "n/a", "NaN", "NULL", "None "])
+def test_an_empty_cell_is_no_number_however_it_is_written(cell: str) -> None:
+    assert np.isnan(number(cell))

@@ -1,0 +1,167 @@
+"""What commands and the engine say and take, by what it means: returns that are played, versions, and digests."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks import play
+from deconfounded.benchmarks.engine import catalogue, job_files, local, sources
+from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import cards, table
+from deconfounded.experts.agent import RandomAgent
+from tests import toys
+
+METHOD = """
+from deconfounded.deconf.method import uses
+
+@uses("demonstrations", version=3)
+def fit(given): pass
+"""
+
+
+def test_a_return_that_is_played_is_the_sum_of_its_episode_s_rewards() -> None:
+    """An episode ends where the environment says so, by a fall or by the time limit."""
+    episodes: list[list[float]] = []
+
+    class Watched(envs.GymEnv):
+        def reset(self, **options: Any) -> Any:
+            episodes.append([])
+            return super().reset(**options)
+
+        def step(self, action: Any) -> Any:
+            then = super().step(action)
+            episodes[-1].append(then[1])
+            return then
+
+    env = Watched(toys.Push())
+    returns, _ = play.play(RandomAgent(env.task.action_space), env, 8, 5)
+    assert returns == pytest.approx([sum(rewards) for rewards in episodes])
+    lengths = [len(rewards) for rewards in episodes]
+    assert max(lengths) <= env.task.horizon
+    assert max(lengths) > 1
+    assert len(set(lengths)) > 1
+
+
+def test_what_play_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """So many episodes, under that seed and theta; as many as in the task's trials where no number is given."""
+    asked: list[tuple[Any, ...]] = []
+
+    def played(agent: Any, env: envs.GymEnv, episodes: int, seed: int, theta: Any) -> Any:
+        env.reset(seed=seed, options=theta and {"theta": theta})
+        asked.append((agent, episodes, seed, theta))
+        return [1.25, -0.5], []
+
+    monkeypatch.setattr(play, "ready", lambda folder, task: f"{folder} on {task.name}")
+    monkeypatch.setattr(play, "play", played)
+    for more in ([], ["--episodes", "2", "--seed", "4", "--theta", "0.25"]):
+        monkeypatch.setattr("sys.argv", ["play", "--agent", "mine", "--task", "slippery_cartpole", *more])
+        play.main()
+    agent, task = "mine on slippery_cartpole", envs.get("slippery_cartpole")
+    assert task.episodes != 2
+    assert asked == [(agent, task.episodes, 0, None), (agent, 2, 4, [0.25])]
+    said = f"slippery_cartpole, friction 0.25 {task.latents[0].unit}".strip()
+    assert capsys.readouterr().out.splitlines()[1] == f"{said}: returns 1.25 -0.50"
+
+
+def test_the_version_of_a_method_from_outside_is_its_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever number it declares: a change of the text alone makes its records stale."""
+    monkeypatch.setattr(catalogue.METHODS, "outside", {})
+    (tmp_path / "versioned.py").write_text(METHOD)
+    name = catalogue.add(f"{tmp_path}/versioned.py:fit")
+    assert catalogue.METHODS[name].version == 0
+    guest = catalogue.guest(name)
+    assert guest is not None
+    assert (guest.version, guest.uses) == (0, ("demonstrations",))
+
+
+def test_a_digest_is_of_names_and_contents(tmp_path: Path) -> None:
+    """Wherever the files lie, and in any order; but not if two of them change places, or if one has another name."""
+    texts = {"a.py": "x = 1", "b.py": "x = 2"}
+    folders = {"first": texts, "again": texts, "turned": {"a.py": "x = 2", "b.py": "x = 1"}}
+    folders["named"] = {"a.py": "x = 1", "c.py": "x = 2"}
+    made: dict[str, set[str]] = {}
+    for folder, held in folders.items():
+        (tmp_path / folder).mkdir()
+        for name, text in held.items():
+            (tmp_path / folder / name).write_text(text)
+        files = [tmp_path / folder / name for name in held]
+        made[folder] = {sources.digest(files), sources.digest(reversed(files))}
+    assert [len(digests) for digests in made.values()] == [1] * 4
+    assert made["first"] == made["again"]
+    assert len(set.union(*made.values())) == 3
+
+
+def test_whether_two_machines_have_the_same_is_without_what_a_wheel_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Studies are in a checkout alone; code, models and weights count, and pictures do not."""
+    monkeypatch.setattr(sources, "OURS", (tmp_path,))
+    counts = {"a.py": True, "b.xml": True, "c.safetensors": True, "studies/d.py": False, "e.png": False}
+    (tmp_path / "studies").mkdir()
+    for name in counts:
+        (tmp_path / name).write_text("1")
+    before = sources.package.__wrapped__()
+    for name, matters in counts.items():
+        (tmp_path / name).write_text("23")
+        assert (sources.package.__wrapped__() != before) is matters, name
+        before = sources.package.__wrapped__()
+
+
+@pytest.mark.parametrize("key", ["returns", "objective", "probe"])
+def test_a_job_s_file_without_a_number_is_broken(key: str) -> None:
+    """Whichever of its arrays lacks it: the record would hold it too."""
+    shapes = {"x/returns": (2, 3), "x/objective": (2, 3), "x/probe": (3,)}
+    meta = {"identity": {"method": "x"}, "seed": 0, "budget": {}, "spans": [], "cpu_s": 1.0, "arrays": list(shapes)}
+    meta |= {"machine": "m", "commit": None, "agents": {"x": ""}, "curve": {}, "tier": "1"}
+    data = {"meta": meta, **{name: np.zeros(shape) for name, shape in shapes.items()}}
+    assert job_files.broken(data) == ""
+    for value in (np.nan, -np.inf):
+        data[f"x/{key}"][-1] = value
+        assert job_files.broken(data) == f"x/{key} holds NaN or infinity"
+
+
+def test_many_seeds_have_a_name_of_their_own() -> None:
+    """It is short, though others may have the same first and last."""
+    many, fewer = list(range(12)), [*range(10), 11]
+    assert job_files.in_name([0, 2, 1]) == "0-2-1"
+    assert job_files.in_name(many).startswith("0-to-11-")
+    assert job_files.in_name(many) == job_files.in_name(tuple(many)) != job_files.in_name(fewer)
+    assert len(job_files.in_name(range(1000))) < 30
+
+
+@pytest.mark.parametrize("threads", [None, "4"])
+def test_workers_alone_have_one_thread(threads: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever this process has, it has again when they are made."""
+    if threads is None:
+        monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    else:
+        monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    with local.inherited():
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+    assert os.environ.get("OMP_NUM_THREADS") == threads
+
+
+def test_a_gpu_has_a_single_job_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which has all seeds side by side; of a CPU, each core has its own."""
+    monkeypatch.setattr(local, "cores", lambda: 6)
+    with local.Local() as engine:
+        assert [engine.slots(device) for device in ("cpu", "cuda", "cuda:1")] == [6, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("more", "docs"), [([], True), (["--set", "eval_trials=4"], False), (["--preset", "smoke"], False)]
+)
+def test_the_table_in_docs_is_of_default_runs_alone(
+    more: list[str], docs: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Records of other settings, or of another preset, are kept in the folder given."""
+    read: list[Path] = []
+    monkeypatch.setattr(records, "held", lambda file: (read.append(file), [])[1])
+    words = ["table", "--tasks", "bandit", "--methods", "random", "--seeds", "1", "--list", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", [*words, *more])
+    table.main()
+    assert [file.is_relative_to(cards.DOCS if docs else tmp_path) for file in read] == [True]
