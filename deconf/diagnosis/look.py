@@ -75,7 +75,7 @@ def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:
 
 
 def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
-    """Trials whose medians, spreads or lengths are far from those of the others."""
+    """Trials whose medians, spreads, shares or lengths are far from those of the others."""
     present = np.flatnonzero(log.mask.any((1, 2)))
     count = len(present)
     if count < 8:
@@ -85,8 +85,17 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     names, features = ["length of episodes"], [per_episode.astype(float)]
     least = [0.1 * float(per_episode.mean())]
     rows = [np.flatnonzero(steps.trial == i) for i in present]
-    named = zip(log.units.obs + log.units.action, np.concatenate([steps.obs, steps.action], 1).T, strict=True)
+    acted = fits.one_hot(steps.action, log.actions)
+    actions = (
+        [f"{value} in {log.units.action[0]}" for value in log.units.values[1:]] if log.actions else log.units.action
+    )
+    named = zip((*log.units.obs, *actions), np.concatenate([steps.obs, acted], 1).T, strict=True)
     for name, column in named:
+        if len(values := np.unique(column)) == 2:  # quartiles of a flag, or of numbers of actions, say nothing
+            share = f"share of {name}" if name in actions else f"share of {values[1]:g} in {name}"
+            names, least = [*names, share], [*least, 0.05]
+            features.append(np.array([(column[index] == values[1]).mean() for index in rows]))
+            continue
         quartiles = np.array([np.quantile(column[index], [0.25, 0.5, 0.75]) for index in rows])
         names += [f"median of {name}", f"interquartile range of {name}"]
         features += [quartiles[:, 1], quartiles[:, 2] - quartiles[:, 0]]

@@ -431,6 +431,24 @@ def test_printed_lines_run(advice: advices.Next, tmp_path: Path, monkeypatch: py
     assert (tmp_path / "agent" / "agent.json").is_file()
 
 
+@pytest.mark.parametrize(("odd_action", "odd_flag"), [(None, None), (2, None), (None, 1)])
+def test_flags_and_numbers_of_actions_have_shares(odd_action: int | None, odd_flag: int | None) -> None:
+    """And no medians: trials of coins and of random actions are alike, whatever their quartiles are."""
+    rng = np.random.default_rng(0)
+    obs = (rng.random((60, 1, 41, 1)) < 0.3).astype(np.float32)
+    action = rng.integers(0, 3, (60, 1, 40, 1)).astype(float)
+    if odd_action is not None:
+        action[7] = odd_action
+    if odd_flag is not None:
+        obs[7] = odd_flag
+    remarks = look(Trials(obs, action, np.ones((60, 1, 40), bool), 3))
+    assert len([each for each in remarks if each.kind == "outlier"]) == (odd_action, odd_flag).count(None) % 2
+    if odd_action is not None:
+        assert "Trial 7 is unlike the others: its share of 2 in action 0 is 1" in said(remarks, "outlier")
+    if odd_flag is not None:
+        assert "Trial 7 is unlike the others: its share of 1 in observation 0 is 1" in said(remarks, "outlier")
+
+
 def test_an_expert_is_no_explorer(tmp_path: Path) -> None:
     """The same trials twice, though from two files, are refused."""
     files = tmp_path / "a.csv", tmp_path / "b.csv"
