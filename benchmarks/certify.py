@@ -286,7 +286,7 @@ def main() -> None:
         print(f"conditional, interventional and evidence are of learned dynamics, not exact: {fit}")
     nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
     inferred = ", ".join(f"{name} {value:.2f}" for name, value in result["inferability"][-1].items())
-    print(f"evidence a step: {nats}; theta from expert trials, R2: {inferred}")
+    print(f"evidence a step: {nats}; theta from expert trials (R2, or the share that is right): {inferred}")
     print(f"{task.name}: certificate {result['verdict']}, in {time.time() - start:.0f} s -> {folder}")
     if result["verdict"] == "failed":
         raise SystemExit(1)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -249,9 +250,10 @@ def _times(column: Column) -> NDArray[np.float64] | None:
     if column.dtype != object:
         return column
     try:
-        return np.array([str(text).strip().removesuffix("Z") for text in column], "datetime64[us]").astype(float) / 1e6
+        times = [datetime.fromisoformat(str(text).strip()) for text in column]
     except ValueError:
         return None
+    return np.array([(time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() for time in times])
 
 
 def _constant(column: Column) -> bool:

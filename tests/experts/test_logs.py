@@ -302,7 +302,8 @@ class TestNotes:
     def test_columns_of_time(self, name: str, tmp_path: Path) -> None:
         """Also texts as ISO 8601 has them; of other texts nothing is known."""
         times = [f"2026-11-29T10:00:{second:02}Z" for second in (1, 2, 4, 3, 5)]
-        for stamps, notes in ((times, 1), ([f"{i}." for i in (1, 2, 4, 3, 5)], 1), ([*"abdce"], 0)):
+        zones = [time.replace("Z", "+02:00") for time in times]
+        for stamps, notes in ((times, 1), (zones, 1), ([f"{i}." for i in (1, 2, 4, 3, 5)], 1), ([*"abdce"], 0)):
             made = [{"run": 0, name: stamp, "x": i, "u": i / 10} for i, stamp in enumerate(stamps)]
             log = datasets.read(write_csv(tmp_path / "x.csv", made), trial="run", obs=["x"], action=["u"])
             assert sum("runs backwards 1 times" in note for note in log.notes) == notes
