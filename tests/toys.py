@@ -81,6 +81,13 @@ class Drift(Push):
     latents = (Latent("force", "N", -1.0, 1.0, drift=0.1),)
 
 
+class Switch(Push):
+    """The same, under a force that is drawn anew in one step of ten."""
+
+    name = "switch"
+    latents = (Latent("force", "N", -1.0, 1.0, switch=0.1),)
+
+
 class Arms(Task):
     """Three arms, of which a hidden one pays more often; the expert knows which."""
 

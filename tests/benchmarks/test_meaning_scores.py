@@ -37,13 +37,6 @@ PUSH = toys.Push()
 EXPERT = CallableExpert(PUSH, toys.control, "control")
 
 
-class Switching(toys.Push):
-    """Push, under a force that is drawn anew in one step of ten."""
-
-    name = "switching"
-    latents = (envs.Latent("force", "N", -1.0, 1.0, switch=0.1),)
-
-
 class Late(Agent):
     """Random in a trial's first episode, and the expert in those after."""
 
@@ -472,7 +465,7 @@ def test_a_picture_of_stakes_has_the_true_theta_in_its_rows(figures: list[Any], 
 
 def test_a_certificate_s_belief_goes_on_after_an_early_end() -> None:
     """Theta switches in the steps that an episode lacks too: by hand, one step in ten draws it anew, here for four."""
-    env, k = envs.BatchEnv(Switching(), 5), 6
+    env, k = envs.BatchEnv(toys.Switch(), 5), 6
     expert = CallableExpert(env.task, toys.control, "control")
     recorder = certify.EvidenceRecorder(env, expert, Grid(env, expert, k))
     obs = env.reset(0)

@@ -235,8 +235,8 @@ class TestTables:
         assert table.missing(job, "default", fresh) == ()
         assert table.missing(replace(job, protocol="once"), "default", fresh) == (0, 1)
         assert table.missing(job, "default", [{**record, "preset": "paper"} for record in fresh]) == (0, 1)
-        way = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
-        assert table.missing(replace(job, guest=way), "default", fresh) == (0, 1)
+        deployed = replace(METHODS["random"], deployments={"mode": lambda agent: agent})
+        assert table.missing(replace(job, guest=deployed), "default", fresh) == (0, 1)
 
     def test_what_scarce_data_do_not_change_is_not_made_twice(self, both: tuple[list[Any], list[Any]]) -> None:
         """Records of the standard protocol are also those of a policy that learns from no data, and of no other."""

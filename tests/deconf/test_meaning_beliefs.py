@@ -10,7 +10,7 @@ from torch import Tensor
 
 from deconfounded import envs
 from deconfounded.deconf import learned_reference
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.gru import GruBelief
@@ -18,6 +18,7 @@ from deconfounded.deconf.core.latent_agent import DeconfoundedAgent, Explorer
 from deconfounded.deconf.core.linear_model import LinearModel
 from deconfounded.deconf.core.models import VariationalModel, new_model
 from deconfounded.deconf.core.nets import Inputs, Scales
+from deconfounded.deconf.diagnosis.learned_env import LearnedEnv, PosteriorSampler
 from deconfounded.deconf.exact import ExactAgent, Grid
 from deconfounded.deconf.learned_reference import LearnedDynamics
 from deconfounded.deconf.methods.deconfounded_offline import exact
@@ -25,18 +26,14 @@ from deconfounded.deconf.particles import Particles
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
-from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import Rollout, run_trials
 from deconfounded.experts.trials import Trials
 from tests import toys
+from tests.deconf.ball import streams
+from tests.deconf.test_particles import expert
 from tests.envs.test_drift import Average
 
 FLAT = Signature(obs=1, action=1, actions=0, binary=False)
-
-
-class Switching(toys.Push):
-    name = "switching"
-    latents = (Latent("force", "N", -1.0, 1.0, switch=0.1),)
 
 
 class TwoKinds(toys.Push):
@@ -46,24 +43,16 @@ class TwoKinds(toys.Push):
     latents = (*toys.Push.latents, Latent("kind", "", 0, 1, "categorical"), Latent("rest", "", 0.0, 1.0))
 
 
-def expert(task: envs.Task) -> CallableExpert:
-    return CallableExpert(task, lambda obs, theta: toys.control(obs, theta[:, :1]), "control")
-
-
-def draws(seeds: int = 1) -> Draws:
-    return Draws([np.random.default_rng(i) for i in range(seeds)], "cpu")
-
-
 def numbered(trials: int = 6, steps: int = 10) -> Batch:
     """Trials whose observations are all different."""
     obs = torch.arange(trials * (steps + 1)).float().reshape(1, trials, steps + 1, 1)
-    return Batch(obs[:, :, :-1], draws().normal(trials, steps, 1), obs[:, :, 1:], torch.ones(1, trials, steps))
+    return Batch(obs[:, :, :-1], streams().normal(trials, steps, 1), obs[:, :, 1:], torch.ones(1, trials, steps))
 
 
 class TestExact:
     def test_a_belief_waits_for_the_steps_that_an_episode_lacked(self) -> None:
         """Of its own episode alone, not of all before it."""
-        env, waits = envs.BatchEnv(Switching(), 1), list[int]()
+        env, waits = envs.BatchEnv(toys.Switch(), 1), list[int]()
         agent = ExactAgent(env, expert(env.task), False, 5)
         predict_steps = agent.grid.predict_steps
 
@@ -155,8 +144,8 @@ def test_padding_is_no_reason_to_forget() -> None:
     for padding in (0, 3):
         x = torch.cat([readings, 30 * torch.randn(1, trials * episodes, padding, 1, generator=generator)], 2)
         mask = (torch.arange(steps + padding) < steps).float().expand(x.shape[:-1])
-        model = Average(draws())
-        choose_kept(model, Batch(x, x, x, mask), episodes, draws())
+        model = Average(streams())
+        choose_kept(model, Batch(x, x, x, mask), episodes, streams())
         kept.append(model.kept.item())
     assert kept[0] == kept[1] > 0
 
@@ -166,7 +155,7 @@ class TestSets:
 
     def test_of_a_network(self, monkeypatch: pytest.MonkeyPatch) -> None:
         data = numbered()
-        model = new_model("evidence", 2, 8, Scales.of(FLAT, data), draws())
+        model = new_model("evidence", 2, 8, Scales.of(FLAT, data), streams())
         assert isinstance(model, VariationalModel)
         final_memory, negative_elbo, read, predicted = model.final_memory, model.negative_elbo, [], []
 
@@ -180,14 +169,14 @@ class TestSets:
 
         monkeypatch.setattr(model, "final_memory", memory_spy)
         monkeypatch.setattr(model, "negative_elbo", elbo_spy)
-        model.loss_on_sets(data, 50, 0.0, draws())
+        model.loss_on_sets(data, 50, 0.0, streams())
         assert len(read[0]) + len(predicted[0].unique()) > 0.9 * data.mask.sum()
         assert not torch.isin(predicted[0], read[0]).any()
 
     def test_of_sums(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """The steps before and after are all of a trial's: counts, the last numbers of memories, add up."""
         data = numbered()
-        model = new_model("linear", 2, 8, Scales.of(FLAT, data), draws())
+        model = new_model("linear", 2, 8, Scales.of(FLAT, data), streams())
         assert isinstance(model, LinearModel)
         prediction_loss, counts = model.prediction_loss, []
 
@@ -196,14 +185,14 @@ class TestSets:
             return prediction_loss(before, after)
 
         monkeypatch.setattr(model, "prediction_loss", spy)
-        model.loss_on_sets(data, 50, 0.0, draws())
+        model.loss_on_sets(data, 50, 0.0, streams())
         assert (counts[0] == data.mask.shape[2]).all()
 
 
 def test_what_a_second_network_reads_has_the_mean_of_the_belief() -> None:
     """Also once the network of the belief says something."""
     data = numbered()
-    model = exact(VariationalModel("innovations", 2, 8, Scales.of(FLAT, data), draws()), draws())
+    model = exact(VariationalModel("innovations", 2, 8, Scales.of(FLAT, data), streams()), streams())
     for parameter in model.reader.parameters():
         torch.nn.init.normal_(parameter, generator=torch.Generator().manual_seed(0))
     memory = model.final_memory(data)
@@ -213,7 +202,7 @@ def test_what_a_second_network_reads_has_the_mean_of_the_belief() -> None:
 
 class TestLatentOfAnEpisode:
     def agent(self) -> DeconfoundedAgent:
-        return DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 1), draws())
+        return DeconfoundedAgent.new("evidence", 3, 16, Scales.plain(FLAT, 1), streams())
 
     def test_it_is_drawn_at_the_start_of_each(self) -> None:
         agent, latents = self.agent(), []
@@ -239,8 +228,6 @@ class TestLatentOfAnEpisode:
 
 def test_a_sampler_in_learned_dynamics_takes_in_no_step_after_the_end() -> None:
     """Where the mask is 0 its belief about the candidates stays as it was."""
-    from deconfounded.deconf.diagnosis.learned_env import PosteriorSampler
-
     sampler = PosteriorSampler.__new__(PosteriorSampler)
     sampler.theta_hat = torch.zeros(1, 2, 1)
     sampler.begin(1, [np.random.default_rng(0)])
@@ -253,8 +240,6 @@ def test_a_sampler_in_learned_dynamics_takes_in_no_step_after_the_end() -> None:
 
 def test_the_reference_s_likeliest_action_is_no_error() -> None:
     """Where actions are discrete: 0 for the likeliest, and for another as much as it is less likely."""
-    from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
-
     log_probs = torch.tensor([[[0.6, 0.3, 0.1]]]).log()
     signature = SimpleNamespace(policy=SimpleNamespace(signature=SimpleNamespace(actions=3)), theta_hat=None)
     env: Any = SimpleNamespace(reference=SimpleNamespace(point=lambda obs, latent: log_probs, **vars(signature)))
@@ -266,7 +251,7 @@ def test_the_reference_s_likeliest_action_is_no_error() -> None:
 def test_a_gru_says_a_variance() -> None:
     """Its numbers are a mean and a softplus variance, of which the std is the root."""
     data = numbered()
-    belief = GruBelief(2, 8, Scales.of(FLAT, data), draws())
+    belief = GruBelief(2, 8, Scales.of(FLAT, data), streams())
     memory = belief(data)
     mean, raw = belief.out(memory).chunk(2, -1)
     said = belief.posterior(memory)
@@ -277,7 +262,7 @@ def test_a_gru_says_a_variance() -> None:
 def test_the_mean_change_of_a_bit() -> None:
     """Of one that is 1 with probability .5: down by .5 from 1, up by .5 from 0."""
     bits = Signature(obs=1, action=1, actions=0, binary=True)
-    head = DynamicsHead(1, 8, Inputs(Scales.plain(bits, 1)), draws())
+    head = DynamicsHead(1, 8, Inputs(Scales.plain(bits, 1)), streams())
     head.forward = lambda obs, *rest: torch.zeros_like(obs)[..., None, :]  # type: ignore[method-assign]
     obs = torch.tensor([[[0.0], [1.0]]])
     mean = head.change.inverse(head.mean(obs, obs, obs))

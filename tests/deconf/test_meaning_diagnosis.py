@@ -24,14 +24,11 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials
+from tests.deconf.ball import streams
 from tests.deconf.test_deviation import lines, walks
 from tests.deconf.test_diagnose import CLEAR
 from tests.deconf.test_latent import CLONING, EXPLORING, world
 from tests.deconf.test_termination import Walker
-
-
-def draws() -> Draws:
-    return Draws([np.random.default_rng(0)], "cpu")
 
 
 def test_a_memory_that_did_not_fit_in_a_single_split_stops_the_verdict() -> None:
@@ -109,7 +106,7 @@ def test_latents_of_episodes_explain_dynamics_and_actions(
     monkeypatch.setattr(latent, "from_dynamics", lambda *_: next(explanations))
     data = world(0.2, False, 8, 0, 2), world(0.2, False, 8, 1, 2)
     amounts = Amounts(exploring=EXPLORING, cloning=CLONING)
-    explanation = measures._explain(data, data, amounts, draws(), lambda share: None)
+    explanation = measures._explain(data, data, amounts, streams(), lambda share: None)
     assert explanation is (of_episodes if single else of_trials)
 
 
@@ -127,7 +124,7 @@ def test_the_noise_of_dynamics_is_that_of_the_expert_s_trials() -> None:
     rng = np.random.default_rng(0)
     expert, explored = (split(world(0.2, kind, 64, seed), 0.25, rng) for seed, kind in enumerate((True, False)))
     few = replace(EXPLORING, inference_updates=20)
-    explanation = latent.from_dynamics(expert, explored, 1, few, replace(CLONING, updates=2), draws(), Monitor())
+    explanation = latent.from_dynamics(expert, explored, 1, few, replace(CLONING, updates=2), streams(), Monitor())
     data, head = Batch.of(expert[0], 1), explanation.dynamics
     with torch.no_grad():
         own = latent.each_step(data, explanation.latents)
@@ -147,7 +144,7 @@ def test_a_trait_is_of_the_half_before() -> None:
         Trials(obs[i], action[i], np.ones((len(obs[i]), 1, 40), bool)) for i in (slice(0, 36), slice(36, None))
     )
     config = MemorylessConfig(updates=100, batch=256, width=32, learning_rate=6e-3)
-    fitted = trait.fit(Batch.of(train, 1), Batch.of(held_out, 1), Signature.of(train), config, draws())
+    fitted = trait.fit(Batch.of(train, 1), Batch.of(held_out, 1), Signature.of(train), config, streams())
     assert fitted.gain < 0.1
 
 

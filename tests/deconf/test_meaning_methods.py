@@ -15,7 +15,8 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
@@ -58,6 +59,7 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentAgent, RecurrentCon
 from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.trials import Trials
 from tests import toys
+from tests.deconf.ball import streams
 from tests.deconf.test_baselines import gail_env
 from tests.tools import FEW, OFFLINE, tiny_preset
 
@@ -67,10 +69,6 @@ N, EPISODES, STEPS = 8, 2, 6
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-def draws() -> Draws:
-    return Draws([rng()], "cpu")
 
 
 def trials(mark: float = 0.0) -> Trials:
@@ -88,18 +86,25 @@ def batch() -> Batch:
 class TestRounds:
     """Methods that act in rounds: at first at random, then by what they have learned so far, and nothing is lost."""
 
-    def test_of_dagger(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        behaviours, sizes, beginnings = list[Agent | None](), list[int](), Batch.beginnings
+    @pytest.fixture
+    def sizes(self, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+        """How many trials there are at each update."""
+        counts, beginnings = list[int](), Batch.beginnings
+
+        def spy(self: Batch, *rest: Any) -> Batch:
+            counts.append(len(self))
+            return beginnings(self, *rest)
+
+        monkeypatch.setattr(Batch, "beginnings", spy)
+        return counts
+
+    def test_of_dagger(self, sizes: list[int]) -> None:
+        behaviours = list[Agent | None]()
 
         def query(behaviour: Agent | None) -> tuple[Trials, np.ndarray]:
             behaviours.append(behaviour)
             return trials(), trials().action
 
-        def spy(self: Batch, *rest: Any) -> Batch:
-            sizes.append(len(self))
-            return beginnings(self, *rest)
-
-        monkeypatch.setattr(Batch, "beginnings", spy)
         agent = dagger.train(query, DaggerConfig(16, 3, rounds=3, updates=3, batch=4), [rng()])
         assert behaviours == [None, agent, agent]
         assert sorted({*sizes}) == [N, 2 * N, 3 * N]
@@ -116,9 +121,9 @@ class TestRounds:
         agent = rma.train(trials(), np.zeros((N, EPISODES, 1)), explore, config, [rng()])
         assert behaviours == [None, agent]
 
-    def test_of_dpt(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_of_dpt(self, sizes: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
         """Each label stays with its trial: here it is the trial's number."""
-        behaviours, sizes, beginnings = list[Agent | None](), list[int](), Batch.beginnings
+        behaviours = list[Agent | None]()
         query_loss = DptAgent.query_loss
 
         def query(behaviour: Agent | None) -> tuple[Trials, np.ndarray]:
@@ -126,39 +131,29 @@ class TestRounds:
             rolled = trials()
             return rolled, rolled.obs[:, :, :-1, :1] / 10
 
-        def beginnings_spy(self: Batch, *rest: Any) -> Batch:
-            sizes.append(len(self))
-            return beginnings(self, *rest)
-
         def loss_spy(self: DptAgent, own: Batch, label: Tensor, context: Batch, *where: Tensor) -> Tensor:
             for number in (own.obs[..., 0], context.obs[..., 0]):
                 torch.testing.assert_close(label[:, :, : number.shape[2], 0], number / 10)
             return query_loss(self, own, label, context, *where)
 
-        monkeypatch.setattr(Batch, "beginnings", beginnings_spy)
         monkeypatch.setattr(DptAgent, "query_loss", loss_spy)
         agent = dpt.train(query, DptConfig(16, 1, 2, rounds=3, updates=3, batch=4), [rng()])
         assert behaviours == [None, agent, agent]
         assert sorted({*sizes}) == [N, 2 * N, 3 * N]
 
-    def test_of_deconfounded_mean(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_of_deconfounded_mean(self, sizes: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
         """The policy is cloned given the beliefs of the model of its round, and at last of the last."""
-        behaviours, sizes, beginnings = list[Agent | None](), list[int](), Batch.beginnings
+        behaviours = list[Agent | None]()
         means, imitation = list[Tensor](), MeanAgent.imitation
 
         def explore(behaviour: Agent | None) -> Trials:
             behaviours.append(behaviour)
             return trials()
 
-        def beginnings_spy(self: Batch, *rest: Any) -> Batch:
-            sizes.append(len(self))
-            return beginnings(self, *rest)
-
         def imitation_spy(self: MeanAgent, expert: Batch, mean: Tensor, *rest: Any) -> Tensor:
             means.append(mean)
             return imitation(self, expert, mean, *rest)
 
-        monkeypatch.setattr(Batch, "beginnings", beginnings_spy)
         monkeypatch.setattr(MeanAgent, "imitation", imitation_spy)
         config = MeanConfig(**{**FEW, "width": 8, "latent": 2, "inference_steps": 64})
         agent = deconfounded_mean.train(trials(), explore, config, [rng()])
@@ -240,20 +235,20 @@ class TestMemories:
 
     def test_of_recurrent_clones(self, monkeypatch: pytest.MonkeyPatch) -> None:
         data = batch()
-        agent = RecurrentAgent.new(8, Scales.of(FLAT, data), draws())
+        agent = RecurrentAgent.new(8, Scales.of(FLAT, data), streams())
         trainer = RecurrentTrainer(agent, RecurrentConfig(width=8, updates=3, chunk=4), 3 * 4, Monitor())
         self.spied(agent, lambda: trainer.learn(data, data.action), monkeypatch)
 
     def test_of_the_adaptation_module(self, monkeypatch: pytest.MonkeyPatch) -> None:
         data = batch()
-        agent = RmaAgent.blank({"width": 8, "theta": 1, "teacher": 8}, Scales.of(FLAT, data), draws())
-        optimizer, theta = sequence_bc.Adam([agent.adapter], 1e-3), torch.zeros(*data.mask.shape, 1)
+        agent = RmaAgent.blank({"width": 8, "theta": 1, "teacher": 8}, Scales.of(FLAT, data), streams())
+        optimizer, theta = Adam([agent.adapter], 1e-3), torch.zeros(*data.mask.shape, 1)
         self.spied(agent, lambda: rma._pass(agent, optimizer, data, theta, 4) and None, monkeypatch)
 
     def test_the_last_chunk_is_as_long_as_what_is_left(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """All steps of a trial are learned, each in one update of a pass."""
         data, lengths = batch(), list[int]()
-        agent = RecurrentAgent.new(8, Scales.of(FLAT, data), draws())
+        agent = RecurrentAgent.new(8, Scales.of(FLAT, data), streams())
         trainer = RecurrentTrainer(agent, RecurrentConfig(width=8, updates=3, chunk=5), EPISODES * STEPS, Monitor())
         loss = agent.loss
         spy = lambda part, *rest: (lengths.append(part.mask.shape[2]), loss(part, *rest))[1]  # noqa: E731
@@ -265,7 +260,7 @@ class TestMemories:
     def test_a_history_ends_with_its_episode(self) -> None:
         """flow_bc reads the latest steps of the episode alone."""
         shape = {"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}
-        agent, step = FlowAgent.blank(shape, Scales.plain(FLAT, 1), draws()), batch()[:, :, 0]
+        agent, step = FlowAgent.blank(shape, Scales.plain(FLAT, 1), streams()), batch()[:, :, 0]
         agent.begin(N)
         agent.reset([rng()])
         agent.remember(step)
@@ -277,7 +272,7 @@ class TestMemories:
         """Actions that flow_bc has not executed by then are never executed."""
         shape, acted = {"width": 8, "history": 3, "ahead": 4, "executed": 4, "integration": 2}, []
         for seen in (0.0, 1.0):
-            agent = FlowAgent.blank(shape, Scales.plain(FLAT, 1), draws())
+            agent = FlowAgent.blank(shape, Scales.plain(FLAT, 1), streams())
             agent.begin(N)
             for obs in (0.0, seen):
                 agent.reset([rng()])
@@ -335,7 +330,7 @@ def test_what_leaks_is_given_the_next_action(monkeypatch: pytest.MonkeyPatch) ->
     samples, hscic = list[tuple[Tensor, ...]](), palr.hscic
     spy = lambda x, y, given, ridge: (samples.append((y, given)), hscic(x, y, given, ridge))[1]  # noqa: E731
     monkeypatch.setattr(palr, "hscic", spy)
-    agent = PalrAgent.new(8, Scales.plain(FLAT, 1), draws())
+    agent = PalrAgent.new(8, Scales.plain(FLAT, 1), streams())
     agent.configure(PalrConfig(samples=32))
     data = batch()
     numbers = torch.arange(data.mask.shape[2]).float().expand_as(data.mask)[..., None]
@@ -359,15 +354,21 @@ def test_transitions_of_gail_end_where_their_episode_did() -> None:
     assert environments is not None
 
 
+def always_half(features: int) -> ActionHead:
+    """A policy that always says .5."""
+    policy = ActionHead(features, 8, Scales.plain(FLAT, 1), streams())
+    policy.sample = lambda features, _: torch.full((*features.shape[:-1], 1), 0.5)  # type: ignore[method-assign]
+    return policy
+
+
 @pytest.mark.parametrize(("share", "std"), [(0.0, 0.0), (1.0, 3**-0.5)])
 def test_synthetic_actions_are_random_as_often_as_asked(share: float, std: float) -> None:
     """deconfounded_offline: by a policy that always says .5, or uniform in [-1, 1]."""
     data = batch()
     scales = Scales.of(FLAT, data)
-    model, policy = VariationalModel("evidence", 1, 8, scales, draws()), ActionHead(FLAT.obs + 1, 8, scales, draws())
-    policy.sample = lambda features, _: torch.full((*features.shape[:-1], 1), 0.5)  # type: ignore[method-assign]
+    model, policy = VariationalModel("evidence", 1, 8, scales, streams()), always_half(FLAT.obs + 1)
     starts = data.obs[:, :, 0]
-    synthetic, _ = Synthesis(model, policy, torch.zeros(1, 2, 1), data, starts, STEPS, share, draws())(64)
+    synthetic, _ = Synthesis(model, policy, torch.zeros(1, 2, 1), data, starts, STEPS, share, streams())(64)
     assert synthetic.action.std().item() == pytest.approx(std, abs=0.05)
     assert synthetic.action.mean().item() == pytest.approx(0.5 * (1 - share), abs=0.08)
 
@@ -384,9 +385,7 @@ def test_the_unit_of_an_online_belief_is_of_demonstrations(monkeypatch: pytest.M
 
 def test_an_exploration_policy_acts_at_random_now_and_then() -> None:
     """By a share of SHARE; in the other steps as the clone does, which always says .5 here."""
-    policy = ActionHead(FLAT.obs, 8, Scales.plain(FLAT, 1), draws())
-    policy.sample = lambda features, _: torch.full((*features.shape[:-1], 1), 0.5)  # type: ignore[method-assign]
-    agent = ExplorationPolicy(policy, Scales.plain(FLAT, 1), None)
+    agent = ExplorationPolicy(always_half(FLAT.obs), Scales.plain(FLAT, 1), None)
     agent.begin(1000)
     agent.reset([rng()])
     assert (agent.act(np.zeros((1000, 2), np.float32)) != 0.5).mean() == pytest.approx(SHARE, abs=0.05)
@@ -395,14 +394,14 @@ def test_an_exploration_policy_acts_at_random_now_and_then() -> None:
 @pytest.mark.parametrize("head", [ActionHead, MeanHead])
 def test_actions_are_within_their_range(head: type[ActionHead]) -> None:
     """Whatever a network says: [-1, 1], to the end."""
-    policy = head(FLAT.obs, 8, Scales.plain(FLAT, 1), draws())
+    policy = head(FLAT.obs, 8, Scales.plain(FLAT, 1), streams())
     for bias, end in ((50.0, 1), (-50.0, -1)):
         policy.net[-1].bias.data[..., 0] = bias  # type: ignore[operator, union-attr]
-        assert (policy.sample(torch.zeros(1, 5, FLAT.obs), draws()) == end).all()
+        assert (policy.sample(torch.zeros(1, 5, FLAT.obs), streams()) == end).all()
 
 
 def test_actions_of_a_chunk_are_within_their_range() -> None:
-    flow = ChunkFlow(4, 8, 2, Scales.plain(FLAT, 1), draws())
+    flow = ChunkFlow(4, 8, 2, Scales.plain(FLAT, 1), streams())
     assert flow.decode(torch.tensor([[[[50.0], [-50.0]]]])).flatten().tolist() == [1, -1]
 
 

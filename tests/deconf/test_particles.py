@@ -24,7 +24,7 @@ from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import run_trials
-from tests.toys import Arms, Push, control
+from tests.toys import Arms, Push, Switch, control
 
 N, FEW = 24, 256
 
@@ -47,11 +47,6 @@ class Three(Push):
 
     def terminated(self, state: Array) -> np.ndarray:
         return np.zeros(len(state), bool)
-
-
-class Switch(Push):
-    name = "switch"
-    latents = (Latent("force", "N", -1.0, 1.0, switch=0.1),)
 
 
 class Drift(Push):

@@ -268,9 +268,9 @@ def test_slow_driving_is_worth_nothing() -> None:
     task = envs.get("icy_road")
     assert isinstance(task, MujocoTask)
     speeds, direction = np.array([-1.0, 0.0, 0.6, 2.6]), np.arctan(2 * np.pi / 8)  # the road's where x is 0
-    way = speeds * task.control_dt
+    distance = speeds * task.control_dt
     before = task.state(x=(np.zeros(4), 0.0))
-    after = task.state(x=(way * np.cos(direction), 0.0), y=(way * np.sin(direction), 0.0))
+    after = task.state(x=(distance * np.cos(direction), 0.0), y=(distance * np.sin(direction), 0.0))
     made = task.reward(before, np.zeros((4, 2)), after, np.full((4, 1), 0.3))
     np.testing.assert_allclose(made, [0, 0, 0, 0.5], atol=1e-9)
 
