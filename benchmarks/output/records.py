@@ -202,7 +202,8 @@ def write(folder: Path, records: Sequence[Record]) -> None:
 
     A record takes the place of the one in its slot. One that was made of something else is kept in the folder
     `superseded`, and so are those of an older version or of another text from outside, of all seeds, which no table
-    shows any more. Raises InputError for what is no record, before anything is written.
+    shows any more; without their training curves, which no page draws. Raises InputError for what is no record, before
+    anything is written.
     """
     from filelock import FileLock
 
@@ -244,7 +245,8 @@ def _append(file: Path, records: Sequence[Record]) -> None:
     check_folder(file.parent)
     before = file.read_text("utf-8") if file.exists() else ""
     lines = set(before.splitlines(True))  # these are there already if a kill came after this
-    write_atomically(file, before + "".join(line for line in map(_line, records) if line not in lines))
+    small = ({key: value for key, value in record.items() if key != "curve"} for record in records)
+    write_atomically(file, before + "".join(line for line in map(_line, small) if line not in lines))
 
 
 def _line(record: Record) -> str:
