@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from deconfounded.benchmarks.output import records, scoring
-from deconfounded.benchmarks.studies import exploration, spectrum, validate
+from deconfounded.benchmarks.studies import exploration, particles, spectrum, validate
 from deconfounded.benchmarks.studies.cards import kept, markdown_table
 from deconfounded.benchmarks.studies.foreign import report
 
@@ -28,6 +28,12 @@ def rates() -> str:
     loops = [f"{what} loop, {n}" for what in ("closed", "of open") for n in sizes]
     others = ("mj_step x threads", "SyncVectorEnv, 64", "a step, 4096 / 256", "KiB each")
     return markdown_table(("task", *loops, *others), rows)
+
+
+def beliefs() -> str:
+    """The table of docs/concepts.md: what `deconf performance particles` measured."""
+    measured = kept("speed/particles")
+    return f"{particles.table(measured['tasks'])}\n\n{_origins([measured])}."
 
 
 def _origins(made: list[dict[str, Any]]) -> str:

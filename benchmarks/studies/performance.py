@@ -5,9 +5,10 @@ envpool`; only where it is named). growth: CPU seconds by the steps of a trial (
 pass of the RNN) and by the values of the exact policies' grid, each with the power of n that fits best. seeds: seconds
 an update of S seeds in one program over those of one seed: S means that stacking gains nothing, 1 that the other seeds
 come for free. training: CPU seconds of one seed of each learned method (set OMP_NUM_THREADS=1). latency: milliseconds
-of an agent's step in one environment, by method (minutes). cost: score in the last episode against CPU seconds, for
-each learned method, with shares of the default preset's updates; where the curve is flat, a smaller share does. The
-last three leave out deconfounded_gru, which takes long. Each part writes a .json, and most a .png.
+of an agent's step in one environment, by method (minutes). particles: the exact policy's belief by particles beside
+that by a grid (half an hour). cost: score in the last episode against CPU seconds, for each learned method, with shares
+of the default preset's updates; where the curve is flat, a smaller share does. Parts of learned methods leave out
+deconfounded_gru, which takes long. Each part writes a .json, and most a .png.
 """
 
 import argparse
@@ -229,6 +230,15 @@ def training(args: argparse.Namespace) -> None:
     write_json(args.out / "training.json", {"task": task.name, "versions": identity.versions(), "cpu_s": measured})
 
 
+def particles(args: argparse.Namespace) -> None:
+    """Of all tasks, or those asked for."""
+    from deconfounded.benchmarks.studies.particles import by_task
+
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    measured = by_task(args.tasks or [*map(envs.get, (*envs.SUITE, *envs.HARD))])
+    write_json(args.out / "particles.json", {**about, "tasks": measured})
+
+
 def latency(args: argparse.Namespace) -> None:
     """Of each learned method on a task."""
     from deconfounded.benchmarks.studies.latency import by_method
@@ -245,6 +255,7 @@ PARTS = {
     "seeds": seeds,
     "training": training,
     "latency": latency,
+    "particles": particles,
     "cost": cost,
 }
 
@@ -253,7 +264,7 @@ def main() -> None:
     parser = Parser(__doc__)
     parser.add_argument("--device", default="cpu", help="torch device, of seeds alone; the other parts are of a CPU")
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"some of {', '.join(PARTS)}; default: all")
-    named = f"of speed and cost; default: all with physics, and {', '.join(COST)}"
+    named = f"of speed, particles and cost; default: all with physics, all, and {', '.join(COST)}"
     parser.add_argument("--tasks", nargs="+", metavar="NAME", default=(), help=named)
     parser.add_argument("--out", type=place, default=Path("results") / "performance", help="output folder")
     args = parser.parse_args()

@@ -143,7 +143,7 @@ def texts(found: index.Found, hard_tasks: index.Found, by_protocol: Mapping[str,
         DOCS / "exploration.md": {"exploration": findings.explored()},
         DOCS / "speed.md": {"costs": results.costs(found), "rates": findings.rates()},
         DOCS / "paper.md": {"controls": results.controls(found)},
-        DOCS / "concepts.md": {"certificates": cards.certificates(certified)},
+        DOCS / "concepts.md": {"certificates": cards.certificates(certified), "beliefs": findings.beliefs()},
         README: {"summary": results.summary(found, certified)},
     }
     return {
