@@ -70,7 +70,8 @@ def by_task(tasks: list[envs.Task]) -> dict[str, dict[str, Any]]:
     for task in tasks:
         if isinstance(task, PatchedTask):
             continue
-        costly = len(task.latents) > GRID_UP_TO or any(lat.distribution == "categorical" for lat in task.latents)
+        categorical = any(latent.distribution == "categorical" for latent in task.latents)
+        costly = len(task.latents) > GRID_UP_TO or categorical and task.moves_state
         measured[task.name] = made = compared(task, FEW if costly else TRIALS)
         print(f"{task.name}: {made}")
     return measured
