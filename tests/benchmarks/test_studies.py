@@ -12,9 +12,11 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import commands
 from deconfounded.benchmarks.engine import presets, scheduler
-from deconfounded.benchmarks.studies import findings, latency, performance, runs, stepping, tune
+from deconfounded.benchmarks.studies import findings, latency, particles, performance, runs, stepping, tune
+from deconfounded.deconf.exact import ExactAgent
 from deconfounded.envs.physics import cores
 from deconfounded.envs.tasks.bandit import Bandit
+from deconfounded.experts.agent import ExpertAgent
 from tests.tools import dots, tiny_preset
 
 
@@ -118,6 +120,52 @@ def test_latency_is_in_milliseconds(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = count()
     monkeypatch.setattr(latency, "time", SimpleNamespace(perf_counter=lambda: 2e-3 * next(clock)))
     assert latency.latency(envs.get("bandit"), "random") == pytest.approx({"median_ms": 2, "p99_ms": 2})
+
+
+def test_ranks_are_the_mass_below_theta() -> None:
+    """By weight, each latent for itself; of mass at theta itself, any share."""
+    belief: Any = SimpleNamespace(
+        theta=np.array([[[0.0, 5.0], [1.0, 4.0], [2.0, 3.0]]] * 200),
+        log_weight=np.log([[0.2, 0.3, 0.5]] * 200),
+    )
+    of = particles.ranks(belief, np.tile([1.5, 3.0], (200, 1)), np.random.default_rng(0))
+    np.testing.assert_allclose(of[:, 0], 0.5)
+    assert (of[:, 1].min(), of[:, 1].max()) == (pytest.approx(0, abs=0.02), pytest.approx(0.5, abs=0.02))
+
+
+def test_particles_less_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores by random actions and the expert of the same trials, differences by trial, and ranks that are all 1."""
+    now = 0.0
+
+    def run_trials(env: envs.BatchEnv, agent: Any, episodes: int, seed: int) -> Any:
+        nonlocal now
+        apart = np.arange(env.n)[:, None] + np.zeros(episodes)
+        by = {ExpertAgent: 20.0 + 0 * apart, ExactAgent: 15.0 + 0 * apart, particles.ParticleAgent: 15.0 + apart}
+        now += 3 if type(agent) is ExactAgent else 1
+        if type(agent) is particles.ParticleAgent:  # each trial's belief is at 0, and its theta above that
+            agent.belief.theta, agent.belief.log_weight = np.zeros((env.n, 1, 1)), np.zeros((env.n, 1))
+        theta = np.ones((env.n, episodes, 1))
+        return SimpleNamespace(returns=by.get(type(agent), 10.0 + 0 * apart), theta=theta)
+
+    monkeypatch.setattr(particles, "run_trials", run_trials)
+    monkeypatch.setattr(particles, "time", SimpleNamespace(process_time=lambda: now))
+    made = particles.compared(envs.get("tilted_cartpole"), 5)
+    assert made["grid"] == {"score": 0.5, "cpu_s": 3.0}
+    assert made["particles"] == {"score": 0.7, "cpu_s": 1.0}
+    assert made["difference"] == pytest.approx(0.2)
+    assert made["standard_error"] == pytest.approx(np.std([0, 0.1, 0.2, 0.3, 0.4], ddof=1) / np.sqrt(5), abs=1e-4)
+    assert made["p"] == [0]
+    row = particles.table({"tilted_cartpole": made}).splitlines()[2].strip("| ").split(" | ")
+    assert row == ["tilted_cartpole", "5", "0.50", "0.70", "+0.200 ± 0.071", "0.00", "3", "1"]
+
+
+def test_trials_of_beliefs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few where each step simulates every particle, or a grid would have too many latents; patches have grids."""
+    monkeypatch.setattr(particles, "compared", lambda task, trials: trials)
+    names = "bandit", "curling", "swapped_lander", "hidden_goal", "patchy_road", "lame_ant"
+    many, few = particles.TRIALS, particles.FEW
+    measured: Any = particles.by_task([*map(envs.get, names)])
+    assert measured == {"bandit": many, "curling": many, "swapped_lander": few, "hidden_goal": many, "lame_ant": few}
 
 
 def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
