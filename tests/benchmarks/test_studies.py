@@ -26,7 +26,7 @@ def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, name, value in (
         *((stepping, "SIZES", (1, 65)), (performance, "STEPS", (10, 20)), (performance, "VALUES", (2, 3))),
         *((performance, "GRID", "bandit"), (performance, "SEEDS", (1, 2)), (performance, "TIMED", ("naive_rnn",))),
-        *((performance, "LEARNED", ("blind_bc",)), (performance, "SHARES", (0.5,))),
+        *((performance, "LEARNED", ("blind_bc",)), (performance, "SHARES", (0.5,)), (particles, "TRIALS", 2)),
     ):
         monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(presets, "preset", lambda *_: tiny_preset())
@@ -44,6 +44,7 @@ def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [*read["seeds"]["methods"]["naive_rnn"]] == ["1", "2"]
     assert read["training"]["cpu_s"]["blind_bc"] > 0
     assert 0 < read["latency"]["methods"]["blind_bc"]["median_ms"] <= read["latency"]["methods"]["blind_bc"]["p99_ms"]
+    assert read["particles"]["tasks"]["tilted_cartpole"]["trials"] == 2
     cost = read["cost-tilted_cartpole"]["methods"]
     assert [(method, *points) for method, points in cost.items()] == [("blind_bc", "0.5")]
     for name in ("speed", "growth", "cost-tilted_cartpole"):
