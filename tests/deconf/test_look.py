@@ -290,6 +290,7 @@ def test_units_of_actions_and_what_is_no_other_unit() -> None:
         np.where(np.arange(T + 1) % 20, np.arange(T + 1) % 3, -12.0),  # no code
         np.linspace(0, 6.3, T + 1),  # turns once, and does not jump
         np.array([0.0, 200.0, 360.0, 200.0])[np.arange(T + 1) % 4],  # jumps by little more than half a turn
+        np.array([0.0, 5.2])[np.arange(T + 1) % 2],  # jumps by most of a turn, and covers no more than that
     ],
 )
 def test_what_is_no_code_and_no_angle(column: Any) -> None:
