@@ -22,6 +22,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Signature, joined_theta
 from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.transformer import rotated, rotation
 from deconfounded.deconf.given import Environments
 from deconfounded.deconf.methods import deconfounded_mean, gail, memoryless_bc, rma
 from deconfounded.deconf.methods.dadp import DadpAgent, contexts
@@ -120,6 +121,7 @@ class TestPastActions:
         assert seen[0] is not None
         assert seen[0].unique().tolist() == pytest.approx([0, 5])
         assert seen[0].mean().item() == pytest.approx(1, abs=0.2)  # 2,000 draws; four standard errors
+        assert (seen[0].amax(2) != seen[0].amin(2)).all()  # some of each trial's
         assert torch.equal(agent.held_out_loss(batch), agent.held_out_loss(batch))
         agent.begin(50)
         agent.remember(batch[:, :, 0])
@@ -286,6 +288,12 @@ class TestTransformer:
         expected = agent.net(agent.tokens(batch)[:, :, -8:])[:, :, -1]
         torch.testing.assert_close(agent._features, expected, rtol=0, atol=1e-5)
 
+    def test_attention_goes_by_how_far_apart_tokens_are(self) -> None:
+        """By a cosine for each pair of columns, of the distance over their wavelength: 2 pi, and 1000^.5 times that."""
+        query, key = (rotated(torch.ones(2, 4), rotation(torch.tensor(at), 4)) for at in ([3, 103], [8, 108]))
+        expected = 2 * (np.cos(5) + np.cos(5 / 1000**0.5))
+        assert (query * key).sum(-1).tolist() == pytest.approx([expected] * 2, abs=1e-4)
+
     def test_held_out_loss_is_the_mean_over_steps(self) -> None:
         batch = random_batch(streams(), 40)
         batch.mask[0, 33:, 3:] = 0
@@ -315,9 +323,10 @@ class TestMean:
                 agent.remember(batch[:, :, t])
 
     def test_kl_is_from_the_belief_a_step_before(self) -> None:
-        """What beta adds to the loss is torch's own KL, summed over time; the first is from N(0, 1)."""
+        """What beta adds is torch's own KL, in the mean of steps that took place; the first is from N(0, 1)."""
         draws = streams()
         batch = random_batch(draws)
+        batch.mask[:, 1:, 4:] = 0
         agent, state = self.agent(draws, batch), draws.state_dict()
         losses = []
         for beta in (0.0, 1.0):
@@ -330,7 +339,7 @@ class TestMean:
             torch.cat([torch.zeros_like(mean[:, :, :1]), mean[:, :, :-1]], 2),
             torch.cat([torch.ones_like(std[:, :, :1]), std[:, :, :-1]], 2),
         )
-        expected = kl_divergence(now, before).sum(-1).mean((1, 2))
+        expected = kl_divergence(now, before).sum(-1)[batch.mask > 0].mean()[None]
         torch.testing.assert_close(losses[1] - losses[0], expected, rtol=1e-3, atol=1e-5)
 
     def test_a_latent_predicts_steps_ahead(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -490,6 +499,31 @@ class TestGail:
             assert (rewards[1] < 0).mean() > 0.9
             np.testing.assert_allclose(rewards[0], net(expert)[i].detach(), atol=1e-5)
 
+    def test_a_discriminator_reads_standard_columns(self) -> None:
+        """Observations, actions and changes of the expert have a mean of 0 and a deviation of 1 there."""
+        own, seen = random_batch(streams(2), 64, 4), list[torch.Tensor]()
+        own = Batch(30 + own.obs, 0.1 * own.action, 30 + own.next_obs, own.mask)
+        net = Discriminator(16, scales(own), streams(2))
+        net.net.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
+        net(own.flat())
+        torch.testing.assert_close(seen[0].mean(1), torch.zeros(2, 5), rtol=0, atol=1e-4)
+        torch.testing.assert_close(seen[0].std(1, correction=0), torch.ones(2, 5), rtol=0, atol=1e-4)
+
+    def test_what_outlives_an_episode(self) -> None:
+        """Its memory, and not the action before: a flag of the start stands in its place."""
+        batch = random_batch(streams())
+        agent = GailAgent.blank({"width": 8}, scales(batch), streams())
+        agent.begin(3)
+        agent.reset([np.random.default_rng(0)])
+        with torch.no_grad():
+            agent.choose(batch.obs[:, :, 0])
+        agent.remember(batch[:, :, 0])
+        memory = agent.features()
+        agent.reset([np.random.default_rng(0)])
+        np.testing.assert_array_equal(agent.features(), memory)
+        assert memory.any()
+        assert agent._before.tolist() == [[[0, 1]] * 3]
+
     def test_its_environments_hide_theta(self) -> None:
         """Its observation is the task's, the previous action, and a flag of an episode's start."""
         vec, behind = gail_env()
@@ -513,11 +547,15 @@ class TestGail:
         for action in 2 * np.random.default_rng(0).random((400, 3, 1)) - 1:
             obs, _, done, infos = vec.step(action)
             episodes += obs[:, -1] == 1
+            assert not obs[obs[:, -1] == 1, -2].any()  # the action before an episode's start
             kept = (behind.batch.theta == theta).all(-1)
             np.testing.assert_array_equal(kept, ~done)
             assert (episodes[done] == envs.get(CONTROL).episodes).all()
             for i in np.flatnonzero(done):
                 assert infos[i]["terminal_observation"].shape == obs[i].shape
+                assert infos[i]["TimeLimit.truncated"]  # a trial ends by its length, and not in a state worth nothing
+                last = vec.transitions[-1][2][i]
+                np.testing.assert_array_equal(infos[i]["terminal_observation"][: len(last)], last)
             episodes[done], ended = 0, ended + int(done.sum())
             theta = behind.batch.theta.copy()
         assert ended > 3

@@ -286,6 +286,7 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
     """A random subset of each trial's steps, or all of them, weighted to the trial's length; another at each update."""
     seen: list[Tensor] = []
     weights: list[Tensor] = []
+    betas: list[float] = []
 
     def final_memory(self: VariationalModel, batch: Batch) -> Tensor:
         seen.append(batch.obs[0, 0, :, 0])
@@ -293,6 +294,7 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
 
     def loss(log_next: Tensor, log_policy: Tensor, kl: Tensor, beta: float, weight: Tensor) -> Tensor:
         weights.append(weight)
+        betas.append(beta)
         return offline_loss(log_next, log_policy, kl, beta, weight)
 
     monkeypatch.setattr(VariationalModel, "final_memory", final_memory)
@@ -300,9 +302,10 @@ def test_eq_7_reads_drawn_steps(asked: int, read: int, monkeypatch: pytest.Monke
     step = np.tile(np.arange(11, dtype="f4"), (3, 1, 1))[..., None]
     trials = Trials(step, np.zeros((3, 1, 10, 1), "f4"), np.ones((3, 1, 10), bool))
     draws = Draws([np.random.default_rng(0)], "cpu")
-    config = OfflineConfig(width=8, offline_updates=3, offline_batch=2, offline_steps=asked)
+    config = OfflineConfig(width=8, offline_beta=0.3, offline_updates=3, offline_batch=2, offline_steps=asked)
     deconfounded_offline.explain(Batch.of(trials, 1), Signature.of(trials), config, draws, Monitor())
     assert [len(set(steps.tolist())) for steps in seen] == [read] * 3
+    assert betas == [0.3] * 3
     assert (len({tuple(sorted(steps.tolist())) for steps in seen}) > 1) == (read < 10)
     assert all(weight.sum(-1).tolist() == [[pytest.approx(10)] * 2] for weight in weights)
 

@@ -250,6 +250,27 @@ class TestJudge:
         assert judge([alike, alike._replace(stakes=0.9)]).verdict == "cannot tell"
         assert judge([alike._replace(stakes=1.8), alike._replace(stakes=1.1)]).verdict == "cannot tell"
 
+    @pytest.mark.parametrize(
+        ("both", "first", "second", "verdict"),
+        [
+            ({"stakes": 1.1, "paired_stakes": 1.4}, {"latent_gain": 0.5}, {"latent_gain": -0.1}, "cannot tell"),
+            (SILENT, {"trait_gain": 0.05}, {"trait_gain": 0.12}, "cannot tell"),
+            ({"latent_gain": 1.5}, {"memory_gain": 0.6}, {"memory_gain": 1.4}, "confounded"),
+            (
+                {"naive_by_actions": 0.8},
+                {"naive": 0.9, "latent": 0.95},
+                {"naive": 0.78, "latent": 0.83},
+                "cannot tell",
+            ),
+            ({"latent": 1.0}, {"naive": 1.0}, {"naive": 0.96}, "confounded"),
+            ({"latent_gain": -0.1}, {"memory_gain": -0.05}, {"memory_gain": 0.12}, "cannot tell"),
+        ],
+    )
+    def test_the_farther_split_decides(self, both: dict, first: dict, second: dict, verdict: str) -> None:
+        """Though the mean of the two is on this side of a threshold."""
+        splits = [CLEAR._replace(**{**both, **changes}) for changes in (first, second)]
+        assert judge(splits).verdict == verdict
+
     def test_what_the_others_say(self) -> None:
         """A verdict that most splits give alone stands, and says how sure it is; that of fewer does not."""
         diagnosis = judge([CLEAR, CLEAR, CLEAR._replace(latent_gain=2.0)])

@@ -16,7 +16,7 @@ from deconfounded.benchmarks import look as look_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
-from deconfounded.deconf.diagnosis import diagnose, fits
+from deconfounded.deconf.diagnosis import columns, diagnose, fits
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -241,6 +241,38 @@ def test_amounts_in_remarks_are_those_of_the_data() -> None:
     assert float(lasts[1]) ** int(lasts[2]) == pytest.approx(0.5, abs=0.05)
 
 
+def test_what_is_recommended_where_nothing_mends_a_column() -> None:
+    """The best of the transforms; what is 0 now and then has no logarithm."""
+    x = np.concatenate([np.zeros(985), np.ones(12), np.full(3, 1000.0)])
+    how, left = fits.mended("x", x)
+    assert "clipped to 0 and 1" in how
+    assert left == pytest.approx(fits.kurtosis(x.clip(0, 1)))
+
+
+def test_what_lasts_is_no_misfit() -> None:
+    """Noise that lasts is alike in steps that follow each other, and not where a trial comes by once more."""
+    trials = driven(0.95, 0.3)
+    lasts, _, alike = fits.lasting(trials, fits.Steps.of(trials)) or (0, 0, 1)
+    assert lasts > 0.8
+    assert alike < 0.3
+
+
+def test_a_few_alike_actions_are_no_replay() -> None:
+    """Of ten steps or more they are."""
+    trials = with_replays(driven())
+    for steps, groups in ((9, []), (10, [[3, 7]])):
+        mask = trials.mask & (np.arange(E * T).reshape(E, T) < steps)
+        assert fits.copies(changed(trials, mask=mask, action=trials.action * mask[..., None]))[1] == groups
+
+
+def test_codes_of_actions_are_in_the_log_s_units() -> None:
+    action = np.where(np.arange(T) % 20 == 7, 0.999, 0.1 * np.sin(np.arange(T)))[:, None] * np.ones((B, E, T, 1))
+    log = Log.of(changed(driven(), action=action))
+    log = replace(log, units=replace(log.units, low=(-1000.0,), high=(1000.0,)))
+    texts = [remark.text for remark in columns.extremes(log, fits.Steps.of(log))]
+    assert any("action 0 is 999 in" in text for text in texts)
+
+
 def test_units_of_actions_and_what_is_no_other_unit() -> None:
     """A latent may change how widely trials vary, by a few times; some trials may be at rest."""
     action, obs = driven().action.copy(), driven().obs.copy()
@@ -258,6 +290,7 @@ def test_units_of_actions_and_what_is_no_other_unit() -> None:
         np.where(np.arange(T + 1) % 20, np.arange(T + 1) % 3, -12.0),  # no code
         np.linspace(0, 6.3, T + 1),  # turns once, and does not jump
         np.array([0.0, 200.0, 360.0, 200.0])[np.arange(T + 1) % 4],  # jumps by little more than half a turn
+        np.array([0.0, 5.2])[np.arange(T + 1) % 2],  # jumps by most of a turn, and covers no more than that
     ],
 )
 def test_what_is_no_code_and_no_angle(column: Any) -> None:

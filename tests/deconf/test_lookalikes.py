@@ -178,6 +178,21 @@ class TestHalves:
         assert alike is not None
         assert alike > 0.8
 
+    def test_episodes_that_did_not_take_place(self) -> None:
+        """Halves are of every other one of those that did."""
+        two = wandering(0.5, episodes=2)
+        obs, action, mask = (np.repeat(x, 2, 1) for x in (two.obs, two.action, two.mask))
+        mask[:, 1::2] = False
+        assert self.alike(Trials(obs, action, mask)) == self.alike(two)
+
+    def test_chance_is_that_of_all_columns_together(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of eight columns of noise, and their products with observations and actions, none is alike."""
+        monkeypatch.setattr(trial_dynamics, "FINE", 4)
+        monkeypatch.setattr(trial_dynamics, "CHANCE", 0.05)
+        rng = np.random.default_rng(0)
+        obs, action = rng.normal(size=(24, 1, 21, 8)), rng.uniform(-1, 1, (24, 1, 20, 1))
+        assert self.alike(Trials(obs, action, np.ones((24, 1, 20), bool))) == 0
+
 
 class TestStatesThatTell:
     """Dynamics that differ from trial to trial, by an amount that observations tell of."""
@@ -231,6 +246,12 @@ def test_one_trial_does_not_own_a_likelihood() -> None:
     assert latent.typical(log_prob, batch) == pytest.approx(before, abs=0.05)
 
 
+def test_what_is_typical_is_of_steps_that_took_place() -> None:
+    log_prob, empty = torch.arange(3.0)[None, :, None].repeat(1, 1, 10), torch.zeros(1, 3, 10, 1)
+    log_prob[..., 6:] += 1000
+    assert latent.typical(log_prob, Batch(empty, empty, empty, (torch.arange(10) < 6).float().expand(1, 3, -1))) == 1
+
+
 def test_small_units_are_no_constants() -> None:
     """A column in units of 1e-7 is scaled as it is in others; what is constant keeps its scale, rounding or not."""
     x = torch.randn(1, 50, 20, 1, generator=torch.Generator().manual_seed(0))
@@ -251,6 +272,14 @@ class TestHeavyTails:
         usual = self.x[0, 1:10].flatten(0, 1)[:, 0]
         assert (LabelScaler(self.x, self.mask)(self.x)[0, 1:10, :, 0].std() / usual.std()).item() > 50
         assert Scaler(self.x, self.mask)(self.x)[0, 1:10, :, 0].std() < 0.2
+
+    def test_padding(self) -> None:
+        """It has no part in what is usual."""
+        mask, x = self.mask * (torch.arange(20) < 8), self.x.clone()
+        x[:, :, 8:] += 5
+        padded, short = LabelScaler(x, mask), LabelScaler(x[:, :, :8], mask[:, :, :8])
+        assert padded.heavy.tolist() == [[True, False]]
+        torch.testing.assert_close(padded(self.x), short(self.x))
 
     def test_inverse(self) -> None:
         scaler = LabelScaler(self.x, self.mask)

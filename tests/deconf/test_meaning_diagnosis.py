@@ -10,14 +10,17 @@ import torch
 
 from deconfounded.benchmarks.output import diagnosis as page
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.linear_model import LinearModel
+from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
 from deconfounded.deconf.diagnosis import advice, diagnose, fits, labels, latent, measures, state, trait
 from deconfounded.deconf.diagnosis.deviation import paired_score
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.held_out import PartMonitor, Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import Explanation
-from deconfounded.deconf.diagnosis.learned_env import LearnedEnv
+from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, LearnedEnv
 from deconfounded.deconf.diagnosis.measures import Amounts, split
 from deconfounded.deconf.diagnosis.thresholds import GOOD, MISFIT, NEGLIGIBLE, STAKES
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
@@ -28,6 +31,8 @@ from tests.deconf.ball import streams
 from tests.deconf.test_deviation import lines, walks
 from tests.deconf.test_diagnose import CLEAR
 from tests.deconf.test_latent import CLONING, EXPLORING, world
+from tests.deconf.test_meaning_beliefs import FLAT, numbered
+from tests.deconf.test_meaning_learning import poisoned
 from tests.deconf.test_termination import Walker
 
 
@@ -101,13 +106,15 @@ def test_latents_of_episodes_explain_dynamics_and_actions(
         Explanation(None, None, torch.zeros(1, 1, 1), latent_gain=1 + by[0], expert_evidence=1 + by[1])  # type: ignore[arg-type]
         for by in ((0.0, 0.0), (gain, evidence))
     )
-    explanations = iter((of_trials, of_episodes))
+    explanations, batches = iter((of_trials, of_episodes)), list[int]()
     monkeypatch.setattr(measures, "_differ", lambda explored: (0.0, 1.0))
-    monkeypatch.setattr(latent, "from_dynamics", lambda *_: next(explanations))
+    next_one = lambda *given: (batches.append(given[3].inference_batch), next(explanations))[1]  # noqa: E731
+    monkeypatch.setattr(latent, "from_dynamics", next_one)
     data = world(0.2, False, 8, 0, 2), world(0.2, False, 8, 1, 2)
     amounts = Amounts(exploring=EXPLORING, cloning=CLONING)
     explanation = measures._explain(data, data, amounts, streams(), lambda share: None)
     assert explanation is (of_episodes if single else of_trials)
+    assert batches == [EXPLORING.inference_batch, 2 * (EXPLORING.inference_batch or 0)]  # as many steps
 
 
 def test_what_a_fit_of_each_trial_leaves_of_noise_is_its_variance() -> None:
@@ -196,10 +203,65 @@ def test_the_progress_of_a_part_ends_where_the_part_does() -> None:
     assert shares == pytest.approx([0.25, 0.525, 0.8])
 
 
-def test_paired_stakes_are_1_by_chance() -> None:
+def test_stakes_are_1_by_chance() -> None:
     """In the mean of 40 draws of 32 trajectories: the largest of 16 deviations is compared with the largest, too."""
-    stakes = [measures.stakes_of([walks(32, 4 * draw + i) for i in range(4)])[1] for draw in range(40)]
-    assert np.mean(stakes) == pytest.approx(1, abs=0.1)
+    stakes = [measures.stakes_of([walks(32, 4 * draw + i) for i in range(4)]) for draw in range(40)]
+    assert np.mean(stakes, 0) == pytest.approx([1, 1], abs=0.1)
+
+
+def test_exploration_counts_where_the_expert_goes_in_all_columns() -> None:
+    """A step that is far off in one of them is left out."""
+    rng = np.random.default_rng(0)
+    shape = (6, 1, 20)
+    expert = Trials(rng.uniform(-1, 1, (6, 1, 21, 2)), rng.uniform(-1, 1, (*shape, 1)), np.ones(shape, bool))
+    obs, inside = expert.obs.copy(), np.ones(shape, bool)
+    obs[2, 0, 3, 1], inside[2, 0, 3] = 50, False
+    explored = Trials(obs, expert.action, expert.mask)
+    np.testing.assert_array_equal(measures.near(expert, explored).mask, inside)
+    masked = latent.in_range(Batch.of(expert, 1), Batch.of(explored, 1)).mask
+    np.testing.assert_array_equal(masked[0], inside[:, 0])
+
+
+def test_few_steps_of_a_set_are_from_anywhere_in_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not the first ones, by which a latent would tell the time."""
+    read, loss = list[torch.Tensor](), LinearModel.loss_on_sets
+    spy = lambda self, data, *rest: (read.append(data.obs), loss(self, data, *rest))[1]  # noqa: E731
+    monkeypatch.setattr(LinearModel, "loss_on_sets", spy)
+    data = numbered(4, 39)
+    few = replace(EXPLORING, inference_updates=4, shortest=0.25)
+    latent._train_dynamics(data, Scales.of(FLAT, data), few, streams(), Monitor())
+    shortest = min(read, key=lambda obs: obs.shape[2])
+    assert (shortest % 40).max() > 20 > shortest.shape[2]
+
+
+def test_a_policy_is_as_it_was_when_held_out_actions_were_likeliest() -> None:
+    """Their log-likelihoods are those of the policy that is returned with them, though it was trained on."""
+    data, held_out = numbered(4, 20), numbered(2, 20)
+    held_out.action = -held_out.action
+    model = new_model("linear", 2, 8, Scales.of(FLAT, data), streams())
+    config, latents = MemorylessConfig(updates=24, batch=64, learning_rate=0.1), torch.zeros(1, 2, 2)
+    belief = model.belief(model.final_memory(data))
+    policy, log_prob = latent._train_policy(model, data, belief, held_out, latents, config, streams())
+    own = latent._log_action(model, policy)(held_out, latent.each_step(held_out, latents))
+    torch.testing.assert_close(log_prob, own)
+
+
+class TestTraitOfAHalf:
+    """A trait is of the steps of a half that took place."""
+
+    @pytest.fixture
+    def half(self) -> Batch:
+        """64 of 80 steps."""
+        made = numbered(3, 80)
+        made.mask[:, :, 64:] = 0
+        return made
+
+    def test_encoder(self, half: Batch) -> None:
+        encoder = trait.Encoder(8, Scales.of(FLAT, half), streams())
+        torch.testing.assert_close(encoder(poisoned(half)), encoder(half))
+
+    def test_drawn_steps(self, half: Batch) -> None:
+        assert trait._draw(half, streams()).mask.all()
 
 
 def test_nothing_is_lost_where_wrong_latents_lead_nowhere_else() -> None:
@@ -239,3 +301,26 @@ class TestLearnedEnv:
         for action, error in ((0.0, 0.0), (0.05, 0.5), (0.3, 1.0)):
             measured = LearnedEnv._action_error(env, torch.zeros(1, 1, 1), torch.full((1, 1, 2), action))
             assert measured.item() == pytest.approx(error)
+
+    def test_the_unit_is_the_mean_distance_of_actions_under_two_latents(self) -> None:
+        """Of actions of -.1 and .1, half of all pairs are .2 apart."""
+        signature = SimpleNamespace(signature=SimpleNamespace(actions=0))
+        latents = torch.tensor([-0.1, 0.1]).repeat(32)[None, :, None]
+        env: Any = SimpleNamespace(
+            reference=SimpleNamespace(policy=signature, theta_hat=latents, point=lambda obs, latent: latent)
+        )
+        assert LearnedEnv._scale(env, numbered()).item() == pytest.approx(0.1, abs=0.01)
+
+    def test_a_point_is_the_mean_action(self) -> None:
+        """In the units of actions, as they are drawn: 20,000 of them."""
+        data = numbered()
+        data.action = 0.2 + 0.05 * data.action
+        scales, dynamics = Scales.of(FLAT, data), SimpleNamespace()
+        dynamics.inputs = Inputs(scales)
+        made: Any = LatentPolicy
+        actor = made(dynamics, ActionHead(2, 8, scales, streams()), torch.ones(1, 20_000, 1))
+        actor.begin(20_000, [np.random.default_rng(0)])
+        obs = torch.full((1, 20_000, 1), 30.0)
+        assert actor.choose(obs).mean().item() == pytest.approx(
+            actor.point(obs, actor.theta_hat).mean().item(), abs=2e-3
+        )

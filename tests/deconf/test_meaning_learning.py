@@ -14,11 +14,12 @@ from deconfounded.deconf.core.latent_agent import DeconfoundedAgent, Explorer
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import VariationalModel, new_model
-from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.core.nets import Scales, Whitener, gaussian_log_prob
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
-from deconfounded.deconf.methods import rma
+from deconfounded.deconf.methods import deconfounded_mean, rma
 from deconfounded.deconf.methods.dagger import DaggerAgent
+from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.dpt import DptAgent
 from deconfounded.deconf.methods.flow_bc import FlowAgent
 from deconfounded.deconf.methods.naive_obs import ObsAgent
@@ -99,6 +100,9 @@ def losses(batch: Batch) -> dict[str, Loss]:
         "dagger": lambda given: dagger.loss(given, given.action, None, draws()),
         "rma": lambda given: student.loss(given, given.action, adapter.start(4))[0],
     }
+    mean, config = MeanAgent.new("evidence", 3, 16, scales, draws()), MeanConfig(inference_steps=200)
+    by_mean = mean.model.eval()
+    by_name["deconfounded_mean"] = lambda given: deconfounded_mean.inference_loss(by_mean, given, config, draws())
     for kind in ("linear", "innovations", "evidence", "gru", "discrete"):
         model = new_model(kind, 3, 16, scales, draws()).eval()
         agent = DeconfoundedAgent.new(kind, 3, 16, scales, draws())
@@ -183,6 +187,25 @@ def test_a_schedule_is_a_cosine_that_ends_with_training() -> None:
         rates.append(optimizer.rate)
     assert rates[4] == pytest.approx(0.05)
     assert rates[-1] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_whitener_follows_its_first_batches() -> None:
+    """By a twentieth in each of the updates that it has, and in none afterwards."""
+    whitener, x, kept = Whitener(2, draws()), 5 + 2 * draws().normal(50, 2), 0.95**3
+    whitener.updates_left = 3
+    for _ in range(5):
+        whitener(x, torch.ones(2, 50))
+    torch.testing.assert_close(whitener.mean, (1 - kept) * x.mean(1))
+    torch.testing.assert_close(whitener.variance, kept + (1 - kept) * x.var(1, correction=0))
+
+
+def test_a_gaussian_density_has_the_gradient_of_autograd() -> None:
+    mean, std = (draws().normal(3, 2).double() for _ in range(2))
+    x, std = mean + 0.7, std.abs() + 0.3
+    expected = torch.distributions.Normal(mean, std).log_prob(x).sum(-1)
+    torch.testing.assert_close(gaussian_log_prob(x, mean, std), expected)
+    given = [mean.requires_grad_(), std.requires_grad_()]
+    assert torch.autograd.gradcheck(lambda *given: gaussian_log_prob(x.detach(), *given), given)
 
 
 def test_an_optimizer_that_is_restored_goes_on_as_before() -> None:

@@ -16,13 +16,16 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.adam import Adam
+from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
+from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.deconf.core.sizes import LARGE_OBSERVATION, WIDE
 from deconfounded.deconf.diagnosis.exploration import SHARE, ExplorationPolicy
+from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.exact import ExactAgent
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import Method
@@ -34,6 +37,8 @@ from deconfounded.deconf.methods import (
     deconfounded_offline,
     dml_il,
     dpt,
+    flow_bc,
+    gail,
     memoryless_bc,
     naive_rnn,
     naive_transformer,
@@ -46,9 +51,9 @@ from deconfounded.deconf.methods.dagger import DaggerAgent, DaggerConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig, Synthesis
-from deconfounded.deconf.methods.dml_il import DmlConfig, MeanHead, Rollouts
+from deconfounded.deconf.methods.dml_il import DmlConfig, History, MeanHead, Rollouts
 from deconfounded.deconf.methods.dpt import DptAgent, DptConfig
-from deconfounded.deconf.methods.flow_bc import ChunkFlow, FlowAgent
+from deconfounded.deconf.methods.flow_bc import ChunkFlow, FlowAgent, FlowConfig, FlowTrainer
 from deconfounded.deconf.methods.gail import Discriminator, GailConfig
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.naive_dropout import ActionDropoutAgent, DropoutConfig
@@ -257,6 +262,14 @@ class TestMemories:
         assert lengths == [5, 5, 2]
         assert trainer.done == trainer.total == 3
 
+    @pytest.mark.parametrize("cooled", [False, True])
+    def test_a_learning_rate_falls_if_it_is_to(self, cooled: bool) -> None:
+        """To 0 at the end of training."""
+        data, config = batch(), RecurrentConfig(width=8, updates=3, chunk=4, cooled=cooled)
+        trainer = RecurrentTrainer(RecurrentAgent.new(8, Scales.of(FLAT, data), streams()), config, 12, Monitor())
+        trainer.learn(data, data.action)
+        assert trainer.optimizer.rate == pytest.approx(0 if cooled else config.learning_rate)
+
     def test_a_history_ends_with_its_episode(self) -> None:
         """flow_bc reads the latest steps of the episode alone."""
         shape = {"width": 8, "history": 3, "ahead": 2, "executed": 1, "integration": 1}
@@ -312,6 +325,48 @@ class TestInstruments:
         assert all((first != second).any() for first, second in residuals)
         assert residuals
 
+    def test_the_first_steps_of_an_episode_are_taken_as_they_are(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Where noise lasts as long as episodes, all are: no model is fitted to them, and no roll-out is used."""
+        fitted, residuals, moment_loss = list[Tensor](), list[Any](), dml_il.moment_loss
+        spy = lambda log_prob, mask: (fitted.append(mask), imitation_loss(log_prob, mask))[1]  # noqa: E731
+        monkeypatch.setattr(dml_il, "imitation_loss", spy)
+        spy = lambda pair, mask: (residuals.append(pair), moment_loss(pair, mask))[1]  # noqa: E731
+        monkeypatch.setattr(dml_il, "moment_loss", spy)
+        dml_il.train(trials(), replace(self.config, lag=STEPS), [rng()])
+        assert fitted
+        assert residuals
+        assert not any(mask.any() for mask in fitted)
+        assert all(torch.equal(first, second) for first, second in residuals)
+
+    def test_a_policy_reads_the_memory_of_its_own_trial(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Of either half; the action is the trial's number here."""
+        marked, read, acted = trials(), list[Tensor](), list[Tensor]()
+        marked = Trials(marked.obs, np.repeat(marked.obs[:, :, :1, :1] / 10, STEPS, 2), marked.mask)
+        at, residual = History.at, MeanHead.residual
+
+        def at_spy(self: History, data: Batch, origin: Tensor) -> Tensor:
+            if not isinstance(self, Rollouts):
+                read.append(data.steps(origin).obs[..., :1])
+            return at(self, data, origin)
+
+        monkeypatch.setattr(History, "at", at_spy)
+        spy = lambda self, features, action: (acted.append(action), residual(self, features, action))[1]  # noqa: E731
+        monkeypatch.setattr(MeanHead, "residual", spy)
+        dml_il.train(marked, self.config, [rng()])
+        assert read
+        for number, action in zip(read, acted[::2], strict=True):
+            torch.testing.assert_close(number / 10, action)
+
+    def test_a_roll_out_model_has_the_density_of_its_mixture(self) -> None:
+        draws = streams()
+        model, memory, obs = Rollouts(2, 8, 3, Scales.of(FLAT, batch()), draws), batch(), draws.normal(2, N, 2)
+        with torch.no_grad():
+            memory, now, then = model.memory(batch())[:, :, 3], obs[:, 0], obs[:, 1]
+            logits, mean, std = model(memory, now)
+            parts = torch.distributions.Independent(torch.distributions.Normal(mean, std), 1)
+            mixture = torch.distributions.MixtureSameFamily(torch.distributions.Categorical(logits=logits), parts)
+            torch.testing.assert_close(model.log_prob(memory, now, then), mixture.log_prob(then))
+
 
 def test_the_inverse_model_counts_as_much_as_it_is_set_to() -> None:
     """dadp's encoder learns other weights with it and without."""
@@ -328,15 +383,16 @@ def test_the_inverse_model_counts_as_much_as_it_is_set_to() -> None:
 def test_what_leaks_is_given_the_next_action(monkeypatch: pytest.MonkeyPatch) -> None:
     """palr: a memory before a step must hold no more of the action before than the expert's action there tells."""
     samples, hscic = list[tuple[Tensor, ...]](), palr.hscic
-    spy = lambda x, y, given, ridge: (samples.append((y, given)), hscic(x, y, given, ridge))[1]  # noqa: E731
+    spy = lambda x, y, given, ridge: (samples.append((x, y, given)), hscic(x, y, given, ridge))[1]  # noqa: E731
     monkeypatch.setattr(palr, "hscic", spy)
     agent = PalrAgent.new(8, Scales.plain(FLAT, 1), streams())
     agent.configure(PalrConfig(samples=32))
     data = batch()
     numbers = torch.arange(data.mask.shape[2]).float().expand_as(data.mask)[..., None]
-    agent.loss(replace(data, action=numbers), numbers + 100, agent.memory.start(N))
-    before, given = samples[0]
+    agent.leakage(numbers + 200, replace(data, action=numbers), numbers + 100)
+    memory, before, given = samples[0]
     assert torch.equal(given, before + 1 + 100)
+    assert torch.equal(memory, before + 1 + 200)
 
 
 def test_transitions_of_gail_end_where_their_episode_did() -> None:
@@ -375,12 +431,15 @@ def test_synthetic_actions_are_random_as_often_as_asked(share: float, std: float
 
 def test_the_unit_of_an_online_belief_is_of_demonstrations(monkeypatch: pytest.MonkeyPatch) -> None:
     """deconfounded_offline: those that it infers on whole trials of the expert."""
-    inferred = list[Tensor]()
+    inferred, fitted, fit_online = list[Tensor](), list[Tensor](), OnlineBelief.fit
+    fit_spy = lambda *given: (fitted.append(given[-1]), fit_online(*given))[1]  # noqa: E731
+    monkeypatch.setattr(OnlineBelief, "fit", fit_spy)
     spy = lambda *parts: (inferred.append(parts[2]), Synthesis(*parts))[1]  # noqa: E731
     monkeypatch.setattr(deconfounded_offline, "Synthesis", spy)
     agent = deconfounded_offline.train(trials(), OfflineConfig(**{**OFFLINE, "width": 8, "online_steps": 64}), [rng()])
     torch.testing.assert_close(agent.model.latent_stds(), inferred[0].std(1, correction=0).clamp(min=0.05))
     assert inferred[0].shape[1] == N
+    assert torch.isin(fitted[0], inferred[0]).all()  # synthetic trials have known latents
 
 
 def test_an_exploration_policy_acts_at_random_now_and_then() -> None:
@@ -398,6 +457,36 @@ def test_actions_are_within_their_range(head: type[ActionHead]) -> None:
     for bias, end in ((50.0, 1), (-50.0, -1)):
         policy.net[-1].bias.data[..., 0] = bias  # type: ignore[operator, union-attr]
         assert (policy.sample(torch.zeros(1, 5, FLAT.obs), streams()) == end).all()
+
+
+def test_a_policy_reads_in_training_what_it_reads_in_deployment() -> None:
+    """dagger: at each step a memory of the steps before, and not of that step."""
+    data = batch()
+    agent: Any = DaggerAgent.new(8, 2, False, Scales.of(FLAT, data), streams())
+    agent.memory.eval()
+    trained, deployed = list[Tensor](), list[Tensor]()
+    agent.policy.log_prob = lambda features, action: (trained.append(features), action[..., 0])[1]
+    agent.policy.sample = lambda features, _: (deployed.append(features), features[..., :1])[1]
+    agent.begin(N)
+    with torch.no_grad():
+        agent.loss(data, data.action, None, streams())
+        for t in range(EPISODES * STEPS):
+            agent.choose(data.obs[:, :, t])
+            agent.remember(data[:, :, t])
+    stepwise = torch.stack(deployed, 2)
+    torch.testing.assert_close(trained[0].view_as(stepwise), stepwise, rtol=1e-4, atol=1e-4)
+
+
+def test_an_estimate_is_trained_as_it_is_deployed() -> None:
+    """rma: that of a step is of the steps before it."""
+    data = batch()
+    agent = RmaAgent.blank({"width": 8, "theta": 1, "teacher": 8}, Scales.of(FLAT, data), streams())
+    agent.begin(N)
+    estimates = []
+    for t in range(EPISODES * STEPS):
+        estimates.append(torch.tensor(agent.features())[None])
+        agent.remember(data[:, :, t])
+    assert agent.loss(data, torch.stack(estimates, 2), agent.adapter.start(N))[0].item() < 1e-10
 
 
 def test_actions_of_a_chunk_are_within_their_range() -> None:
@@ -442,19 +531,41 @@ def test_each_batch_of_a_function_is_fresh_trials(monkeypatch: pytest.MonkeyPatc
     assert learned == [100, 200]
 
 
+@pytest.mark.parametrize("fresh", [False, True])
+def test_histories_of_flow_bc_are_of_an_episode(fresh: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It learns single episodes, of trials that stay and of fresh ones."""
+    lengths, learn = list[int](), FlowTrainer.learn
+    spy = lambda self, data, label: (lengths.append(data.mask.shape[2]), learn(self, data, label))[1]  # noqa: E731
+    monkeypatch.setattr(FlowTrainer, "learn", spy)
+    config = FlowConfig(width=8, history=2, ahead=2, updates=1, batch=4, steps=8)
+    flow_bc.train(trials if fresh else trials(), config, rng())
+    assert lengths == [STEPS]
+
+
 def test_ppo_has_the_settings_of_gail() -> None:
     from deconfounded.deconf.methods.gail_ppo import new_ppo
 
     config = GailConfig(width=8, envs=3, steps=8, epochs=2, minibatch=12, gamma=0.5, policy_rate=0.25)
     ppo = new_ppo(gail_env()[0], config, 0)
     assert (ppo.n_steps, ppo.n_epochs, ppo.batch_size, ppo.gamma, ppo.learning_rate) == (8, 2, 12, 0.5, 0.25)
+    assert ppo.policy.log_std.exp().tolist() == pytest.approx([0.6], abs=0.01)  # type: ignore[operator, union-attr]
 
 
 def test_each_seed_of_gail_is_rewarded_by_its_own_discriminator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the environments of its own, before the first round and in each."""
+    """In the environments of its own, before the first round and in each; it takes demonstrations for the expert's."""
     rewarded, of_seed = list[int](), Discriminator.of_seed
     spy = lambda self, i: (rewarded.append(i), of_seed(self, i))[1]  # noqa: E731
     monkeypatch.setattr(Discriminator, "of_seed", spy)
+    given, train, loss = list[Trials](), gail.train, Discriminator.loss
+
+    def loss_spy(self: Discriminator, expert: Batch, own: Batch) -> Tensor:
+        demonstrated = torch.tensor(given[0].action).unique()
+        assert torch.isin(expert.action, demonstrated).all()
+        assert not torch.isin(own.action, demonstrated).all()
+        return loss(self, expert, own)
+
+    monkeypatch.setattr(gail, "train", lambda *rest: (given.append(rest[0]), train(*rest))[1])
+    monkeypatch.setattr(Discriminator, "loss", loss_spy)
     fit(Context(envs.get("tilted_cartpole"), tiny_preset().configured("gail", rounds=1), [0, 1], Monitor()), "gail")
     assert rewarded == [0, 1, 0, 1]
 
@@ -514,7 +625,12 @@ def test_contexts_are_read_by_the_encoder_that_was_trained(monkeypatch: pytest.M
     spy = lambda memories, of: (read.append(memories), contexts(memories, of))[1]  # noqa: E731
     monkeypatch.setattr(dadp, "contexts", spy)
     config = DadpConfig(width=8, inference_updates=2, inference_batch=4, inference_steps=16, imitation_updates=1)
+    numbers, forward = list[Tensor](), EvidenceBelief.forward
+    forward_spy = lambda self, data: (numbers.append(data.obs[0, :, 0, 0]), forward(self, data))[1]  # noqa: E731
+    monkeypatch.setattr(EvidenceBelief, "forward", forward_spy)
     agent = dadp.train(trials(), config, rng())
+    assert len(read) == 3  # in each update of encoder and policy
+    assert not any(number.unflatten(0, (-1, EPISODES)).diff().any() for number in numbers)  # of trials that are whole
     with torch.no_grad():
         memories = agent.encoder(Batch.of(split_episodes(trials()), 1))[:, :, -1]
     torch.testing.assert_close(read[-1], memories.unflatten(1, (N, EPISODES)))

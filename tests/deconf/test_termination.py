@@ -30,10 +30,13 @@ def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
 
 
 def test_the_limit_is_learned() -> None:
-    """Termination beyond the limit and not within: right for 95% of observations .3 or more from it."""
+    """Termination beyond the limit and not within: right for 95% of observations .3 or more from it.
+
+    It is learned from all logs, of which one is of walks that go on.
+    """
     trials = walks()
     draws = Draws([np.random.default_rng(0)], "cpu")
-    model = termination.fit([trials], observed(trials), draws)
+    model = termination.fit([walks(2, limit=1e9), trials], observed(trials), draws)
     assert model is not None
     obs = torch.linspace(-4, 4, 401)[None, :, None]
     predicted = (model.logit(obs) > 0)[0]
@@ -100,10 +103,11 @@ def test_rollouts_end(limit: float, observed: float, steps: int, last: float, er
     walker, model = Walker(), SimpleNamespace(logit=lambda obs: obs[..., 0] - limit)
     make: Any = LearnedEnv
     expert = trial(*range(6))
-    env = make(walker, expert, [expert, trial(-1, observed)], 1, 20, model)
-    action_error, path, length = env.rollout(walker, [np.random.default_rng(0)])
-    assert walker.steps == steps
-    assert walker.farthest >= min(last + 1, 6)  # the actor's evidence is not clamped
-    assert action_error.item() == pytest.approx(error)
-    assert length.tolist() == [[steps] * 3]
-    assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]
+    for episodes in (1, 2):  # of which the last counts
+        env = make(walker, expert, [expert, trial(-1, observed)], episodes, 20, model)
+        action_error, path, length = env.rollout(walker, [np.random.default_rng(0)])
+        assert walker.steps == episodes * steps
+        assert walker.farthest >= min(last + 1, 6)  # the actor's evidence is not clamped
+        assert action_error.item() == pytest.approx(error)
+        assert length.tolist() == [[steps] * 3]
+        assert path[0, 0, :, 0].tolist() == [min(i, last) for i in range(1, 21)]

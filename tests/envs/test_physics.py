@@ -241,7 +241,9 @@ class TestEdits:
     def test_masses_and_gravity(self, compiler: str) -> None:
         """What edits say, in numbers: not only alike in both."""
         nominal = mujoco.MjSpec.from_string(MJCF.format(compiler=compiler)).compile()
-        for model in self.edited(compiler, lambda edit: edit.slope(0.2), lambda edit: edit.body_mass("b", 3.0)):
+        shift: Callable[[Edit], None] = lambda edit: edit.body_shift("d", 0.7, 0.2)  # noqa: E731
+        for model in self.edited(compiler, lambda edit: edit.slope(0.2), lambda edit: edit.body_mass("b", 3.0), shift):
+            np.testing.assert_allclose(model.body("d").pos, (0.7, 0.2, 2))
             np.testing.assert_allclose(model.body("b").mass, 3 * nominal.body("b").mass)
             np.testing.assert_allclose(model.body("b").inertia, 3 * nominal.body("b").inertia)
             np.testing.assert_allclose(model.body("c").mass, nominal.body("c").mass)
@@ -266,6 +268,13 @@ def test_pictures_show_a_tilt() -> None:
     state = task.state(slider=(0.0, 0.0))[0]
     level, up = (task.renderer(np.array([angle]))(state, np.zeros(1)) for angle in (0.0, 0.5))
     assert (level != up).any()
+
+
+def test_an_edit_of_no_geom_is_refused() -> None:
+    """A model for stepping alone lacks those that are only seen; a name that the MJCF does not have is a slip."""
+    model = Spring().model
+    with pytest.raises(KeyError, match="wait"):
+        ModelEdit(copy.copy(model), model, mujoco.MjData(model)).geom_friction("wait", 1.0)
 
 
 def test_threads_are_at_most_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
