@@ -50,7 +50,7 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 f"{method} on {task.name}: the same number of settings each"
             )
     amounts = preset("default", envs.get("bandit"), "cpu", ["deconfounded_mean"])
-    changed = tune.other(amounts, "deconfounded_mean", {"latent": 0.4, "beta": 2, "model": "evidence"})
+    changed = tune.other(amounts, "deconfounded_mean", {"latent": 0.34, "beta": 2, "model": "evidence"})
     config = changed.configs["deconfounded_mean"]
     assert (config["latent"], config["beta"], config["model"]) == (2, 0.02, "evidence")
     assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
