@@ -56,7 +56,7 @@ class Units:
         width = np.where(high > low, high - low, 1)
         given = np.asarray(action, float)
         scaled = np.where(high > low, (2 * (given - low) / width - 1).clip(-1, 1), 0)
-        return np.where((low == -1) & (high == 1), given, scaled)  # the same bits
+        return np.where((low == -1) & (high == 1), given.clip(-1, 1), scaled)  # the same bits
 
     def unscaled(self, action: NDArray[Any]) -> NDArray[Any]:
         """The reverse of `scaled`; beyond -1 and 1 it is the end of the range."""

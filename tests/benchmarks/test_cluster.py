@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -264,3 +266,24 @@ def test_what_killed_workers_left_is_removed(tmp_path: Path, monkeypatch: pytest
         assert (folder / "jobs").is_dir()
         assert not (tmp_path / names[0]).exists()
     assert {one.name for one in tmp_path.iterdir()} == {names[1], "deconfounded-data", f"deconfounded-{2**22 + 1}-mine"}
+
+
+def test_a_process_of_another_user_is_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though it may not be signalled: its folder stays."""
+    for error, right in ((PermissionError, True), (ProcessLookupError, False)):
+        monkeypatch.setattr(worker.os, "kill", Mock(side_effect=error))
+        assert worker.running(1) is right
+
+
+def test_progress_is_sent_with_files_or_without(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All ticks so far, and each file when it has changed; nothing where there is nothing new."""
+    sent: list[Any] = []
+    monkeypatch.setattr(worker.threading, "Thread", Mock())  # it is asked to send by hand
+    courier = worker.Courier(tmp_path, 3, SimpleNamespace(put=SimpleNamespace(remote=lambda *what: sent.append(what))))
+    (tmp_path / "jobs").mkdir()
+    for ticks, content in ((2, b""), (0, b""), (4, b"a"), (0, b""), (0, b"bc")):
+        courier.put(ticks)
+        if content:
+            (tmp_path / "jobs" / ".x-0.pt").write_bytes(content)
+        courier._send()
+    assert sent == [(3, 2, {}), (3, 6, {"jobs/.x-0.pt": b"a"}), (3, 6, {"jobs/.x-0.pt": b"bc"})]

@@ -221,6 +221,8 @@ def test_what_differs_is_said() -> None:
     before, now = {"torch": "2.13.0", "numpy": "2.4"}, {"torch": "2.14.0", "numpy": "2.4"}
     assert job_files.differing("versions", before, now) == "versions (torch was 2.13.0, is 2.14.0)"
     assert job_files.differing("salt", "", "x") == "salt (was empty, is x)"
+    before, now = dict.fromkeys("abcde", "1"), dict.fromkeys("abcde", "2")
+    assert job_files.differing("set", before, now) == "set (a was 1, is 2; b was 1, is 2; c was 1, is 2, and 2 more)"
 
 
 class TestScores:
@@ -231,8 +233,9 @@ class TestScores:
         both = [[r for r in kept if r["seed"] in (s if r["method"] in catalogue.REFERENCES else s[:3])] for s in seeds]
         few, many = (aggregation.gather(of)["methods"] for of in both)
         assert few["naive_rnn"]["score"] == many["naive_rnn"]["score"]
-        foreign = [{**r, "expert": "0" * 64} for r in both[0]]  # an expert of one's own: its run's own references
-        assert aggregation.gather(foreign)["methods"]["expert"]["score"] != few["expert"]["score"]
+        for of in ({"expert": "0" * 64}, {"expert_version": 99}):  # another expert: its run's own references
+            foreign = [{**r, **of} for r in both[0]]
+            assert aggregation.references(foreign[0], foreign) != aggregation.references(both[0][0], both[0])
 
     @pytest.mark.slow
     def test_coverage(self) -> None:
@@ -315,6 +318,7 @@ class TestComparison:
             **{"first - c": "-0.15", "last - c": "+0.50", "regret - c": "-0.35"},
         }
         assert (of_t["task"], of_t["method"], of_t["seeds"], of_t["last"]) == ("t", "a", "2", "0.60")
+        assert tables["tasks"][2][:6] == ["t", "b", "3", "0.40", "0.53", "1.07"]
         for cells in (of_t, over):
             assert {head: cells[head].partition(" (")[0] for head in expected} == expected
         better = [over[f"P(better than {other})"].partition(" (")[0] for other in "bc"]

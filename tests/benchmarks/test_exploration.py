@@ -8,7 +8,8 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import changed, preset
-from deconfounded.benchmarks.studies import exploration
+from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.studies import exploration, table
 from tests.tools import bars, dots
 
 PNG = b"\x89PNG"
@@ -56,6 +57,16 @@ def test_two_programs_add_to_a_file(tmp_path: Path) -> None:
     for task, last in (("curling", 0.5), ("windy_drone", 0.6), ("curling", 0.7)):
         points = exploration.added(file, point(task, "rma", 4, [last]))
     assert {key[0]: of["last"] for key, of in points.items()} == {"curling": [0.7], "windy_drone": [0.6]}
+
+
+def test_records_that_stand_for_all_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of the method and of the references, of as many seeds as the other amounts have; none if one is missing."""
+    task, methods = envs.get("curling"), ("random", "expert", "dagger", "rma")
+    made: list[Any] = [{"method": method, "seed": seed} for method in methods for seed in range(3)]
+    monkeypatch.setattr(records, "of_task", lambda *_: made)
+    for lacking, expected in (((), [each for each in made[:9] if each["seed"] < 2]), ((1,), [])):
+        monkeypatch.setattr(table, "missing", lambda *_, lacking=lacking: lacking)
+        assert exploration.recorded(task, preset("default", task, "cpu", ["dagger"]), "dagger", 2) == expected
 
 
 def test_table(points: list[dict[str, Any]]) -> None:

@@ -1,6 +1,7 @@
 """What commands and the engine say and take, by what it means: returns that are played, versions, and digests."""
 
 import os
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,13 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import play
-from deconfounded.benchmarks.engine import catalogue, job_files, local, sources
+from deconfounded.benchmarks.console import whole
+from deconfounded.benchmarks.engine import catalogue, guest_host, job_files, local, sources
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import cards, table
 from deconfounded.experts.agent import RandomAgent
 from tests import toys
+from tests.tools import deconf
 
 METHOD = """
 from deconfounded.deconf.method import uses
@@ -165,3 +168,43 @@ def test_the_table_in_docs_is_of_default_runs_alone(
     monkeypatch.setattr("sys.argv", [*words, *more])
     table.main()
     assert [file.is_relative_to(cards.DOCS if docs else tmp_path) for file in read] == [True]
+
+
+def test_the_last_edit_is_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of any Python file of the package, in any of its folders."""
+    monkeypatch.setattr(sources, "OURS", (tmp_path / "a", tmp_path / "b"))
+    for name, at in (("a/x.py", 1), ("b/c/y.py", 3), ("b/z.py", 2), ("b/z.png", 9)):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+        os.utime(tmp_path / name, ns=(0, at))
+    assert sources.last_edit() == 3
+
+
+def test_a_whole_number_of_the_command_line_is_of_its_range() -> None:
+    """Both ends are."""
+    number = whole(2, 5)
+    assert [number(text) for text in ("2", "5")] == [2, 5]
+    assert whole(2)("10") == 10
+    for text in ("1", "6", "2.5", "x", ""):
+        with pytest.raises(ArgumentTypeError, match="it must be a whole number from 2 to 5"):
+            number(text)
+
+
+def test_an_agent_of_another_class_gets_numbers_as_in_its_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of seeds that it is sent, in a process of its own; one of ours gets the run's generators."""
+    space = toys.Push.action_space
+    monkeypatch.setattr(play.saved_agents, "describe", lambda folder: {})
+    monkeypatch.setattr(play.deconfounded, "load", lambda folder: RandomAgent(space))
+    ready, agent = play.ready(Path(), toys.Push()), RandomAgent(space)
+    ready.reset([np.random.default_rng(3)])
+    agent.reset([np.random.default_rng(seed) for seed in guest_host.fresh([np.random.default_rng(3)])])
+    obs = np.zeros((4, 2), np.float32)
+    np.testing.assert_array_equal(ready.act(obs), agent.act(obs))
+
+
+def test_the_first_five_seeds_of_a_table_come_first(tmp_path: Path) -> None:
+    """Of what a default run makes there are ten."""
+    words = ["table", "--tasks", "bandit", "--methods", "naive_rnn", "rma", "--set", "eval_trials=4", "--list"]
+    lines = [line.removeprefix("bandit, ") for line in deconf(tmp_path, *words).stdout.splitlines()]
+    many = [f"{name}: seeds 0 1 2 3 4 5 6 7 8 9" for name in ("naive_rnn", "expert", "random")]
+    assert {*lines} == {*many, "rma: seeds 0 1 2 3 4", "35 seeds are missing or stale"}

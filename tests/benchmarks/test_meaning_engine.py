@@ -6,6 +6,7 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -14,7 +15,9 @@ from deconfounded.benchmarks import certify
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, progress, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
+from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.local import Here, Local
+from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.envs import registry
 from tests.tools import tiny_preset
 
@@ -43,21 +46,26 @@ def test_a_killed_worker_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_certificate_s_exit_code(
     verdict: str, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """It is of as many trials as were asked for, and says how well theta is known in the last episode."""
+    asked: list[Any] = []
     result = {
-        **{"task": "bandit", "verdict": verdict, "inferability": [{}]},
+        **{"task": "bandit", "verdict": verdict, "inferability": [{"arm": 0.2}, {"arm": 0.9}]},
         **{"checks": {"blind_bc": {"measured": 0.9, "required": "<= 0.7", "passed": verdict == "passed"}}},
         **{"evidence_nats_per_step": {"dynamics": 1.0, "actions": 1.0}},
     }
-    monkeypatch.setattr(certify, "certify", lambda *_, **__: result)
+    monkeypatch.setattr(certify, "certify", lambda *given, **_: (asked.extend(given[2:]), result)[1])
     monkeypatch.setattr(certify, "picture", lambda *_: None)
-    monkeypatch.setattr("sys.argv", ["certify", "--task", "bandit", "--out", str(tmp_path)])
+    monkeypatch.setattr("sys.argv", ["certify", "--task", "bandit", "--out", str(tmp_path), "--trials", "7"])
     ended: Any = 0
     try:
         run_command(certify.main)
     except SystemExit as error:
         ended = error.code
     assert ended == code
-    assert f"certificate {verdict}" in capsys.readouterr().out
+    assert asked == [7]
+    said = capsys.readouterr().out
+    assert f"certificate {verdict}" in said
+    assert "theta from expert trials (R2, or the share that is right): arm 0.90\n" in said
 
 
 def test_a_checkpoint_is_of_its_own_job_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,3 +202,46 @@ def test_an_error_of_ours_is_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(BenchmarkJob, "run", lambda self: {}["gone"])
     with pytest.raises(KeyError):
         scheduler.run_job(BenchmarkJob("bandit", tiny_preset(), "random", (0,), tmp_path))
+
+
+def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """When so many seconds have passed since the line before, whatever is done meanwhile."""
+    clock = Mock(return_value=0.0)
+    monkeypatch.setattr(progress.time, "monotonic", clock)
+    work = progress.Progress(10, "work", every_s=5)
+    for clock.return_value in (4.0, 6.0, 8.0, 10.0, 12.0):
+        work.update(1)
+    assert capsys.readouterr().out == "work:  20%, 24 s left\nwork:  50%, 12 s left\n"
+
+
+def test_seeds_side_by_side() -> None:
+    """As many groups as there are slots; references share nothing, nor does what is from outside."""
+    learned = METHODS["naive_rnn"]
+    assert scheduler.groups(learned, [0, 1, 2, 4, 7], 2) == [(0, 1, 2), (4, 7)]
+    assert scheduler.groups(learned, [3], 2) == [(3,)]
+    for alone in (METHODS["random"], replace(learned, reference="mine.py:fit")):
+        assert scheduler.groups(alone, [0, 1, 2], 2) == [(0,), (1,), (2,)]
+
+
+@pytest.mark.parametrize(
+    ("name", "control", "bandit"), [("smoke", (1, 32), (1, 2000)), ("default", (3, 256), (5, 24000))]
+)
+def test_amounts_of_presets(name: str, control: tuple[int, int], bandit: tuple[int, int]) -> None:
+    """Seeds and expert trials of each kind of task; of the paper, ten seeds of as many trials as by default."""
+    for task, amounts in (("curling", control), ("bandit", bandit)):
+        made, paper = (preset(each, envs.get(task), "cpu", ["random"]) for each in (name, "paper"))
+        assert (made.seeds, made.expert_trials) == amounts
+        assert (paper.seeds, paper.expert_trials >= made.expert_trials) == (10, True)
+
+
+def test_progress_of_a_training_is_its_share_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of a training that takes .8 of a job are .4 of its ticks; the rest come when it is done."""
+    ticks: queue.Queue[int] = queue.Queue()
+    monkeypatch.setattr(progress, "_ticks", ticks, raising=False)
+    job = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", (0,), tmp_path)
+    monitor = jobs.JobMonitor(job, 0.8)
+    for done, sum_of_ticks in ((1, 0.4), (1, 0.4), (2, 0.8)):
+        monitor.update(done, 2, {})
+        assert sum(ticks.queue) == pytest.approx(sum_of_ticks * job.ticks, abs=1)
+    monitor.close()
+    assert sum(ticks.queue) == job.ticks

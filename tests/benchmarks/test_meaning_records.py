@@ -4,6 +4,7 @@ import queue
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,6 +115,13 @@ class TestBudget:
         assert context.monitor.budget["queries"] == (2 * steps).tolist()
         assert steps.sum() < trials.mask.size
 
+    @pytest.mark.parametrize(("n", "spent"), [(3, 3), (None, 4)])
+    def test_exploration(self, n: int | None, spent: int) -> None:
+        """As many trials as were asked for; else the preset's."""
+        context = Context(toys.Push(), tiny_preset(), [0, 1], expert="tests.toys:control")
+        assert len(context.explore(None, context.rngs, n)) == 2 * spent
+        assert context.monitor.budget["exploration_trials"] == [spent] * 2
+
     def test_cpu_seconds(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         monkeypatch.setattr(JobMonitor, "cpu", lambda self: 8.0)
@@ -128,3 +136,27 @@ class TestBudget:
         jobs = (BenchmarkJob("bandit", on_gpu, method, (0,), tmp_path) for method in ("naive_rnn", "gail", *REFERENCES))
         devices = [JobMonitor(job, 1.0).device for job in jobs]
         assert devices == ["cuda", "cuda", *["cpu"] * len(REFERENCES)]
+
+
+def test_an_identity_is_of_no_device(tmp_path: Path) -> None:
+    """A record that a GPU made stays when a CPU is asked for."""
+    cpu, gpu = (tiny_preset().configured("naive_rnn", device=device) for device in ("cpu", "cuda"))
+    jobs = (BenchmarkJob("bandit", each, "naive_rnn", (0,), tmp_path) for each in (cpu, replace(gpu, device="cuda")))
+    first, second = map(identity.identity, jobs)
+    assert first == second
+
+
+@pytest.mark.parametrize(("status", "commit"), [("", "abc"), (" M x.py\n", "abc+")])
+def test_a_commit_of_changed_files_has_a_plus(status: str, commit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And a folder in another checkout has none."""
+    said = {"--show-toplevel": f"{identity.ROOT}\n", "HEAD": "abc\n", "--porcelain": status}
+    answer = lambda command, **_: SimpleNamespace(stdout=said[command[2]].encode())  # noqa: E731
+    monkeypatch.setattr(identity.subprocess, "run", answer)
+    assert identity.commit.__wrapped__() == commit
+    said["--show-toplevel"] = f"{identity.ROOT.parent}\n"
+    assert identity.commit.__wrapped__() is None
+
+
+def test_a_short_commit_says_whether_files_were_changed() -> None:
+    commits = (None, "0123456789abcdef", "0123456789abcdef+")
+    assert [records.short_commit(commit) for commit in commits] == ["unknown", "0123456", "0123456+"]

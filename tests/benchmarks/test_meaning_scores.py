@@ -241,6 +241,16 @@ def test_a_number_in_results_is_its_method_s(some: Found) -> None:
     assert seen == len(expected) + 2
 
 
+def test_twice_as_long_is_the_last_of_twice_as_many_episodes(some: Found) -> None:
+    """Its cell is empty where agents were not run for that long."""
+    task, made = some[1]
+    head, _, *rows = tables(results.section(task, made))[0]
+    assert head[-1] == "twice as long"
+    for row in rows:
+        beyond = made["methods"][row[0]].get("score_beyond")
+        assert row[-1] == (scoring.two_decimals(beyond[task.episodes - 1]) if beyond else "")
+
+
 def entry(first: float, last: float) -> dict[str, Any]:
     """A method's part of results.json that scores `first` in the first episode and `last` in the second."""
     return {
@@ -267,6 +277,7 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
     about |= {"versions": dict.fromkeys(("python", "mujoco", "torch"), "1"), "eval_trials": 4, "episodes": 2}
     text = run_report.page({**about, "commits": ["0"], "expert": "x", "methods": methods}, tmp_path)
+    assert '<path d="M4.0 19.0L74.0 7.0"/>' in text  # the best, from .2 to .8: 0 is at 23, and 1 above it, at 3
     places = [re.search(rf"<td[^>]*>\s*(?:<[^>]*>\s*)*{name}\b", text).start() for name in ("best", "middle", "bad")]  # type: ignore[union-attr]
     assert places == sorted(places)
 
@@ -315,6 +326,11 @@ def test_episodes_beyond_training_move_no_score() -> None:
     assert summary["regret"] == pytest.approx(0.8 + 0.5)
     assert summary["ci95_regret"] == pytest.approx([0.8 + 0.4, 0.8 + 0.6])
     assert scoring.summarise(by_method, 2, references)["expert"]["regret"] == 0
+
+
+def test_data_that_a_seed_did_not_use_is_none() -> None:
+    """A mean over seeds is of all of them."""
+    assert scoring.mean_budget([{"queries": 4}, {"queries": 2, "thetas": 6}]) == {"queries": 3, "thetas": 3}
 
 
 def test_rows_csv_is_row_by_row_what_came_of_it() -> None:

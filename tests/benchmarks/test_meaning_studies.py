@@ -15,7 +15,7 @@ from deconfounded.benchmarks import certify, diagnose, verify
 from deconfounded.benchmarks import score as score_command
 from deconfounded.benchmarks.engine import identity, protocols, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
-from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.published import RECORDS
@@ -23,6 +23,7 @@ from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import exploration, validate
 from deconfounded.benchmarks.studies.foreign import measure as foreign
 from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.diagnosis import exploration as explorers
 from deconfounded.deconf.diagnosis import measures
 from deconfounded.deconf.diagnosis.advice import EXPLORE, VARY_LATENT, Next
 from deconfounded.deconf.diagnosis.measures import Amounts
@@ -34,6 +35,7 @@ from deconfounded.envs.streams import Array
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import of_steps, run_trials
+from deconfounded.experts.trials import Trials
 from tests import toys
 from tests.tools import deconf, tiny_preset
 
@@ -86,6 +88,37 @@ def test_a_gap_is_predicted_where_tier_2_could_close_it() -> None:
     for verdict, tier in (("confounded", 3), ("not confounded", 1), ("nothing at stake", 1)):
         assert validate.predicted(diagnosis(verdict, tier)) == 0
     assert validate.predicted(diagnosis("cannot tell", None, VARY_LATENT)) == 0
+
+
+def test_exploration_of_a_validation_is_half_at_random(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And half by a clone of the demonstrations that tries things; what is there is not made again."""
+    trials = run_trials(envs.BatchEnv(PUSH, 4), RandomAgent(PUSH.action_space), 2, 0).trials
+    explored: list[Any] = []
+    monkeypatch.setattr(Context, "demonstrations", trials)
+    monkeypatch.setattr(
+        Context, "explore", lambda self, *given: (explored.append((given[0], self.preset.explore_trials)), trials)[1]
+    )
+    monkeypatch.setattr(explorers, "fit", lambda *given: given[0])
+    for _ in range(2):
+        file = validate.data(envs.get("curling"), None, tmp_path)[1]
+        assert explored == [(None, 64), (trials, 64)]
+    assert len(Trials.load(file)) == 8
+
+
+def test_a_row_of_a_validation_is_of_its_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The predicted gap, and by how much deconfounded is ahead of naive_rnn; of a certified task Tier 2 is right."""
+    rows: list[dict[str, Any]] = []
+    monkeypatch.setattr(validate, "data", lambda *_: (tmp_path, tmp_path))
+    monkeypatch.setattr(diagnose, "run", lambda *_: (diagnosis("confounded", 2), ""))
+    monkeypatch.setattr(validate, "certificate", lambda *_: True)
+    monkeypatch.setattr(validate, "measured", lambda *_: {"deconfounded": 0.75, "naive_rnn": 0.5})
+    monkeypatch.setattr(validate, "keep", lambda row, order: rows.append(row))
+    monkeypatch.setattr(validate, "kept", lambda name: [])
+    monkeypatch.setattr(validate, "picture", lambda *_: None)
+    monkeypatch.setattr("sys.argv", ["validate", "--tasks", "curling", "--out", str(tmp_path)])
+    validate.main()
+    (row,) = rows
+    assert (row["case"], row["predicted"], row["measured"], row["right"]) == ("curling", 0.4, 0.25, True)
 
 
 @pytest.mark.parametrize(
@@ -159,6 +192,7 @@ class TestCertificates:
         assert mask.mean() < 0.9
         evidence = (expert[:, None] - grid.log_policy(obs, action)).mean()
         assert np.concatenate(recorder.actions).mean() == pytest.approx(evidence, rel=1e-3)
+        assert len(np.concatenate(recorder.dynamics)) == mask.sum()
 
 
 class TestCommands:
@@ -176,6 +210,7 @@ class TestCommands:
         amounts = protocols.amounts("scarce", preset("default", envs.get("curling"), "cpu"))
         assert jobs
         for job in jobs:
+            assert job.folder == Path("results/curling-default-scarce/jobs")
             for name in (*protocols.AMOUNTS, "fresh"):
                 assert getattr(job.preset, name) == getattr(amounts, name)
 
@@ -191,6 +226,20 @@ class TestCommands:
         with pytest.raises(Stopped):
             verify.rerun(record, envs.get("curling"), "naive_rnn", None, "cpu")
 
+    def test_changes_of_a_record_that_is_verified(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Those of all methods and of its own, on the device that was asked for; another method's do not matter."""
+        (record, *_) = [r for r in records.of_task(RECORDS, "curling") if r["method"] == "naive_rnn"]
+        record = {**record, "set": ["query_trials=7", "naive_rnn.updates=9", "dagger.updates=3"]}
+
+        def seen(every: list[BenchmarkJob], *_: Any) -> None:
+            made = every[0].preset
+            assert (made.query_trials, made.configs["naive_rnn"]["updates"], made.device) == (7, 9, "cuda")
+            raise Stopped
+
+        monkeypatch.setattr(scheduler, "run_all", seen)
+        with pytest.raises(Stopped):
+            verify.rerun(record, envs.get("curling"), "naive_rnn", None, "cuda")
+
     def test_a_deployment_is_verified_by_its_own_record(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Of the deployments of an agent, which are all made again."""
         (record, *_) = [r for r in records.of_task(RECORDS, "curling") if r["deployment"] == "mode"]
@@ -201,6 +250,38 @@ class TestCommands:
         made.pop()
         with pytest.raises(envs.InputError, match=f"left no {records.named(record)} to compare with"):
             verify.rerun(record, envs.get("curling"), record["method"], None, "cpu")
+
+    @pytest.mark.parametrize("debug", [False, True])
+    def test_a_run_for_a_debugger(self, debug: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """It is in this process, methods from outside too, and in a folder that goes away."""
+        jobs: list[BenchmarkJob] = []
+
+        def seen(every: list[BenchmarkJob], *_: Any) -> None:
+            jobs.extend(every)
+            raise envs.InputError("enough")
+
+        monkeypatch.setattr(scheduler, "run_all", seen)
+        deconf(tmp_path, "run", "--task", "bandit", "--methods", "blind_bc", *["--debug"] * debug)
+        assert {(job.walled, job.folder.is_relative_to("results")) for job in jobs} == {(not debug, not debug)}
+        assert (tmp_path / "results").exists() is not debug
+
+    def test_exact_policies_need_a_likelihood(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Without one, a run is of the other methods, and names what was asked for in vain."""
+        ran: list[list[str]] = []
+
+        def seen(tasks: Any, args: Any, methods: list[str], folders: Any) -> None:
+            ran.append(methods)
+
+        monkeypatch.setattr("deconfounded.benchmarks.run.run_tasks", seen)
+        monkeypatch.setattr(envs, "check_task", lambda task: None)
+        for opaque in (False, True):
+            monkeypatch.setattr(type(envs.get("curling")), "has_likelihood", not opaque)
+            assert deconf(tmp_path, "run", "--task", "curling").returncode == 0
+        assert [name for name in ran[0] if name not in ran[1]] == ["conditional", "interventional"]
+        assert {*ran[0]} == {*DEFAULT}
+        refused = deconf(tmp_path, "run", "--task", "curling", "--methods", "conditional")
+        assert (refused.returncode, len(ran)) == (2, 2)
+        assert "--methods had conditional, and curling has no likelihood for it" in refused.stderr
 
     def test_another_range_is_scored(self) -> None:
         """All three agents are in it; the expert has less force there to act against than in the whole range."""

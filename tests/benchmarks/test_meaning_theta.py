@@ -102,6 +102,16 @@ def test_a_job_s_file_has_its_own_seed_s_thetas(salt: str, tmp_path: Path, monke
         assert (expected != thetas(task, 3, task.episodes, stream(EVALUATION, seed, f"{salt}x"))).all()
 
 
+def test_a_salt_draws_other_explorations() -> None:
+    """What is explored in training is nobody's guess either, nor what the expert is asked about."""
+    contexts = [Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control", salt=salt) for salt in ("", "x")]
+    for explored, salted in (
+        [context.explore(None, context.rngs) for context in contexts],
+        [context.query(None, context.rngs)[0] for context in contexts],
+    ):
+        assert not np.isin(salted.obs[:, 0, 0], explored.obs[:, 0, 0]).any()
+
+
 class TestDrift:
     """Where theta walks from episode to episode, each episode's labels and features are of its own theta."""
 

@@ -50,7 +50,7 @@ def test_tuning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
                 f"{method} on {task.name}: the same number of settings each"
             )
     amounts = preset("default", envs.get("bandit"), "cpu", ["deconfounded_mean"])
-    changed = tune.other(amounts, "deconfounded_mean", {"latent": 0.5, "beta": 2, "model": "evidence"})
+    changed = tune.other(amounts, "deconfounded_mean", {"latent": 0.34, "beta": 2, "model": "evidence"})
     config = changed.configs["deconfounded_mean"]
     assert (config["latent"], config["beta"], config["model"]) == (2, 0.02, "evidence")
     assert tune.title({"beta": 2, "model": "evidence"}) == "beta x 2, model evidence"
@@ -142,6 +142,14 @@ class TestStatistics:
         assert difference.interval == pytest.approx((0.5 - 1.242069, 0.5 + 1.242069), abs=1e-6)
         assert statistics.paired({0: 1.0}, {0: 0.25}) == statistics.Figure(np.float64(0.75), None, 1)
         assert statistics.paired({0: 1.0}, {1: 1.0}) is None
+
+    @pytest.mark.parametrize("seeds", [2, 5])
+    def test_coverage(self, seeds: int) -> None:
+        """Of the mean over 100 tasks, by the variance of seeds drawn anew within each: 4000 tries."""
+        scores = np.random.default_rng(0).standard_normal((4000, 100, seeds))
+        error = np.sqrt((scores.var(-1) / seeds).sum(-1)) / 100
+        held = np.mean(np.abs(scores.mean((1, 2))) <= 1.96 * error)
+        assert statistics.coverage(seeds) == pytest.approx(held, abs=0.02)
 
     def test_iqm(self) -> None:
         """Of 0 to 7, all tasks as one, the lowest two and the highest two are left out."""
@@ -766,6 +774,28 @@ def test_a_pane_shows_what_was_earned_in_its_episode() -> None:
     np.testing.assert_allclose(pane.earned, [0, *rewards[:3].cumsum(), 0, rewards[3]])
     assert [pane.row(0, t) for t in (0, 3, 4)] == [(0, False), (3, False), (3, True)]
     assert [pane.row(1, t) for t in (0, 1, 2)] == [(4, False), (5, False), (5, True)]
+    assert pane.row(1, Push.horizon) == (5, True)
+
+
+def clip_of(*lengths: int) -> dict[str, Any]:
+    """Episodes of so many steps, in which nothing moves."""
+    episode = np.repeat(np.arange(len(lengths)), np.add(lengths, 1))
+    still, theta = np.zeros((len(episode), 2)), np.zeros((len(lengths), 1))
+    return {"state": still, "action": still[:, :1], "episode": episode, "theta": theta}
+
+
+def test_a_film_is_of_the_first_and_the_last_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each until all agents are done with it."""
+    drawn, blank = list[tuple[str, int, int]](), Image.new("RGB", (film.WIDTH, 1))
+    monkeypatch.setattr(film.Pane, "picture", lambda self, e, t: (drawn.append((self.name, e, t)), blank)[1])
+    film.film(Seen(), {"a": clip_of(3, 1, 2), "b": clip_of(1, 4, 1)})
+    assert drawn == [(name, e, t) for e, last in ((0, 3), (2, 2)) for t in range(last + 1) for name in "ab"]
+
+
+@pytest.mark.parametrize(("step", "rate"), [(0.01, 25), (0.04, 25), (0.1, 10), (1.0, 5), (60.0, 5)])
+def test_a_film_is_in_real_time(step: float, rate: int) -> None:
+    """But for steps of less than 40 ms, and where they have no time of their own."""
+    assert film.frame_rate(SimpleNamespace(control_dt=step)) == rate  # type: ignore[arg-type]
 
 
 def test_a_strip_has_each_episode_s_theta() -> None:
@@ -882,6 +912,16 @@ def test_a_card_says_what_each_latent_moves(name: str, moved: list[str]) -> None
     assert said[0] == moved[0]
 
 
+@pytest.mark.parametrize(("name", "row"), [("slippery_cartpole", "slider"), ("ant_goal", "root")])
+def test_a_card_has_the_noise_of_positions_and_of_velocities(name: str, row: str) -> None:
+    """In that order; a free joint has two of each, of moves and of turns."""
+    task = envs.get(name)
+    assert isinstance(task, envs.MujocoTask)
+    cells = cards.card(task).partition(f"| {row} | ")[2].partition("\n")[0].removesuffix(" |").split(" | ")
+    assert len(cells) == 2
+    assert [float(std) for std in ", ".join(cells).split(", ")] == [*task.process_noise[row]]
+
+
 def test_no_browser(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publish, "BROWSERS", ("no-such-browser",))
     says = r"^no browser was found; install one of no-such-browser$"
@@ -904,6 +944,29 @@ def test_tasks_on_which_a_method_fared_worst_and_best(monkeypatch: pytest.Monkey
     head, _, row = results.fared([], {}).splitlines()
     ends = [[cell.strip() for cell in line.split("|")[-3:-1]] for line in (head, row)]
     assert ends == [["least on", "most on"], ["curling, 0.20", "bandit, 0.80"]]
+
+
+def test_the_summary_has_the_first_and_the_last_episode() -> None:
+    """Of the certified tasks where all of its methods were run, and the best of them first."""
+    methods = {name: scored(name, 0.25, 0.75 + 0.1 * (name == "rma")) for name in results.SUMMARY}
+    methods |= {"random": scored("random", 0, 0), "expert": scored("expert", 1, 1)}
+    found = [(envs.get(name), {"methods": of}) for name, of in (("curling", methods), ("bandit", {**methods}))]
+    found[1][1]["methods"].pop("gail")
+    text = results.summary(found, {name: {"verdict": "passed"} for name in ("curling", "bandit")})
+    assert text.startswith("Interquartile means over 1 tasks")
+    rows = [[cell.strip() for cell in line.split("|")] for line in text.splitlines()[4:]]
+    assert rows[0][1].startswith("[rma]")
+    assert {tuple(cell.partition(" (")[0] for cell in row[4:6]) for row in rows[1:]} == {("0.25", "0.75")}
+
+
+def test_costs_stand_under_their_tasks() -> None:
+    """Of the tasks in the table; a method that was not run on one has an empty cell there."""
+    of = {"bandit": 7, "curling": 8, "tilted_cartpole": 9}
+    found = [(envs.get(name), {"methods": {"dagger": {"cpu_s": seconds}}}) for name, seconds in of.items()]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in results.costs(found).splitlines()]
+    assert lines[0] == ["method", "bandit", "tilted_cartpole"]
+    assert ["dagger", "7", "9"] in lines
+    assert ["rma", "", ""] in lines
 
 
 def test_commands_of_numbers() -> None:
@@ -957,12 +1020,14 @@ def test_a_still_is_small_and_made_once(tmp_path: Path) -> None:
 
 def test_a_clip_of_the_same_film_is_not_encoded_anew(tmp_path: Path) -> None:
     """Its mark says of which film it is; a copy is made only where that differs."""
-    frames = np.zeros((6, 16, 16, 3), np.uint8)
+    frames = np.repeat(np.uint8([0, 40, 80, 120, 160, 200]), 16 * 16 * 3).reshape(6, 16, 16, 3)
     imageio.imwrite(tmp_path / "video.mp4", frames)
     for name, made_of in (("one", "a"), ("two", "a"), ("three", "b")):
         publish.clip(tmp_path / "video.mp4", tmp_path / f"{name}.webp", mark(made_of))
     one, two, three = ((tmp_path / f"{name}.webp") for name in ("one", "two", "three"))
     assert mark_of(one) == mark_of(two) == mark("a") != mark_of(three)
+    with Image.open(one) as image:
+        assert getattr(image, "n_frames", 1) == 2  # every third of six
     before = one.stat().st_mtime_ns
     publish.copy(two, one)
     assert one.stat().st_mtime_ns == before

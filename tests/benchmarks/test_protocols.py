@@ -11,11 +11,12 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.benchmarks import compare, report
-from deconfounded.benchmarks.engine import progress, protocols
+from deconfounded.benchmarks.engine import progress, protocols, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import identity
+from deconfounded.benchmarks.engine.local import Here
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import aggregation, comparison, records
@@ -123,6 +124,16 @@ def test_demonstrations_in_a_folder_are_of_their_protocol(tmp_path: Path) -> Non
     assert unseen.demonstrations.sha256 != first.sha256
 
 
+def test_demonstrations_of_a_run_are_of_its_protocol(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are made before any method asks for them, which finds them."""
+    monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+    monkeypatch.setattr(BenchmarkJob, "run", lambda self: "")
+    job = BenchmarkJob("curling", tiny_preset(), "blind_bc", (0,), tmp_path, protocol="once")
+    scheduler.run_all([job], "cpu", "", Here())
+    assert job.context().has_demonstrations(0)
+    assert not replace(job, protocol="standard").context().has_demonstrations(0)
+
+
 def test_no_other_protocol_is_asked_of_a_task() -> None:
     """Not even what would not do under it."""
     odd = PUSH.changed(latents=("force",))
@@ -175,9 +186,10 @@ def both() -> tuple[list[Any], list[Any]]:
 
 class TestTables:
     def test_they_lie_side_by_side(self, both: tuple[list[Any], list[Any]], tmp_path: Path) -> None:
-        """In a task's file, each with its own 0 and 1; what asks for no protocol gets the standard one."""
+        """In a task's file, each with its own 0 and 1; what asks for no protocol gets the standard one, as it is."""
         standard, once = both
-        records.write(tmp_path, [*standard, *once])
+        salted = [{**record, "salt": "x"} for record in standard]
+        records.write(tmp_path, [*standard, *once, *salted, *({**record, "set": ["x=1"]} for record in standard)])
         assert records.of_task(tmp_path, "curling") == standard
         assert records.of_task(tmp_path, "curling", protocol="once") == once
         assert not (tmp_path / "superseded").exists()

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import EXACT
@@ -69,17 +70,20 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
 
 
 def test_scores_above_and_evidence_below(figures: list[Any], tmp_path: Path) -> None:
-    """Of one task: each method's mean, and both sources of evidence."""
+    """Of one task: each method's mean, and both sources of evidence; it is green where the certificate is passed."""
     points: list[dict[str, Any]] = []
     for _, kind, factor, _ in spectrum.variants("icy_road"):
         nats = {"dynamics": factor, "actions": 7 * factor}
         scores = {name: [i + factor, i + factor + 0.2] for i, name in enumerate((*EXACT, *spectrum.LEARNED))}
-        about = {"certificate": {"evidence_nats_per_step": nats, "verdict": "passed"}, "scores": scores}
+        verdict = "passed" if factor >= 1 else "failed"
+        about = {"certificate": {"evidence_nats_per_step": nats, "verdict": verdict}, "scores": scores}
         points.append({"task": "icy_road", "kind": kind, "factor": factor, **about})
     spectrum.picture(points, tmp_path / "spectrum.png")
     factors = [float(times) for times in TIMES]
     above, below = figures[0].axes[0], figures[0].axes[2]
     assert above.get_title() == "icy_road\nprocess noise"
+    green = [patch.get_facecolor()[:3] == to_rgb("tab:green") for patch in above.patches]
+    assert green == [factor >= 1 for factor in factors]
     for i, (name, line) in enumerate(zip((*EXACT, *spectrum.LEARNED), above.lines, strict=True)):
         assert line.get_label() == name
         np.testing.assert_allclose(line.get_xydata(), [(factor, i + factor + 0.1) for factor in factors])

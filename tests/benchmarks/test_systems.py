@@ -275,15 +275,17 @@ class TestAsGymnasiumHasIt:
         assert [info["episode"]["l"] for info in infos] == [horizon, horizon]
 
     def test_returns_of_stable_baselines(self) -> None:
-        """The rewards of the episode that is over, all of them."""
-        vec, paid, ended = Sb3VecEnv(Push(), 4, 0), np.zeros(4), 0
+        """The rewards of the episode that is over, all of them, and how many there were."""
+        vec, paid, ended, steps = Sb3VecEnv(Push(), 4, 0), np.zeros(4), 0, np.zeros(4, int)
         vec.reset()
         for _ in range(3 * Push.horizon):
             _, reward, done, infos = vec.step(np.zeros((4, 1)))
             paid += reward
             returns = [infos[i]["episode"]["r"] for i in np.flatnonzero(done)]
             np.testing.assert_allclose(returns, paid[done], rtol=1e-5)
-            paid[done], ended = 0, ended + done.sum()
+            steps += 1
+            assert [infos[i]["episode"]["l"] for i in np.flatnonzero(done)] == steps[done].tolist()
+            paid[done], steps[done], ended = 0, 0, ended + done.sum()
         assert ended >= 12
 
     def test_seeds_of_stable_baselines(self) -> None:

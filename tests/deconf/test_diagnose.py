@@ -384,6 +384,22 @@ def test_gain_by_memory() -> None:
     assert measures.measure(chance, None, amounts, np.random.default_rng(0)).memory_gain < 0.02
 
 
+@pytest.mark.usefixtures("here")
+def test_a_diagnosis_says_what_it_was_made_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both logs, each by its own name, contents and shape, and the seed."""
+    logs = [tmp_path / "expert.npz", tmp_path / "explored.npz"]
+    for n, file in enumerate(logs, 24):
+        trials(n, seed=n).save(file)
+    monkeypatch.setattr("deconfounded.benchmarks.engine.scheduler.run_jobs", lambda *_: [])
+    monkeypatch.setattr(diagnose, "conclude", lambda *_: None)
+    monkeypatch.setattr(command.look, "look", lambda *_: [])
+    monkeypatch.setattr("deconfounded.benchmarks.output.diagnosis.write", lambda _, about, folder: about)
+    about: Any = command.run(logs[:1], logs[1:], {}, 5, tmp_path / "out", "")[1]
+    for key, n, file in zip(("trials", "explore"), (24, 25), logs, strict=True):
+        assert about[key] == {"from": str(file), "sha256": trials(n, seed=n).sha256, "shape": (n, 2, 3)}
+    assert about["seed"] == 5
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:

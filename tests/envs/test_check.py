@@ -1,10 +1,12 @@
 """A slip in a task file is one line that names the part, whoever runs the task."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -495,6 +497,31 @@ def test_commands_check_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         with pytest.raises(envs.InputError, match=r"^reward of slippery_cartpole gave"):
             main()
         assert not out.parent.exists()
+
+
+@pytest.mark.parametrize(("returns", "better"), [((4.0, 8.0), True), ((1.5, 2.5), False)])
+def test_the_card_of_an_expert_that_was_trained(
+    returns: tuple[float, float],
+    better: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Its returns, those of random actions, and a warning if these deviate by half of what lies between."""
+    held = {"ExpertAgent": np.array(returns), "RandomAgent": np.array([0.0, 2.0])}
+
+    def rolled_out(env: envs.BatchEnv, agent: object, *_: Any, **__: Any) -> Any:
+        return SimpleNamespace(returns=held[type(agent).__name__])
+
+    monkeypatch.setattr(train, "run_trials", rolled_out)
+    weights = {"0.weight": np.zeros((1, 7), np.float32), "0.bias": np.zeros(1, np.float32)}
+    monkeypatch.setattr("deconfounded.experts.train.train", lambda *_: weights)
+    monkeypatch.setattr("sys.argv", ["train", "--task", "slippery_cartpole", "--out", str(tmp_path / "x.safetensors")])
+    train.main()
+    card = json.loads((tmp_path / "x.json").read_text())
+    assert (card["return_mean"], card["return_random"], card["episodes_scored"]) == (np.mean(returns), 1, 2)
+    assert card["return_standard_error"] == pytest.approx(np.std(returns) / 2**0.5, abs=0.01)
+    assert ("hardly better than random actions" in capsys.readouterr().out) is not better
 
 
 def test_an_expert_trained_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

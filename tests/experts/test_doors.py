@@ -413,6 +413,16 @@ class TestRunTrials:
         assert not trials.mask.all()
         np.testing.assert_array_equal(np.stack(observed, 1), trials.mask[:, 0, : len(observed)])
 
+    def test_random_actions_are_uniform(self) -> None:
+        """In their range, to either end, or over all actions."""
+        acted = []
+        for space in (spaces.Discrete(3), Push.action_space):
+            agent = RandomAgent(space)
+            agent.reset([np.random.default_rng(0)])
+            acted.append(agent.act(np.zeros((6000, 1), np.float32))[:, 0])
+        assert np.bincount(acted[0].astype(int)) / 6000 == pytest.approx([1 / 3] * 3, abs=0.02)
+        assert np.histogram(acted[1], 4, (-1, 1))[0] / 6000 == pytest.approx([1 / 4] * 4, abs=0.02)
+
     def test_random_numbers_of_an_agent_are_new_in_each_episode(self) -> None:
         """And of each seed its own."""
         drawn = list[float]()

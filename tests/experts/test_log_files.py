@@ -124,6 +124,20 @@ def test_actions_of_agents_stay_in_the_range() -> None:
     np.testing.assert_array_equal(units.unscaled(np.array([[-1.5], [0.0], [1.5]])), [[0.0], [50.0], [100.0]])
 
 
+def test_actions_beyond_the_range_are_its_ends() -> None:
+    """In a column from -1 to 1, too, whose other actions keep their bits."""
+    units = Units(("x",), ("y", "z"), (-1.0, 0.0), (1.0, 4.0))
+    np.testing.assert_array_equal(units.scaled(np.array([[1.5, 9.0], [-3.0, -1.0]])), [[1.0, 1.0], [-1.0, -1.0]])
+    assert units.scaled(np.array([[0.1, 2.0]])).tolist() == [[0.1, 0.0]]
+
+
+def test_an_action_that_never_changes_is_0() -> None:
+    """And comes back as what it always was."""
+    units = Units(("x",), ("y",), (3.0,), (3.0,))
+    np.testing.assert_array_equal(units.scaled(np.array([[3.0], [5.0]])), [[0.0], [0.0]])
+    np.testing.assert_array_equal(units.unscaled(np.array([[0.0], [0.7]])), [[3.0], [3.0]])
+
+
 def test_the_first_part_of_a_name_ends_at_a_dot() -> None:
     """A column whose name goes on otherwise is another one."""
     table = Table("a", {name: np.zeros(2) for name in ("speed.0", "speed.1", "speed_limit")})

@@ -568,6 +568,13 @@ class TestBadInput:
         with pytest.raises(envs.InputError, match=r"empty in the first row of 5 episodes .* move it up by a row"):
             datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
 
+    def test_one_action_that_is_lost(self, tmp_path: Path) -> None:
+        """In an episode's first row, which is no reason to move up all of them."""
+        made = rows(AFTER)
+        made[0]["throttle"] = ""
+        with pytest.raises(envs.InputError, match=r"'throttle' of .*x.csv is empty in row 1$"):
+            datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+
     def test_text_beyond_the_first_block(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A column whose first blocks are numbers keeps its texts as they are written."""
         monkeypatch.setattr("deconfounded.experts.datasets.tabular.BLOCK", 4)
