@@ -1,9 +1,10 @@
 """The exact policies' belief by particles, in place of a grid: for tasks of three latents or more.
 
-A grid of so many latents has too few values of each. K particles are drawn from p(theta), and weighed by the likelihood
-of every transition. Before their effective number falls below K / 2, they are drawn anew by their weights and moved: by
-a normal kernel that keeps their mean and covariance (Liu and West 2001), in quantiles of the latents, reflected at 0
-and 1. A transition that says much is taken in by several such stages, each with a power of its likelihood.
+A grid of so many latents has too few values of each. K particles are drawn from p(theta), and weighed by the
+likelihood of every transition. Before their effective number falls below K / 2, they are drawn anew by their weights
+and moved: by a normal kernel that keeps their mean and covariance (Liu and West 2001), in quantiles of the latents,
+reflected at 0 and 1. Values of categorical latents stay as they are: between two of them lies a third. A transition
+that says much is taken in by several such stages, each with a power of its likelihood.
 
 Simulating every particle would cost too much. A share of them is simulated, and the outcomes of the others are those of
 a quadratic function of theta, fitted to these by least squares for each transition. Where it misses the log-likelihoods
@@ -46,6 +47,7 @@ class Particles:
     def __init__(self, env: BatchEnv, expert: Expert, conditional: bool, static: bool = False) -> None:
         self.env, self.task, self.expert = env, env.task, expert
         self.conditional, self.static = conditional, static
+        self._categorical = np.array([lat.distribution == "categorical" for lat in env.task.latents])
 
     def begin(self, n: int) -> None:
         """Start n new trials."""
@@ -68,7 +70,7 @@ class Particles:
         seeds = (rng.random((self._n, 1))[:, 0] * 2**53).astype(np.int64)
         self._rngs = [np.random.default_rng(seed) for seed in seeds.tolist()]
         self._shape = self._n, PARTICLES, len(self.task.latents)
-        smooth = self.task.moves_state and all(lat.distribution != "categorical" for lat in self.task.latents)
+        smooth = self.task.moves_state and not self._categorical.any()
         terms = quadratic(np.zeros(self._shape[2])).size
         wanted = round(SIMULATED * terms) if smooth else PARTICLES
         self._simulated = np.arange(wanted) * PARTICLES // wanted  # evenly, among particles in their parents' order
@@ -118,11 +120,13 @@ class Particles:
         return self.mean(log_weight)
 
     def mean(self, log_weight: Array) -> Array:
-        """Thetas [N, L]: of each latent the posterior mean; of a categorical one its value in the likeliest theta."""
-        weight = np.exp(log_weight)
-        likeliest = self.theta[np.arange(len(weight)), weight.argmax(-1)]
-        categorical = [lat.distribution == "categorical" for lat in self.task.latents]
-        return np.where(categorical, likeliest, (weight[..., None] * self.theta).sum(1))
+        """Thetas [N, L]: of each latent the posterior mean; of a categorical one its likeliest value."""
+        weight = np.exp(log_weight)[..., None]
+        mean = (weight * self.theta).sum(1)
+        for i in np.flatnonzero(self._categorical):
+            mass = (weight * self.task.latents[i].encode(self.theta[..., i])).sum(1)
+            mean[:, i] = self.task.latents[i].grid(0)[mass.argmax(-1)]
+        return mean
 
     def features(self) -> NDArray[np.float32]:
         """The posterior mean [N, F] of the encoded theta."""
@@ -206,7 +210,7 @@ class Particles:
         return power
 
     def _move(self, rows: NDArray[np.int64]) -> None:
-        """Draw particles of trials `rows` anew by their weights, and move them."""
+        """Draw particles of trials `rows` anew by their weights, and move them, but for categorical latents."""
         u, weight = self._u[rows], np.exp(self.log_weight[rows])
         mean = np.einsum("nk,nkl->nl", weight, u)[:, None]
         spread = np.einsum("nk,nkl,nkm->nlm", weight, u - mean, u - mean)
@@ -218,8 +222,9 @@ class Particles:
         kept = np.take_along_axis(u, index.clip(0, PARTICLES - 1)[..., None], 1)
         normal = draws.standard_normal((u[..., 0].size, u.shape[-1])).reshape(u.shape)
         noise = np.einsum("nlm,nkm->nkl", root, normal)
+        moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise
         self.log_weight[rows] = -np.log(PARTICLES)
-        self._set(rows, mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise)
+        self._set(rows, np.where(self._categorical, kept, moved))
 
 
 def quadratic(x: Array) -> Array:

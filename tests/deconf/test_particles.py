@@ -190,6 +190,43 @@ def test_a_move_keeps_mean_and_variance() -> None:
     assert after[1] == pytest.approx(before[1], rel=0.05)
 
 
+class Boxes(Push):
+    name = "boxes"
+    latents = (Latent("box", "", 0, 4, "categorical"), Latent("force", "N", -1.0, 1.0))
+
+
+@pytest.fixture
+def boxes() -> Particles:
+    """Beliefs of which .55 of the mass is at box 0, .45 at box 4, and none between, as of evidence in boxes."""
+    env = envs.BatchEnv(Boxes(), N)
+    belief = Particles(env, expert(env.task), conditional=False)
+    belief.begin(N)
+    belief.reset(Streams([np.random.default_rng(0)]))
+    first, last = (belief.theta[..., 0] == box for box in (0, 4))
+    weight = 0.55 * first / first.sum(-1, keepdims=True) + 0.45 * last / last.sum(-1, keepdims=True)
+    belief.log_weight = np.log(weight + 1e-300)
+    return belief
+
+
+def test_categories_are_drawn_anew_and_not_moved(boxes: Particles) -> None:
+    """To a category between two others, where there was no mass; latents beside them are moved."""
+    before = boxes.theta[..., 1].copy()
+    boxes._move(np.arange(N))
+    assert np.isin(boxes.theta[..., 0], [0, 4]).all()
+    assert (boxes.theta[..., 0] == 4).mean() == pytest.approx(0.45, abs=0.01)
+    assert not np.isin(boxes.theta[..., 1], before).any()
+
+
+def test_the_mean_of_a_category_is_its_likeliest_value(boxes: Particles) -> None:
+    """Of all particles of each value; of the latent beside it the mean."""
+    for _ in range(2):
+        mean = boxes.mean(boxes.log_weight)
+        assert (mean[:, 0] == 0).all()
+        expected = (np.exp(boxes.log_weight) * boxes.theta[..., 1]).sum(-1)
+        np.testing.assert_allclose(mean[:, 1], expected)
+        boxes._move(np.arange(N))
+
+
 def test_a_trial_does_not_depend_on_those_beside_it() -> None:
     """Two groups with a generator each: the second group's particles are those that it has alone."""
     task = Three()
