@@ -21,7 +21,7 @@ from deconfounded.experts import policy
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 
-TRIALS, FEW = 256, 64  # few where each step simulates every particle, or many latents
+MANY, TRIALS, FEW = 2048, 256, 64  # without physics; of most tasks; where a step simulates many particles
 SEED = 11
 
 
@@ -71,8 +71,9 @@ def by_task(tasks: list[envs.Task]) -> dict[str, dict[str, Any]]:
         if isinstance(task, PatchedTask):
             continue
         categorical = any(latent.distribution == "categorical" for latent in task.latents)
-        costly = len(task.latents) > GRID_UP_TO or (categorical and isinstance(task, envs.MujocoTask))
-        measured[task.name] = made = compared(task, FEW if costly else TRIALS)
+        physics = isinstance(task, envs.MujocoTask)
+        costly = len(task.latents) > GRID_UP_TO or (categorical and physics)
+        measured[task.name] = made = compared(task, FEW if costly else TRIALS if physics else MANY)
         print(f"{task.name}: {made}")
     return measured
 

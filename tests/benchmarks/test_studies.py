@@ -161,12 +161,16 @@ def test_particles_less_grid(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_trials_of_beliefs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few where each step simulates every particle, or a grid would have too many latents; patches have grids."""
+    """Many without physics; few where each step simulates every particle, or a grid would have too many latents.
+
+    Patches have grids of their own.
+    """
     monkeypatch.setattr(particles, "compared", lambda task, trials: trials)
     names = "bandit", "curling", "swapped_lander", "hidden_goal", "patchy_road", "lame_ant"
-    many, few = particles.TRIALS, particles.FEW
+    usual, few = particles.TRIALS, particles.FEW
     measured: Any = particles.by_task([*map(envs.get, names)])
-    assert measured == {"bandit": many, "curling": many, "swapped_lander": few, "hidden_goal": many, "lame_ant": few}
+    own = {"swapped_lander": few, "lame_ant": few, "bandit": particles.MANY}
+    assert measured == {**own, "curling": usual, "hidden_goal": usual}
 
 
 def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
