@@ -272,6 +272,7 @@ class TestScores:
 
 
 class TestComparison:
+    @pytest.mark.slow
     def test_differences_are_paired_by_seed(self, tmp_path: Path) -> None:
         """Against the records of the package; intervals as of scipy, and over tasks as by hand."""
         every = [record("mine", seed, 0.5 + 0.1 * seed, task) for task in ("curling", "bandit") for seed in range(3)]

@@ -32,6 +32,7 @@ def test_both_halves_have_every_tier() -> None:
     assert len({case.reference.split(":")[0] for case in CASES}) >= 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", OURS, ids=NAMES)
 def test_theta_is_hidden_at_first_and_seeds_repeat(case: Case) -> None:
     made = case.world

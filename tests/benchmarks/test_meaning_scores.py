@@ -216,6 +216,7 @@ def test_a_number_in_the_table_of_tasks_is_its_method_s(some: Found) -> None:
     assert seen == 11 * (len(expected) + 2)
 
 
+@pytest.mark.slow
 def test_a_number_in_results_is_its_method_s(some: Found) -> None:
     """Score and return of the last episode, best first: on the page, and made anew."""
     expected, seen = last_of_records(), 0

@@ -143,6 +143,7 @@ class TestCertificates:
         agent = exact_agent(env, expert, conditional, 5, static=static)
         return run_trials(env, agent, certify.EPISODES, certify.SEED).returns.mean(0)
 
+    @pytest.mark.slow
     def test_curves(self) -> None:
         drift = toys.Drift()
         expert = CallableExpert(drift, toys.control, "control")

@@ -573,6 +573,7 @@ def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.Monke
     assert catalogue.METHODS["fine_best"].tier == "sees theta"
 
 
+@pytest.mark.slow
 def test_guests_get_what_ours_get(tmp_path: Path) -> None:
     """Demonstrations, theta, explorations and queries: bit for bit those of the context, and counted."""
     text = """

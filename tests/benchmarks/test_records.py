@@ -163,6 +163,7 @@ class TestKeptFiles:
         assert result is not None
         assert job.unfit(0, result).startswith("it was made with another method (was ")
 
+    @pytest.mark.slow
     def test_contents(self, job: BenchmarkJob) -> None:
         few = {"blind_bc/returns": np.ones((3, 1)), "blind_bc/objective": np.ones((3, 1))}
         assert "has shape (3, 1), for 4 trials" in self.spoilt(job, **few)
@@ -486,6 +487,7 @@ class TestVerify:
             assert verify.verdict(record, again) == (said, [f"machine: {record['machine']}, now another"])
 
 
+@pytest.mark.slow
 def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """From what jobs left, without training; what is not there is told in a line."""
     monkeypatch.setenv("MUJOCO_GL", "EGL ")

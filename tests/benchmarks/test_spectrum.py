@@ -46,6 +46,7 @@ def test_noise_is_scaled_and_nothing_else(base: str) -> None:
     assert len(names) == sum(map(len, noise.FACTORS.values()))
 
 
+@pytest.mark.slow
 def test_spectrum_is_shown(tmp_path: Path) -> None:
     """A column for each task and kind of noise: its factors in order, with what both kinds have in common in each."""
     points: list[dict[str, Any]] = []

@@ -57,6 +57,7 @@ def own(tmp_path: Path) -> envs.Task:
 
 
 class TestOtherProcesses:
+    @pytest.mark.slow
     def test_spec_data_set_and_pickle(self, own: envs.Task, tmp_path: Path) -> None:
         """A task from outside is known to a process that has a spec of it, a data set, or a pickled environment."""
         env = gymnasium.make(own.gym_id)

@@ -23,6 +23,7 @@ def explored(kind: str, informative: bool) -> Trials:
     return with_column(world(kind, 96, 1, explores=True), column)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "informative", "columns"), [("wind", True, [1]), ("wind", False, []), ("idle", False, [])]
 )

@@ -137,6 +137,7 @@ class TestData:
         np.testing.assert_array_equal(context.demonstrated_theta, np.stack([env.theta] * task.episodes, 1))
         assert not np.array_equal(made.action[:4], made.action[4:])
 
+    @pytest.mark.slow
     def test_kept_demonstrations_are_the_same(self, tmp_path: Any) -> None:
         task = envs.get(CONTROL)
         free, kept, again = (Context(task, tiny_preset(), [1, 2], folder=f) for f in (None, tmp_path, tmp_path))
@@ -230,6 +231,7 @@ class TestData:
         same = {stream(purpose, seed) for purpose in (DEMOS, EXPLORATION, EVALUATION) for seed in range(100)}
         assert len(same) == 300
 
+    @pytest.mark.slow
     def test_the_oracle_is_given_theta(self) -> None:
         """On the bandit it pulls the best arm as often as the expert, 60 of 100, to four standard errors."""
         preset = replace(tiny_preset(), expert_trials=400, eval_trials=200)

@@ -34,6 +34,7 @@ from tests.deconf.test_diagnose import _tiny_init
 B, E, T = 48, 2, 60
 
 
+@pytest.mark.slow
 def test_a_log_that_is_mostly_at_rest() -> None:
     """It pauses; that nothing ever changes would be untrue."""
     trials = driven()
@@ -218,6 +219,7 @@ PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", PLANTED)
 def test_what_is_planted_is_named(case: str) -> None:
     """And nothing else is, but that actions which are states, or paused, repeat themselves."""
@@ -228,6 +230,7 @@ def test_what_is_planted_is_named(case: str) -> None:
     assert ("repeat" in odd(remarks)) <= (case in ("next", "present", "pauses"))
 
 
+@pytest.mark.slow
 def test_amounts_in_remarks_are_those_of_the_data() -> None:
     """The steps with a code, the share of actions at an end of the range, and how long what lasts takes to halve."""
     coded = with_codes(driven())
@@ -273,6 +276,7 @@ def test_codes_of_actions_are_in_the_log_s_units() -> None:
     assert any("action 0 is 999 in" in text for text in texts)
 
 
+@pytest.mark.slow
 def test_units_of_actions_and_what_is_no_other_unit() -> None:
     """A latent may change how widely trials vary, by a few times; some trials may be at rest."""
     action, obs = driven().action.copy(), driven().obs.copy()
@@ -379,6 +383,7 @@ def test_our_own_tasks_are_not_late_or_noisy(name: str) -> None:
     assert not {"late", "lasting", "pause", "duplicate", "state"} & set(odd(remarks))
 
 
+@pytest.mark.slow
 def test_small_data() -> None:
     """One trial of one step, and actions or observations that never change."""
     look(Trials(np.zeros((1, 1, 2, 1)), np.zeros((1, 1, 1, 1)), np.ones((1, 1, 1), bool)))

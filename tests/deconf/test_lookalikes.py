@@ -159,6 +159,7 @@ class TestHalves:
         measured = trial_dynamics.own_dynamics(trials, Steps.of(trials))
         return measured and measured[0]
 
+    @pytest.mark.slow
     def test_constant_columns(self) -> None:
         """An observation that never changes, and an action that is never taken, are alike in all halves."""
         trials = wandering(0)

@@ -45,6 +45,7 @@ def test_too_little_to_say() -> None:
     assert state.named(None) == []
 
 
+@pytest.mark.slow
 def test_some_of_many_trials() -> None:
     """Every second, or third, of which half are held out in turn."""
     for b in (1100, 2200):
@@ -89,6 +90,7 @@ def test_a_clone_without_a_memory_is_not_advised_there() -> None:
     assert judge([CLEAR] * 3, incomplete=["y"]).next is advice.EXPLORE
 
 
+@pytest.mark.slow
 def test_a_look_at_exploration_says_so() -> None:
     for speed in (False, True):
         [remark] = [remark for remark in look(cart(speed), blind=True) if remark.kind == "dynamics"]

@@ -107,6 +107,7 @@ class Whole(Sliding):
         return [3]
 
 
+@pytest.mark.slow
 def test_whole_actions() -> None:
     """All are alike to random actions, and the expert's are taken as they are."""
     task = task_of(Whole)()
@@ -452,6 +453,7 @@ def test_quantiles_of_draws() -> None:
     np.testing.assert_array_equal(latent.ppf(latent.cdf(np.array([0.0, 1.0, 2.0]))), [0, 1, 2])
 
 
+@pytest.mark.slow
 def test_a_clock_is_no_dynamics() -> None:
     """A share of the horizon changes by the same amount in each step, but for the rounding of float32."""
 
