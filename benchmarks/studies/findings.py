@@ -32,8 +32,8 @@ def rates() -> str:
 
 def beliefs() -> str:
     """The table of docs/concepts.md: what `deconf performance particles` measured."""
-    measured = kept("speed/particles")
-    return f"{particles.table(measured['tasks'])}\n\n{_origins([measured])}."
+    rows = kept("speed/particles")["rows"]
+    return f"{particles.table(rows)}\n\n{_origins(rows)}."
 
 
 def _origins(made: list[dict[str, Any]]) -> str:

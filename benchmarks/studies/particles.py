@@ -4,19 +4,23 @@ Agents act in the same trials. Where a belief is right, the true theta's rank, t
 between 0 and 1 over trials.
 """
 
+import json
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.stats import kstest
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import identity
 from deconfounded.benchmarks.output.scoring import normalise, two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.deconf.exact import ExactAgent, grid_size
-from deconfounded.deconf.particles import GRID_UP_TO, ParticleAgent, Particles
-from deconfounded.envs.patches import PatchedTask
+from deconfounded.deconf.particles import GRID_UP_TO, ParticleAgent, Particles, needs_particles
 from deconfounded.envs.streams import Array
+from deconfounded.envs.support.files import write_json
 from deconfounded.experts import policy
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
@@ -28,12 +32,12 @@ SEED = 11
 def compared(task: envs.Task, trials: int) -> dict[str, Any]:
     """Scores, means over trials and episodes, and CPU seconds by belief; p of a test of ranks for each latent.
 
-    Of particles alone, where a grid would have too many latents.
+    Of particles alone, where there is no grid.
     """
     env, expert = envs.BatchEnv(task, trials), policy.load(task)
     particles = ParticleAgent(env, expert, conditional=False)
     agents: dict[str, Agent] = {"particles": particles}
-    if len(task.latents) <= GRID_UP_TO:
+    if not needs_particles(task):
         agents["grid"] = ExactAgent(env, expert, False, grid_size(task))
     zero, one = (
         run_trials(env, agent, task.episodes, SEED).returns.mean()
@@ -64,29 +68,31 @@ def ranks(belief: Particles, theta: Array, rng: np.random.Generator) -> Array:
     return below + rng.random(theta.shape) * at
 
 
-def by_task(tasks: list[envs.Task]) -> dict[str, dict[str, Any]]:
-    """Of each task that has no grid of its own for each patch, printed as they come."""
-    measured = {}
+def by_task(tasks: Sequence[envs.Task], file: Path) -> None:
+    """Of each task, printed and added to a .json file as they come; those that are there stay."""
+    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
+    rows = json.loads(file.read_bytes())["rows"] if file.is_file() else []
     for task in tasks:
-        if isinstance(task, PatchedTask):
+        if task.name in {row["task"] for row in rows}:
             continue
         categorical = any(latent.distribution == "categorical" for latent in task.latents)
         physics = isinstance(task, envs.MujocoTask)
         costly = len(task.latents) > GRID_UP_TO or (categorical and physics)
-        measured[task.name] = made = compared(task, FEW if costly else TRIALS if physics else MANY)
+        made = compared(task, FEW if costly else TRIALS if physics else MANY)
         print(f"{task.name}: {made}")
-    return measured
+        rows.append({"task": task.name, **made, **about})
+        write_json(file, {"rows": rows})
 
 
-def table(measured: dict[str, dict[str, Any]]) -> str:
+def table(measured: Sequence[dict[str, Any]]) -> str:
     """A row for each task, in markdown."""
     rows = []
-    for name, made in measured.items():
+    for made in measured:
         grid, particles = made.get("grid"), made["particles"]
         by_grid, cpu_grid = (two_decimals(grid["score"]), f"{grid['cpu_s']:.0f}") if grid else ("", "")
         apart = f"{made['difference']:+.3f} ± {made['standard_error']:.3f}" if grid else ""
         p = " ".join(map(two_decimals, made.get("p", ())))
         scores = by_grid, two_decimals(particles["score"]), apart
-        rows.append((name, str(made["trials"]), *scores, p, cpu_grid, f"{particles['cpu_s']:.0f}"))
+        rows.append((made["task"], str(made["trials"]), *scores, p, cpu_grid, f"{particles['cpu_s']:.0f}"))
     head = ("grid", "particles", "particles less grid", "p of ranks", "CPU s, grid", "CPU s, particles")
     return markdown_table(("task", "trials", *head), rows)

@@ -231,12 +231,10 @@ def training(args: argparse.Namespace) -> None:
 
 
 def particles(args: argparse.Namespace) -> None:
-    """Of all tasks, or those asked for."""
+    """Of all tasks, or those asked for; what the output folder has of them stays."""
     from deconfounded.benchmarks.studies.particles import by_task
 
-    about = {"commit": identity.commit(), "machine": identity.machine("cpu"), "versions": identity.versions()}
-    measured = by_task(args.tasks or [*map(envs.get, (*envs.SUITE, *envs.HARD))])
-    write_json(args.out / "particles.json", {**about, "tasks": measured})
+    by_task(args.tasks or [*map(envs.get, (*envs.SUITE, *envs.HARD))], args.out / "particles.json")
 
 
 def latency(args: argparse.Namespace) -> None:

@@ -44,7 +44,7 @@ def test_performance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [*read["seeds"]["methods"]["naive_rnn"]] == ["1", "2"]
     assert read["training"]["cpu_s"]["blind_bc"] > 0
     assert 0 < read["latency"]["methods"]["blind_bc"]["median_ms"] <= read["latency"]["methods"]["blind_bc"]["p99_ms"]
-    assert read["particles"]["tasks"]["tilted_cartpole"]["trials"] == 2
+    assert [(row["task"], row["trials"]) for row in read["particles"]["rows"]] == [("tilted_cartpole", 2)]
     cost = read["cost-tilted_cartpole"]["methods"]
     assert [(method, *points) for method, points in cost.items()] == [("blind_bc", "0.5")]
     for name in ("speed", "growth", "cost-tilted_cartpole"):
@@ -156,21 +156,37 @@ def test_particles_less_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     assert made["difference"] == pytest.approx(0.2)
     assert made["standard_error"] == pytest.approx(np.std([0, 0.1, 0.2, 0.3, 0.4], ddof=1) / np.sqrt(5), abs=1e-4)
     assert made["p"] == [0]
-    row = particles.table({"tilted_cartpole": made}).splitlines()[2].strip("| ").split(" | ")
+    row = particles.table([{"task": "tilted_cartpole", **made}]).splitlines()[2].strip("| ").split(" | ")
     assert row == ["tilted_cartpole", "5", "0.50", "0.70", "+0.200 ± 0.071", "0.00", "3", "1"]
 
 
-def test_trials_of_beliefs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Many without physics; few where each step simulates every particle, or a grid would have too many latents.
+def test_trials_of_beliefs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many without physics; few where each step simulates every particle, or latents are many. What is there stays."""
+    file, usual, few = tmp_path / "particles.json", particles.TRIALS, particles.FEW
+    expected = {"bandit": particles.MANY, "curling": usual, "swapped_lander": few, "hidden_goal": usual}
+    expected["lame_ant"] = few
+    for made, tasks in ((1, ["bandit", "curling"]), (2, [*expected])):
+        monkeypatch.setattr(particles, "compared", lambda task, trials, made=made: {"trials": trials, "made": made})
+        particles.by_task([*map(envs.get, tasks)], file)
+    rows = json.loads(file.read_bytes())["rows"]
+    assert {row["task"]: row["trials"] for row in rows} == expected
+    assert [row["made"] for row in rows] == [1, 1, 2, 2, 2]
 
-    Patches have grids of their own.
-    """
-    monkeypatch.setattr(particles, "compared", lambda task, trials: trials)
-    names = "bandit", "curling", "swapped_lander", "hidden_goal", "patchy_road", "lame_ant"
-    usual, few = particles.TRIALS, particles.FEW
-    measured: Any = particles.by_task([*map(envs.get, names)])
-    own = {"swapped_lander": few, "lame_ant": few, "bandit": particles.MANY}
-    assert measured == {**own, "curling": usual, "hidden_goal": usual}
+
+@pytest.mark.parametrize(("name", "kinds"), [("patchy_road", {"grid", "particles"}), ("lame_ant", {"particles"})])
+def test_what_has_a_grid(name: str, kinds: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Patches have one each; of four latents that are not of patches there are particles alone."""
+    ran: list[str] = []
+
+    def run_trials(env: envs.BatchEnv, agent: Any, episodes: int, seed: int) -> Any:
+        ran.append(type(agent).__name__)
+        expert = isinstance(agent, ExpertAgent)
+        return SimpleNamespace(returns=np.full((env.n, episodes), 1.0 + expert), theta=np.zeros((env.n, episodes, 1)))
+
+    monkeypatch.setattr(particles, "run_trials", run_trials)
+    monkeypatch.setattr(particles, "ranks", lambda belief, theta, rng: np.ones((2, 1)))
+    assert kinds == {*particles.compared(envs.get(name), 2)} & {"grid", "particles"}
+    assert ran == ["RandomAgent", "ExpertAgent", "ParticleAgent", *["ExactAgent"] * (len(kinds) - 1)]
 
 
 def test_runs_lock_their_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
