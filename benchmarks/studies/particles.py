@@ -25,7 +25,7 @@ from deconfounded.experts import policy
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 
-MANY, TRIALS, FEW = 2048, 256, 64  # without physics; of most tasks; where a step simulates many particles
+MANY, TRIALS, FEW = 2048, 128, 32  # without physics; of most tasks; where a step simulates many particles
 SEED = 11
 
 
