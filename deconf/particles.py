@@ -29,7 +29,7 @@ from deconfounded.experts.policy import Expert, sample_rows
 
 PARTICLES = 1024
 GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior factorises
-SIMULATED = 1.5  # particles for each coefficient of the quadratic
+SIMULATED, LEAST = 1.5, 15  # particles for each coefficient of the quadratic; in all, so that they show a kink
 TOLERANCE, NEAR = 0.1, 10.0  # nats: rms error of the quadratic, over particles so near the likeliest one
 KERNEL = 0.5  # std of the kernel, in units of the particles' own
 IMPOSSIBLE = 50  # nats by which a likelihood of 0 is below the least other one
@@ -72,7 +72,7 @@ class Particles:
         self._shape = self._n, PARTICLES, len(self.task.latents)
         smooth = self.task.moves_state and not self._categorical.any()
         terms = quadratic(np.zeros(self._shape[2])).size
-        wanted = round(SIMULATED * terms) if smooth else PARTICLES
+        wanted = max(round(SIMULATED * terms), LEAST) if smooth else PARTICLES
         self._simulated = np.arange(wanted) * PARTICLES // wanted  # evenly, among particles in their parents' order
         self._simulator = self.task.simulator(self._n * wanted)
         self._terms = np.zeros((*self._shape[:2], terms)) if smooth else None

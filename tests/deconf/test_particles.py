@@ -65,6 +65,20 @@ class Kinds(Push):
         return super().outcome(state, action, 0.4 * theta - 0.2)
 
 
+class Slip(Push):
+    """A push acts as far as a hidden grip lets it: steps have a kink, of grips that let all of it, and that do not."""
+
+    name = "slip"
+    latents = (Latent("grip", "N", 0.1, 0.6),)
+    std = np.array([0.003, 0.003])
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        return super().outcome(state, action.clip(-theta, theta), 0 * theta)
+
+    def terminated(self, state: Array) -> np.ndarray:
+        return np.zeros(len(state), bool)
+
+
 def expert(task: Task) -> CallableExpert:
     return CallableExpert(task, lambda obs, theta: control(obs, theta[:, :1]), "toy")
 
@@ -165,6 +179,19 @@ def test_a_quadratic_stands_for_simulation() -> None:
         obs = env.observe()
     assert max(gaps) < 0.05
     assert belief.missed < 16
+
+
+def test_a_kink_does_not_mislead() -> None:
+    """No true theta is left far outside of a belief, though of steps most are simulated for a few particles alone."""
+    env = envs.BatchEnv(Slip(), 100)
+    agent = ParticleAgent(env, expert(env.task), conditional=False)
+    rollout = run_trials(env, agent, 2, 0)
+    weight, theta = np.exp(agent.belief.log_weight), agent.belief.theta[..., 0]
+    mean = (weight * theta).sum(-1)
+    std = np.sqrt((weight * np.square(theta - mean[:, None])).sum(-1))
+    assert np.abs((rollout.theta[:, -1, 0] - mean) / std).max() < 5
+    assert np.median(std) < 0.01
+    assert agent.belief.missed < 0.4 * rollout.trials.mask.sum()
 
 
 def test_a_move_keeps_mean_and_variance() -> None:
