@@ -125,6 +125,7 @@ def test_eq_1_is_over_the_steps_that_took_place() -> None:
             assert by_episode[b, e] == pytest.approx(by_hand, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_intervals_over_tasks_are_of_95_percent() -> None:
     """Of the interquartile mean over two tasks of 20 seeds each: they hold the truth about as often, in 150 tries."""
     rng, held = np.random.default_rng(1), []

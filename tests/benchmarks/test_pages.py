@@ -982,6 +982,7 @@ def test_commands_of_numbers() -> None:
     assert results.command(task, gathered, "expert") == results.command(task, gathered)
 
 
+@pytest.mark.slow
 def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
     """And not otherwise, nor for another comment in the code that draws them."""
     file, drawn = tmp_path / "gap.png", list[int]()

@@ -70,6 +70,7 @@ def test_spectrum_is_shown(tmp_path: Path) -> None:
     assert (tmp_path / "some.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.slow
 def test_scores_above_and_evidence_below(figures: list[Any], tmp_path: Path) -> None:
     """Of one task: each method's mean, and both sources of evidence; it is green where the certificate is passed."""
     points: list[dict[str, Any]] = []

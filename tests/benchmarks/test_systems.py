@@ -126,6 +126,7 @@ if __name__ == "__main__":
         assert lines == [f"{tmp_path}/script.py:Own {shape}", f"beside:Own {shape}"]
 
 
+@pytest.mark.slow
 def test_a_fork_steps_on() -> None:
     """As a worker of torch's DataLoader does; its pool is gone with its threads. Both go on, and come to their ends."""
     code = """
@@ -348,6 +349,7 @@ print(json.dumps({name: one.__file__ for name, one in sys.modules.items() if nam
 class TestText:
     ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
 
+    @pytest.mark.slow
     def test_files_name_their_encoding(self) -> None:
         """No file is read or written as text in whatever encoding the system has."""
         for folder in ("envs", "experts", "deconf", "benchmarks"):

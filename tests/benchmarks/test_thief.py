@@ -55,6 +55,7 @@ def run(folder: Path, steal: str, monkeypatch: pytest.MonkeyPatch, seed: int = 0
     return data
 
 
+@pytest.mark.slow
 def test_the_suite_cannot_be_imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither tasks, experts, benchmarks nor a simulator are in the process, and importing them says why not."""
     steal = """    import importlib

@@ -182,6 +182,7 @@ class TestDmlIl:
         assert best(state, state) == pytest.approx(1.5, abs=0.051)
         assert best(z + first, z + second) == pytest.approx(2, abs=0.051)
 
+    @pytest.mark.slow
     def test_histories_end_before_the_noise(self) -> None:
         """In training and in deployment the policy reads the memory of k steps ago, or of the episode's beginning."""
         draws, lag = streams(), 3
@@ -561,6 +562,7 @@ class TestGail:
         assert ended > 3
         assert behind.context.monitor.budget["exploration_trials"] == [3 + ended]
 
+    @pytest.mark.slow
     def test_interactions_are_counted(self) -> None:
         """Two rounds of 32 steps in 2 environments, for each seed; global generators are restored."""
         monitor = Monitor()

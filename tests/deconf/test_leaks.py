@@ -86,6 +86,7 @@ class TestEnvironments:
             compared = done if task.switches else compared
         assert resets >= 6
 
+    @pytest.mark.slow
     def test_dead_environments_stand_still(self, name: str) -> None:
         """What has ended is not stepped, earns nothing, and is as it was."""
         task = envs.get(name)
@@ -371,6 +372,7 @@ def fitted(monkeypatch: pytest.MonkeyPatch, **changes: Any) -> tuple[LatentModel
     return agent.model, betas
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("warm_up", [0.5, 0.0])
 def test_beta_rises(warm_up: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Linearly from 0 over the warm-up's share of all updates; then it is constant."""
@@ -397,6 +399,7 @@ def test_prior_is_fitted_if_asked_for(fit_prior: bool, monkeypatch: pytest.Monke
     assert same != fit_prior
 
 
+@pytest.mark.slow
 def test_gru_scan_has_the_gradient_of_autograd() -> None:
     """Double precision, two seeds, with steps that did not take place."""
     from deconfounded.deconf.core.gru import GruScan

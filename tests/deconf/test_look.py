@@ -326,6 +326,7 @@ def test_what_was_misread_is_odd() -> None:
     assert [remark.odd for note in notes for remark in look(log) if remark.text == note] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_one_action_alone() -> None:
     """Of a log whose every action has the same text: there is nothing to match."""
     trials = driven()

@@ -157,6 +157,7 @@ def test_true_thetas_have_uniform_ranks() -> None:
     ).min() > 0.3
 
 
+@pytest.mark.slow
 def test_a_quadratic_stands_for_simulation() -> None:
     """Of a drone in wind, posteriors by fitted outcomes are those by simulation, to .05 in total variation."""
     task, rows = envs.get("windy_drone"), np.arange(2)

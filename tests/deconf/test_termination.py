@@ -29,6 +29,7 @@ def walks(n: int = 200, steps: int = 20, limit: float = 2.0) -> Trials:
     return Trials(obs, np.zeros((n, 1, steps, 1)), mask)
 
 
+@pytest.mark.slow
 def test_the_limit_is_learned() -> None:
     """Termination beyond the limit and not within: right for 95% of observations .3 or more from it.
 

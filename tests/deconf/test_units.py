@@ -29,6 +29,7 @@ def learned(name: str, task: toys.Push, expert: str) -> tuple[Array, Array]:
     return trials.action[trials.mask].astype(float), returns
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNED)
 def test_units_of_observations(name: str) -> None:
     action, returns = learned(name, toys.Push(), "control")

@@ -164,6 +164,7 @@ def test_a_closed_world_takes_no_step() -> None:
     env.step(np.zeros((2, 1)))
 
 
+@pytest.mark.slow
 def test_worlds_are_closed() -> None:
     """With their environment, as a new theta makes others, or when nobody holds it any more."""
     task = task_of(Whole)()

@@ -55,6 +55,7 @@ def test_each_interface_has_the_privileged_view() -> None:
     assert dm.observation_spec().shape == first.shape == (width,)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 def test_renderers_are_independent() -> None:
     """A renderer draws the same before and after another one is gone."""

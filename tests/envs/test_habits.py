@@ -364,6 +364,7 @@ def draw_alike(name: str) -> int:
 
 
 class TestPictures:
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", TASKS)
     def test_vectors_and_dm_env_draw_as_single_environments(self, name: str, renderers: list[Array]) -> None:
         """Of the same theta, state and action; each renderer is that of its environment's theta."""
