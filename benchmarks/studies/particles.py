@@ -39,7 +39,7 @@ def compared(task: envs.Task, trials: int) -> dict[str, Any]:
     agents: dict[str, Agent] = {"particles": particles}
     if not needs_particles(task):
         agents["grid"] = ExactAgent(env, expert, False, grid_size(task))
-    zero, one = (
+    random, best = (
         run_trials(env, agent, task.episodes, SEED).returns.mean()
         for agent in (RandomAgent(task.action_space), ExpertAgent(env, expert))
     )
@@ -49,7 +49,7 @@ def compared(task: envs.Task, trials: int) -> dict[str, Any]:
         start = time.process_time()
         rollout = run_trials(env, agent, task.episodes, SEED)
         cpu_s = round(time.process_time() - start, 1)
-        scores[name] = normalise(rollout.returns, zero, one).mean(-1)
+        scores[name] = normalise(rollout.returns, random, best).mean(-1)
         made[name] = {"score": round(float(scores[name].mean()), 4), "cpu_s": cpu_s}
         if name == "particles" and not task.switches:  # a switch may come after the last step
             rank = ranks(particles.belief, rollout.theta[:, -1], np.random.default_rng(SEED))

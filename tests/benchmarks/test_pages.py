@@ -950,9 +950,9 @@ def test_the_summary_has_the_first_and_the_last_episode() -> None:
     """Of the certified tasks where all of its methods were run, and the best of them first."""
     methods = {name: scored(name, 0.25, 0.75 + 0.1 * (name == "rma")) for name in results.SUMMARY}
     methods |= {"random": scored("random", 0, 0), "expert": scored("expert", 1, 1)}
-    found = [(envs.get(name), {"methods": of}) for name, of in (("curling", methods), ("bandit", {**methods}))]
-    found[1][1]["methods"].pop("gail")
-    text = results.summary(found, {name: {"verdict": "passed"} for name in ("curling", "bandit")})
+    by_task = [(envs.get(name), {"methods": of}) for name, of in (("curling", methods), ("bandit", {**methods}))]
+    by_task[1][1]["methods"].pop("gail")
+    text = results.summary(by_task, {name: {"verdict": "passed"} for name in ("curling", "bandit")})
     assert text.startswith("Interquartile means over 1 tasks")
     rows = [[cell.strip() for cell in line.split("|")] for line in text.splitlines()[4:]]
     assert rows[0][1].startswith("[rma]")
@@ -962,8 +962,8 @@ def test_the_summary_has_the_first_and_the_last_episode() -> None:
 def test_costs_stand_under_their_tasks() -> None:
     """Of the tasks in the table; a method that was not run on one has an empty cell there."""
     of = {"bandit": 7, "curling": 8, "tilted_cartpole": 9}
-    found = [(envs.get(name), {"methods": {"dagger": {"cpu_s": seconds}}}) for name, seconds in of.items()]
-    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in results.costs(found).splitlines()]
+    by_task = [(envs.get(name), {"methods": {"dagger": {"cpu_s": seconds}}}) for name, seconds in of.items()]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in results.costs(by_task).splitlines()]
     assert lines[0] == ["method", "bandit", "tilted_cartpole"]
     assert ["dagger", "7", "9"] in lines
     assert ["rma", "", ""] in lines
