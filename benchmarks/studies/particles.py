@@ -52,7 +52,7 @@ def compared(task: envs.Task, trials: int) -> dict[str, Any]:
         agents["grid"] = ExactAgent(env, expert, False, grid_size(task))
     agents |= {"random": RandomAgent(task.action_space), "expert": ExpertAgent(env, expert)}
     batches, made = list[Deployed](), dict[str, Any]()
-    for seed in range(SEED, SEED + MOST):
+    for seed in range(SEED, SEED + MOST * trials, trials):  # near seeds share trials
         batches.append(_deployed(env, agents, seed))
         made = _pooled(batches)
         if made.get("standard_error", 0) <= ENOUGH:

@@ -155,7 +155,7 @@ def test_particles_less_grid(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(particles, "run_trials", run_trials)
     monkeypatch.setattr(particles, "time", SimpleNamespace(process_time=lambda: now))
     made = particles.compared(envs.get("tilted_cartpole"), 5)
-    assert len(seeds) == particles.MOST == 4
+    assert sorted(seeds) == [11, 16, 21, 26], "no trial twice"
     assert made["grid"] == {"score": 0.5, "cpu_s": 12.0}
     assert made["particles"] == {"score": 0.7, "cpu_s": 4.0}
     assert made["difference"] == pytest.approx(0.2)
