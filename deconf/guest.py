@@ -2,14 +2,13 @@
 
 import contextlib
 import io
-import json
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
-from multiprocessing.connection import Client, Connection
+from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -112,14 +111,12 @@ def _end_with_parent() -> None:
 
 
 def main() -> None:
-    """Connect to the run that started this process, and serve its requests."""
-    line = b""
-    while not line.endswith(b"\n") and (more := os.read(0, 65536)):
-        line += more
-    settings, sys.stdin = json.loads(line), io.StringIO()
-    sys.path[:] = settings["path"]
+    """Serve the requests of the run that started this process, over the connection that the argument numbers."""
+    os.set_inheritable(number := int(sys.argv.pop()), False)  # else what the method starts would keep it open
+    sys.stdin = io.StringIO()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(AttributeError):  # characters that the output's encoding lacks are escaped
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-    with Client(settings["address"], authkey=bytes.fromhex(settings["key"])) as channel:
-        live(settings["reference"], channel, channel.recv())
+    with Connection(number) as channel:
+        reference, sys.path[:] = channel.recv()
+        live(reference, channel, channel.recv())

@@ -1,4 +1,4 @@
-"""The process of a method from outside, `python -m deconfounded.deconf.wall`; engine/guest_host.py starts it.
+"""The process of a method from outside, which engine/guest_host.py starts: `python -m deconfounded.deconf.wall FD`.
 
 It holds no tasks, experts, benchmarks or simulators, and refuses to import them. This prevents accidental leakage and
 simple attacks, not all: the process has the rights of its user.

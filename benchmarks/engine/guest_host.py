@@ -5,17 +5,14 @@ environments in which the method's agent acts.
 """
 
 import contextlib
-import json
 import os
-import queue
 import secrets
 import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Sequence
-from multiprocessing.connection import Connection, Listener
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -57,39 +54,26 @@ class Guest(Agent):
         self.provider = Provider(context, uses, context.rngs)
         self.provider.open -= {"acting theta"}
         self.mark, self.folder = secrets.token_hex(16), tempfile.TemporaryDirectory(prefix="deconfounded-")
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "deconfounded.deconf.wall"],
-            cwd=self.folder.name,
-            env=_environ(self.mark),
-            stdin=subprocess.PIPE,
-            start_new_session=True,
-        )
-        config = context.preset.configs.get(name, {})
+        self.channel, theirs = Pipe()  # inherited, as a socket of a name fails in a temporary folder of a long one
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "deconfounded.deconf.wall", str(theirs.fileno())],
+                cwd=self.folder.name,
+                env=_environ(self.mark),
+                stdin=subprocess.PIPE,  # which nothing is written to: it closes when this process ends
+                start_new_session=True,
+                pass_fds=[theirs.fileno()],
+            )
+        path = [str(Path(entry).resolve()) for entry in sys.path if entry not in outside.FOLDERS]  # of others
+        config, rng = context.preset.configs.get(name, {}), stream(GUEST, context.seeds[0], context.salt)
         try:
-            self.channel = self._connect(reference)
-            rng = stream(GUEST, context.seeds[0], context.salt)
-            self.channel.send({**self.provider.about(), "config": config, "rng": rng})
+            with contextlib.suppress(ConnectionError):  # it ended; how, it is asked next
+                self.channel.send((reference, path))
+                self.channel.send({**self.provider.about(), "config": config, "rng": rng})
             self._fit()
         except BaseException:
             self.close()
             raise
-
-    def _connect(self, reference: str) -> Connection:
-        """The guest's end calls here. Raises InputError if its process ends before it does."""
-        key, accepted = secrets.token_bytes(16), queue.SimpleQueue[Connection]()
-        path = [str(Path(entry).resolve()) for entry in sys.path if entry not in outside.FOLDERS]  # of others
-        with Listener(authkey=key) as listener:
-            threading.Thread(target=lambda: accepted.put(listener.accept()), daemon=True).start()
-            begun = {"reference": reference, "address": listener.address, "key": key.hex(), "path": path}
-            assert self.process.stdin is not None
-            with contextlib.suppress(BrokenPipeError):
-                self.process.stdin.write(f"{json.dumps(begun)}\n".encode())
-                self.process.stdin.flush()
-            while True:
-                with contextlib.suppress(queue.Empty):
-                    return accepted.get(timeout=0.2)
-                if self.process.poll() is not None:
-                    raise envs.InputError(f"method {self.name}: its process ended before it began")
 
     def _hear(self) -> list[Any]:
         """What it says next: never unpickled, since that would run its code here."""
@@ -193,8 +177,7 @@ class Guest(Agent):
 
     def close(self) -> None:
         """Let it go, and all that it started."""
-        if hasattr(self, "channel"):
-            self.channel.close()
+        self.channel.close()
         assert self.process.stdin is not None
         self.process.stdin.close()
         try:

@@ -207,14 +207,7 @@ def test_data_is_for_training_and_an_oracle_s_theta_for_acting(monkeypatch: pyte
 def test_a_guest_does_not_act_on_theta(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever it declares, the theta that it acts under is not to be had; that of demonstrations is, if declared."""
 
-    class Silent:
-        """A channel to nobody."""
-
-        def send(self, message: Any) -> None: ...
-        def close(self) -> None: ...
-
     monkeypatch.setattr(guest_host.sys, "executable", "true")
-    monkeypatch.setattr(guest_host.Guest, "_connect", lambda self, reference: Silent())
     monkeypatch.setattr(guest_host.Guest, "_fit", lambda self: None)
     context = Context(toys.Push(), tiny_preset(), [0], expert="tests.toys:control")
     made = guest_host.Guest(context, "mine", "mine.py:fit", ["demonstrations", "theta"])

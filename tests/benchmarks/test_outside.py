@@ -8,6 +8,7 @@ import queue
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -379,6 +380,7 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
         ("def fit(given): import os; os._exit(3)", "its process ended with status 3$"),
+        ("def fit(given): import os; os.system('sleep 60 &'); os._exit(3)", "its process ended with status 3$"),
         ("def fit(given): import os; os.kill(os.getpid(), 9)", r"its process was killed \(out of memory\?\)"),
         ("def fit(given): import os; os.kill(os.getpid(), 11)", "its process was ended by signal 11$"),
         ("def fit(given): given.explore(3)", "agent of exploration was 3; it must be an Agent, or None"),
@@ -386,7 +388,10 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): given.explore(trials=0)", "asked for exploration, and declares"),
     ],
 )
-def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str) -> None:
+def test_a_bad_method_is_one_line(tmp_path: Path, text: str, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a temporary folder of a long name, too, as clusters have them; a socket's is at most 108 characters."""
+    (scratch := tmp_path / ("long" * 25)).mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     with pytest.raises(envs.InputError, match=f"method mine: {says}" if "trials=0" not in text else says) as caught:
         guest(tmp_path, text, CONTROL, "demonstrations")
     assert "\n" not in str(caught.value)
