@@ -380,7 +380,7 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),
         ("def fit(given): import os; os._exit(3)", "its process ended with status 3$"),
-        ("def fit(given): import os; os.system('sleep 60 &'); os._exit(3)", "its process ended with status 3$"),
+        ("def fit(given): import os; 1 / os.get_inheritable(given._ask._channel.fileno())", "division by zero"),
         ("def fit(given): import os; os.kill(os.getpid(), 9)", r"its process was killed \(out of memory\?\)"),
         ("def fit(given): import os; os.kill(os.getpid(), 11)", "its process was ended by signal 11$"),
         ("def fit(given): given.explore(3)", "agent of exploration was 3; it must be an Agent, or None"),
