@@ -79,7 +79,8 @@ def pick(file: Path, method: str, seed: int, protocol: str = protocols.STANDARD)
     every = by_protocol[protocol]
     ours = [record for record in every if records.named(record) == method]
     if not ours:
-        raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), f" in {file}")
+        there = f" in {file}; --records names other files"
+        raise envs.closest("method", method, list(dict.fromkeys(map(records.named, every))), there)
     fitting = [record for record in ours if record["seed"] == seed]
     if not fitting:
         seeds = ", ".join(map(str, sorted(record["seed"] for record in ours)))

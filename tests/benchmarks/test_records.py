@@ -466,7 +466,7 @@ class TestVerify:
         assert verify.pick(file, "blind_bc", 0) == one
         assert verify.pick(file, "blind_bc", 0, "scarce")["protocol_name"] == "scarce"
         for method, seed, says in (
-            ("blind", 0, "method 'blind' is unknown; did you mean 'blind_bc'"),
+            ("blind", 0, r"did you mean 'blind_bc'\? there are blind_bc in .*; --records names"),
             ("blind_bc", 4, r"seed of blind_bc was 4; .* has 0, 1, 1"),
             ("blind_bc", 1, "has 2 records of blind_bc with seed 1"),
         ):

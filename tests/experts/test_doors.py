@@ -350,6 +350,7 @@ class TestTasks:
             ({"1.bias": np.full(1, np.nan, np.float32)}, "layer 1 of .* holds NaN or infinity"),
             ({"0.bias": np.full(4, np.nan, np.float32)}, "layer 0 of .* holds NaN or infinity"),
             ({"1.bias": np.ones(2, np.float32)}, "lack a whole layer 1"),
+            ({"log_std": np.ones(1, np.float32)}, "lack a whole layer 2"),
         ],
     )
     def test_expert_weights_of_each_layer(self, change: dict[str, Any], says: str, tmp_path: Path) -> None:
