@@ -13,15 +13,13 @@ from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import ON_BANDIT, SHARED, USES, DeconfoundedConfig
 
+ON_CONTROL = DeconfoundedConfig(model="forgetting", inference_updates=500)
 BANDIT = replace(ON_BANDIT, model="forgetting")
-AMOUNTS = {
-    "on_control": DeconfoundedConfig(model="forgetting", inference_updates=500),
-    "on_bandit": BANDIT,
-    "paper": BANDIT,
-}
 
 
-@uses(*USES, version=3, cost=6, large=deconfounded.large, **AMOUNTS, **SHARED)
+@uses(
+    *USES, version=3, cost=6, on_control=ON_CONTROL, on_bandit=BANDIT, paper=BANDIT, large=deconfounded.large, **SHARED
+)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the belief that forgets."""
     return deconfounded.fit(given)
