@@ -8,7 +8,8 @@ that says much is taken in by several such stages, each with a power of its like
 
 Simulating every particle would cost too much. A share of them is simulated, and the outcomes of the others are those of
 a quadratic function of theta, fitted to these by least squares for each transition. Where it misses the log-likelihoods
-of those simulated, as of thetas far apart, and wherever a latent is categorical, every particle is simulated.
+of those simulated, as of thetas far apart, and wherever a latent is categorical, every particle is simulated, trial by
+trial, as a model of each particle of all trials would take gigabytes.
 """
 
 from collections.abc import Sequence
@@ -39,7 +40,7 @@ HALVINGS = 20  # of the interval, in the search for the power of a stage
 class Particles:
     """A belief about theta in each of N trials: weighted particles, and the likelihoods that weigh them.
 
-    Attributes: `theta` [N, K, L], `log_weight` [N, K]; `missed`: how often every particle was simulated.
+    Attributes: `theta` [N, K, L], `log_weight` [N, K]; `missed`: how often the quadratic missed.
     conditional: the expert's probability of an action counts as evidence too, Eq. (3). static: it assumes that theta
     neither drifts nor switches.
     """
@@ -70,15 +71,16 @@ class Particles:
         seeds = (rng.random((self._n, 1))[:, 0] * 2**53).astype(np.int64)
         self._rngs = [np.random.default_rng(seed) for seed in seeds.tolist()]
         self._shape = self._n, PARTICLES, len(self.task.latents)
-        smooth = self.task.moves_state and not self._categorical.any()
+        moves = self.task.moves_state
+        smooth = moves and not self._categorical.any()
         terms = quadratic(np.zeros(self._shape[2])).size
-        wanted = max(round(SIMULATED * terms), LEAST) if smooth else PARTICLES
+        wanted = max(round(SIMULATED * terms), LEAST) if smooth else 0
         self._simulated = np.arange(wanted) * PARTICLES // wanted  # evenly, among particles in their parents' order
         self._simulator = self.task.simulator(self._n * wanted)
         self._terms = np.zeros((*self._shape[:2], terms)) if smooth else None
         self._solver = np.zeros((self._n, terms, wanted))
-        self.missed = 0  # transitions at which every particle was simulated
-        self._whole = self.task.simulator(PARTICLES) if smooth else None
+        self.missed = 0  # transitions that the quadratic missed
+        self._whole = self.task.simulator(PARTICLES if moves else 0)
         self._flat = self._n * PARTICLES, self._shape[2]
         self.log_weight = np.full(self._shape[:2], -np.log(PARTICLES))
         self._u, self.theta = np.zeros(self._shape), np.full(self._shape, np.nan)
@@ -171,12 +173,12 @@ class Particles:
 
     def _log_physics(self, rows: NDArray[np.int64], state: Array, action: Array, next_state: Array) -> Array:
         """That of the next state alone, but for its readings, by simulation and fit."""
+        if self._terms is None:
+            return np.stack([self._by_each(*each) for each in zip(rows, state, action, next_state, strict=True)])
         n, share = len(rows), len(self._simulated)
         index = (rows[:, None] * share + np.arange(share)).ravel()
         outcome = self._simulator.outcome(np.repeat(state, share, 0), np.repeat(action, share, 0), index)
         simulated = self.task.log_prob(np.repeat(next_state, share, 0), outcome).reshape(n, share)
-        if self._terms is None or self._whole is None:
-            return simulated
         fitted = self._terms[rows] @ (self._solver[rows] @ outcome.reshape(n, share, -1))
         log_prob = self.task.log_prob(next_state[:, None], fitted)
         near = simulated > simulated.max(-1, keepdims=True) - NEAR
@@ -184,12 +186,16 @@ class Particles:
         error = np.where(near, error - (error * near).sum(-1, keepdims=True) / near.sum(-1, keepdims=True), 0)
         missed = np.square(error).sum(-1) > TOLERANCE**2 * near.sum(-1)
         for i in np.flatnonzero(missed).tolist():
-            for which, theta in enumerate(self.theta[rows[i]]):
-                self._whole.set_theta(which, theta)
-            same = np.full(PARTICLES, i)
-            log_prob[i] = self.task.log_prob(next_state[same], self._whole.outcome(state[same], action[same]))
+            log_prob[i] = self._by_each(rows[i], state[i], action[i], next_state[i])
         self.missed += int(missed.sum())
         return log_prob
+
+    def _by_each(self, row: int, state: Array, action: Array, next_state: Array) -> Array:
+        """The same [K] of a transition of trial `row`, states [S] and action [A], by simulation of every particle."""
+        for which, theta in enumerate(self.theta[row]):
+            self._whole.set_theta(which, theta)
+        outcome = self._whole.outcome(np.tile(state, (PARTICLES, 1)), np.tile(action, (PARTICLES, 1)))
+        return self.task.log_prob(next_state[None], outcome)
 
     def _power(self, log_weight: Array, log_prob: Array, remaining: Array) -> Array:
         """The largest power [M] of likelihoods, at most `remaining`, that leaves K / 2 effective particles."""

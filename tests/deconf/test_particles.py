@@ -182,6 +182,19 @@ def test_a_quadratic_stands_for_simulation() -> None:
     assert belief.missed < 16
 
 
+@pytest.mark.parametrize(("name", "models"), [("cheetah_speed", 0), ("forked_path", FEW)])
+def test_models_are_few_where_nothing_is_fitted(name: str, models: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """None where theta moves no state; as many as particles where a latent is categorical, for 500 trials too."""
+    task, made = envs.get(name), list[int]()
+    simulator = type(task).simulator
+    monkeypatch.setattr(type(task), "simulator", lambda self, n: made.append(n) or simulator(self, n))
+    belief = Particles(envs.BatchEnv(task, 1), policy.load(task), False)
+    made.clear()
+    belief.begin(500)
+    belief.reset(Streams([*np.random.default_rng(0).spawn(500)]))
+    assert sum(made) == models
+
+
 def test_a_kink_does_not_mislead() -> None:
     """No true theta is left far outside of a belief, though of steps most are simulated for a few particles alone."""
     env = envs.BatchEnv(Slip(), 100)
