@@ -184,14 +184,14 @@ def test_a_quadratic_stands_for_simulation() -> None:
 
 @pytest.mark.parametrize(("name", "models"), [("cheetah_speed", 0), ("forked_path", FEW)])
 def test_models_are_few_where_nothing_is_fitted(name: str, models: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None where theta moves no state; as many as particles where a latent is categorical, for 500 trials too."""
+    """None where theta moves no state; as many as particles where a latent is categorical, for 50 trials too."""
     task, made = envs.get(name), list[int]()
     simulator = type(task).simulator
     monkeypatch.setattr(type(task), "simulator", lambda self, n: made.append(n) or simulator(self, n))
     belief = Particles(envs.BatchEnv(task, 1), policy.load(task), False)
     made.clear()
-    belief.begin(500)
-    belief.reset(Streams([*np.random.default_rng(0).spawn(500)]))
+    belief.begin(50)
+    belief.reset(Streams([*np.random.default_rng(0).spawn(50)]))
     assert sum(made) == models
 
 
