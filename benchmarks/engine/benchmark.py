@@ -144,7 +144,7 @@ class BenchmarkJob(Job):
             }
             monitor.elsewhere = sum(agent.cpu for agent in agents.values() if isinstance(agent, Guest))
             # First, since a seed's file says that it is finished:
-            notes = [self._keep(names[way], agent) for way, agent in agents.items()]
+            notes = [self._keep(way, agent) for way, agent in agents.items()]
             meta: dict[str, Any] = {"curve": monitor.kept, "tier": self.about.tier}
             meta |= {"agents": {name: way for way, name in names.items()}}
             meta |= {"salts": [training, evaluation]} if self.guest else {}
@@ -156,11 +156,10 @@ class BenchmarkJob(Job):
                 self.save(seed, arrays, monitor, meta)
         return "; ".join([f"trained in {trained:.0f} s, all in {monitor.close():.0f} s", *filter(None, notes)])
 
-    def _keep(self, name: str, agent: Agent) -> str:
+    def _keep(self, deployment: str, agent: Agent) -> str:
         """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
-        note = ""
-        for i, seed in enumerate(self.seeds):
-            folder = self.folder.parent / "agents" / f"{name}-{seed}"
+        note, name = "", label(self.method, deployment)
+        for i, (seed, folder) in enumerate(zip(self.seeds, self.agents(deployment), strict=True)):
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
             try:
                 if folder.exists():  # the agent of results that are no longer there

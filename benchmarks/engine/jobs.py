@@ -15,7 +15,7 @@ import torch
 
 from deconfounded import __version__, envs
 from deconfounded.benchmarks.engine import job_files
-from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine.catalogue import METHODS, Method, label
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
@@ -70,6 +70,11 @@ class Job(ABC):
     def file(self, seed: int) -> Path:
         """An .npz file."""
         return self.folder / f"{self.method}-{seed}.npz"
+
+    def agents(self, deployment: str) -> list[Path]:
+        """Folders of the agents of a deployment, one a seed."""
+        folder = self.folder.parent / "agents"
+        return [folder / f"{label(self.method, deployment)}-{seed}" for seed in self.seeds]
 
     @property
     def device(self) -> str:

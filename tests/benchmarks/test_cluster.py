@@ -157,6 +157,8 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
         dawdling = [
             Dawdling("slippery_cartpole", preset, "naive_rnn", (seed,), there, first_node=first) for seed in (0, 1)
         ]
+        (earlier := there.parent / "agents" / "naive_rnn-0" / "agent.py").parent.mkdir(parents=True)
+        earlier.touch()
         guests = [BenchmarkJob("bandit", preset, name, (0,), there, guest=catalogue.guest(name)) for name in names]
         engine.run([*dawdling, *guests], tick, say)
     assert two.second is None
@@ -178,6 +180,7 @@ def test_two_nodes_one_dies(two: Any, tmp_path: Path, request: pytest.FixtureReq
     result = guests[0].load(0)
     assert result is not None
     assert result["meta"]["reference"] == f"{home}/my_guest.py:fit"  # where it is here
+    assert not earlier.exists(), "of results that are no longer there"
     assert not list(there.glob(".*"))
     assert not list((there.parent).rglob("__pycache__"))
     deadline = time.monotonic() + 30
