@@ -6,10 +6,13 @@ package also registers every task with gymnasium, so that `gymnasium.make("decon
 
 import os
 
-_gl = os.environ.pop("MUJOCO_GL", None)  # `import mujoco` fails if the backend is missing, which only rendering needs
+_gl = os.environ.get("MUJOCO_GL")
+os.environ["MUJOCO_GL"] = "off"  # `import mujoco` fails if the backend is missing, which only rendering needs
 import mujoco  # noqa: F401
 
-if _gl is not None:
+if _gl is None:
+    del os.environ["MUJOCO_GL"]
+else:
     os.environ["MUJOCO_GL"] = _gl
 
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from functools import cache, partial
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -32,6 +33,16 @@ def backend() -> str:
     remedy = "; install libegl1 or libosmesa6" * (sys.platform == "linux")
     raise InputError(f"no GL for pictures: tried {' and '.join(names)}{remedy}")
 
+
+def _context(width: int, height: int) -> Any:
+    """MuJoCo's GL context of the backend that works here."""
+    name = backend()
+    module = name if name in ("egl", "osmesa", "cgl") else "glfw"
+    return importlib.import_module(f"mujoco.{module}").GLContext(width, height)
+
+
+if not hasattr(gl_context, "GLContext"):  # MuJoCo was imported without GL, and others may draw with it too
+    gl_context.GLContext = mujoco.GLContext = _context
 
 _GL_PROCESSES: set[int] = set()  # that created a GL context: this process, and those that it was forked from
 
@@ -120,8 +131,8 @@ class MujocoRenderer:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _load_triton()
-        if (name := backend()) in ("egl", "osmesa", "cgl", "glfw"):
-            gl_context.GLContext = importlib.import_module(f"mujoco.{name}").GLContext
+        backend()
+        gl_context.GLContext = _context
         self._model, self._data = model, mujoco.MjData(model)
         level(model)
         self._renderer = Handle(partial(_create, model), _close)

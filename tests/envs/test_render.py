@@ -35,6 +35,15 @@ print("rendered, trained, rendered")
 OTHERS = "import mujoco\nmujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 8, 8).render()\n"
 
 
+@pytest.mark.skipif(not gl_works(), reason="no GL")
+def test_others_render_too() -> None:
+    """By the backend that they chose, though this package imported MuJoCo first, and without a GL library."""
+    code = f"import sys\nfrom deconfounded import envs\nassert 'glfw' not in sys.modules\n{OTHERS}"
+    environ = {**os.environ, "MUJOCO_GL": render.backend()}
+    done = subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.skipif(find_spec("triton") is None, reason="triton is not installed")
 @pytest.mark.skipif(not gl_works(), reason="no GL")
 @pytest.mark.parametrize("before", ["", OTHERS], ids=["first", "after another renderer"])
