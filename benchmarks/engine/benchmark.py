@@ -159,7 +159,7 @@ class BenchmarkJob(Job):
     def _keep(self, deployment: str, agent: Agent) -> str:
         """Leave each seed's agent beside the jobs, for `deconfounded.load`; returns why one could not be kept."""
         note, name = "", label(self.method, deployment)
-        for i, (seed, folder) in enumerate(zip(self.seeds, self.agents(deployment), strict=True)):
+        for i, (seed, folder) in enumerate(zip(self.seeds, self.agent_folders(deployment), strict=True)):
             about = {"task": self.task, "method": name, "seed": seed, "spaces": spaces(envs.get(self.task))}
             try:
                 if folder.exists():  # the agent of results that are no longer there

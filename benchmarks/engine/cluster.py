@@ -94,7 +94,7 @@ class Cluster(Engine):
                     say(job, "its worker was lost; it is tried again")
                     start(Attempt(job, attempt.tries + 1, attempt.ticks))
             else:
-                for folder in (folder for way in ("", *job.about.deployments) for folder in job.agents(way)):
+                for folder in (folder for way in ("", *job.about.deployments) for folder in job.agent_folders(way)):
                     shutil.rmtree(folder, ignore_errors=True)  # of results that are no longer there
                 keep(job, files)
                 job.checkpoint.unlink(missing_ok=True)

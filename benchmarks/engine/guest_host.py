@@ -54,7 +54,7 @@ class Guest(Agent):
         self.provider = Provider(context, uses, context.rngs)
         self.provider.open -= {"acting theta"}
         self.mark, self.folder = secrets.token_hex(16), tempfile.TemporaryDirectory(prefix="deconfounded-")
-        self.channel, theirs = Pipe()  # inherited, as a socket of a name fails in a temporary folder of a long one
+        self.channel, theirs = Pipe()  # no named socket: these fail where the path of temporary files is long
         with theirs:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "deconfounded.deconf.wall", str(theirs.fileno())],

@@ -71,7 +71,7 @@ class Job(ABC):
         """An .npz file."""
         return self.folder / f"{self.method}-{seed}.npz"
 
-    def agents(self, deployment: str) -> list[Path]:
+    def agent_folders(self, deployment: str) -> list[Path]:
         """Folders of the agents of a deployment, one a seed."""
         folder = self.folder.parent / "agents"
         return [folder / f"{label(self.method, deployment)}-{seed}" for seed in self.seeds]
