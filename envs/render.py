@@ -131,7 +131,7 @@ class MujocoRenderer:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         _load_triton()
-        backend()
+        backend()  # before a renderer is begun, as it may fail
         gl_context.GLContext = _context
         self._model, self._data = model, mujoco.MjData(model)
         level(model)

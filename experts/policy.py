@@ -174,7 +174,7 @@ def _weights(task: Task, file: Path, remedy: str) -> dict[str, NDArray[np.float3
     except (SafetensorError, OSError) as error:
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
     width = len(task.observation) + task.seen_width
-    for i in range(max(-(-len(weights) // 2), 1)):  # an odd number has a layer too many
+    for i in range(max((len(weights) + 1) // 2, 1)):  # an odd number has a layer too many
         weight, bias = weights.get(f"{i}.weight"), weights.get(f"{i}.bias")
         if weight is None or bias is None or weight.ndim != 2 or bias.shape != weight.shape[:1]:
             raise InputError(f"expert weights at {file} lack a whole layer {i}; {remedy}")

@@ -94,8 +94,9 @@ class Cluster(Engine):
                     say(job, "its worker was lost; it is tried again")
                     start(Attempt(job, attempt.tries + 1, attempt.ticks))
             else:
-                for folder in (folder for way in ("", *job.about.deployments) for folder in job.agent_folders(way)):
-                    shutil.rmtree(folder, ignore_errors=True)  # of results that are no longer there
+                for way in ("", *job.about.deployments):
+                    for folder in job.agent_folders(way):
+                        shutil.rmtree(folder, ignore_errors=True)  # of results that are no longer there
                 keep(job, files)
                 job.checkpoint.unlink(missing_ok=True)
                 tick(job.ticks - attempt.ticks)
