@@ -74,21 +74,15 @@ def panels(
     **shared: Any,
 ) -> Iterator[Any]:
     """Panels [rows, columns] to draw in, saved as .png at the end; pdf: and as .pdf. mark: what for, see `mark_of`."""
-    import matplotlib
+    from matplotlib.figure import Figure  # not pyplot, which has a backend, and a notebook's would be switched
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, **shared)
-    try:
-        yield axes
-        save_figure(figure, file, dpi, mark)
-        if pdf and isinstance(file, Path):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format="pdf")
-            write_atomically(file.with_suffix(".pdf"), buffer.getvalue())
-    finally:
-        plt.close(figure)
+    figure = Figure(figsize=size, layout="constrained")
+    yield figure.subplots(rows, columns, squeeze=False, **shared)
+    save_figure(figure, file, dpi, mark)
+    if pdf and isinstance(file, Path):
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="pdf")
+        write_atomically(file.with_suffix(".pdf"), buffer.getvalue())
 
 
 PLACES = (*((across, up) for up in (1, -1, 3, -3, 5, -5) for across in (1, -1)), (1, 1))

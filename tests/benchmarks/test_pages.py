@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 from unittest.mock import Mock
 
 import imageio.v3 as imageio
-import matplotlib.pyplot as plt
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from deconfounded import envs
@@ -19,7 +20,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.output import aggregation, film, index, records, run_report, scoring, statistics
 from deconfounded.benchmarks.output.index import answers
-from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure, still
+from deconfounded.benchmarks.output.pictures import mark, mark_of, panels, save_figure, still
 from deconfounded.benchmarks.studies import (
     cards,
     findings,
@@ -994,10 +995,24 @@ def test_pictures_are_drawn_when_their_data_change(tmp_path: Path) -> None:
     for data in ([("a", 0.1, 0.2)], [("a", 0.1, 0.2)], [("a", 0.1, 0.3)], [("a", 0.1, 0.3)]):
         publish.redraw(file, draw, data)
     assert drawn == [1, 1]
-    save_figure(plt.figure(), file, 50)
+    save_figure(Figure(), file, 50)
     assert mark_of(file) == mark_of(tmp_path / "nowhere.png") == ""
     publish.redraw(file, draw, data)
     assert drawn == [1, 1, 1]
+
+
+def test_a_picture_leaves_the_backend_as_it_is(tmp_path: Path) -> None:
+    """A notebook that draws with one of its own goes on doing so."""
+    before = matplotlib.get_backend()
+    matplotlib.use("svg")
+    try:
+        with panels(file := tmp_path / "empty.png", size=(1, 1), pdf=True):
+            pass
+        assert matplotlib.get_backend() == "svg"
+        assert file.read_bytes().startswith(b"\x89PNG")
+        assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+    finally:
+        matplotlib.use(before)
 
 
 def test_a_still_is_small_and_made_once(tmp_path: Path) -> None:
