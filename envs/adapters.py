@@ -85,7 +85,8 @@ class GymEnv(gym.Env[Any, Any]):
         if seed is None and not options and 0 < self._episode < self.episodes:
             options = {"keep_theta": True}
         obs = self.batch.reset(seed, options)[0]
-        super().reset(seed=None if seed is None else int(np.ravel(seed)[0]))
+        first = np.ravel(np.array(seed, object))[0]  # a batch takes a list of one
+        super().reset(seed=None if first is None else int(first))
         self._episode = self._episode + 1 if (options or {}).get("keep_theta", False) else 1
         return obs, {}
 
@@ -196,6 +197,9 @@ class DmEnv(dm_env.Environment):
 
     def action_spec(self) -> specs.BoundedArray:
         return _spec(self.task.action_space, "action")
+
+    def close(self) -> None:
+        self._batch.close()
 
 
 def _spec(space: spaces.Box | spaces.Discrete, name: str) -> specs.BoundedArray:

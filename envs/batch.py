@@ -77,6 +77,8 @@ class BatchEnv:
             forced = self.task.check_theta(forced, self.n)
         if seed is not None or not self._streams:
             self.seed(seed)
+        if not len(rows) and first:
+            raise InputError("reset was given a mask `where` without any environment before the first reset")
         if not len(rows):
             return self.observe()
         theta_rng, start_rng, noise_rng, switch_rng = zip(*(self._streams[i] for i in rows.tolist()), strict=True)

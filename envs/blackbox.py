@@ -37,19 +37,18 @@ class GymSimulator(Simulator):
         super().__init__(task, n)
         self.box = task
         self._envs: list[gymnasium.Env[Any, Any] | None] = [None] * n
-        weakref.finalize(self, _close, self._envs)  # simulators may hold processes, sockets and windows
+        weakref.finalize(self, _close_all, self._envs)  # simulators may hold processes, sockets and windows
 
     def close(self) -> None:
-        _close(self._envs)
+        _close_all(self._envs)
 
     def __getstate__(self) -> dict[str, Any]:
         raise InputError(f"environments of {self.box.name} cannot be copied; make others")
 
     def set_theta(self, i: int, theta: Array) -> None:
         super().set_theta(i, theta)
-        if (old := self._envs[i]) is not None:
-            old.close()
-        self._envs[i] = None
+        old, self._envs[i] = self._envs[i], None
+        _close(old)
 
     def start(self, rows: NDArray[np.int64], start: Array, noise: Array) -> Array:
         """Reset by the seed in `start`, and go on with the random numbers of the seed in `noise`."""
@@ -98,13 +97,18 @@ class GymSimulator(Simulator):
         return np.append(row, (reward, over, cut))
 
 
-def _close(made: list[gymnasium.Env[Any, Any] | None]) -> None:
-    """Close environments, and leave None in their places; what they raise on closing is of no use to anybody."""
+def _close(env: gymnasium.Env[Any, Any] | None) -> None:
+    """Close an environment, if there is one; what it raises on closing is of no use to anybody."""
+    with contextlib.suppress(Exception):
+        if env is not None:
+            env.close()
+
+
+def _close_all(made: list[gymnasium.Env[Any, Any] | None]) -> None:
+    """Close environments, and leave None in their places."""
     for i, env in enumerate(made):
         made[i] = None
-        with contextlib.suppress(Exception):
-            if env is not None:
-                env.close()
+        _close(env)
 
 
 Value = TypeVar("Value")
@@ -170,7 +174,7 @@ class BlackBox(Task):
         low, high = bounds(space)
         scaled = low + (action + 1) / 2 * (high - low)
         whole = np.issubdtype(space.dtype, np.integer)
-        return (np.rint(scaled) if whole else scaled).astype(space.dtype).clip(space.low, space.high)
+        return (np.rint(scaled) if whole else scaled).clip(space.low, space.high).astype(space.dtype)
 
     def simulator(self, n: int) -> GymSimulator:
         return GymSimulator(self, n)

@@ -39,6 +39,8 @@ class Latent:
     switch: float = 0.0
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not isinstance(self.unit, str):
+            raise InputError(f"name and unit of a latent were {self.name!r} and {self.unit!r}; they must be texts")
         for part in ("low", "high", "drift", "switch"):
             if isinstance(value := getattr(self, part), bool) or not isinstance(value, int | float | np.number):
                 raise InputError(f"{part} of latent {self.name} was {value!r}; it must be a number")

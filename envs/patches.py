@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.physics import MujocoTask, Physics
+from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Array
 
 
@@ -19,6 +20,9 @@ class PatchedPhysics(Physics):
     def set_theta(self, i: int, theta: Array) -> None:
         super().set_theta(i, theta)
         self._held[i] = theta[0]
+
+    def rollout(self, state: Array, action: Array) -> Array:
+        raise InputError(f"{self.task.name} has a theta for each place; mujoco.rollout holds one for all steps")
 
     def outcome(self, state: Array, action: Array, rows: NDArray[np.int64] | None = None) -> Array:
         which = np.arange(len(state)) if rows is None else np.asarray(rows)

@@ -13,6 +13,7 @@ from deconfounded.envs import blackbox
 from deconfounded.envs.adapters import DmEnv, GymEnv, GymVectorEnv
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import InputError, Task
 
 TASKS: dict[str, type[Task]] = {}
@@ -30,7 +31,11 @@ def register(cls: type[Task]) -> type[Task]:
     for part in ("latents", "horizon", "action_space", "observation"):
         if not hasattr(cls, part):
             raise InputError(f"task {name} of {where} does not state its {part}")
-    _check_latents(cls())
+    try:
+        task = cls()
+    except TypeError as error:
+        raise InputError(f"task {name} of {where}: {error_line(error)}; {cls.__name__}() must do") from None
+    _check_latents(task)
     if TASKS.get(name, cls) is not cls:
         raise InputError(f"task name {name!r} of {where} is taken by {_where(TASKS[name])}; give it another name")
     if "reference" not in vars(cls):
@@ -38,7 +43,9 @@ def register(cls: type[Task]) -> type[Task]:
         cls.reference = name if ours else outside.reference(cls) or name
     if outside.is_outside(cls.reference):
         copyreg.pickle(cls, _parts)
-    gym_id, steps = cls().gym_id, cls().horizon
+    gym_id, steps = task.gym_id, task.horizon
+    if twins := [of for of, other in TASKS.items() if of != name and other().gym_id == gym_id]:
+        raise InputError(f"task {name!r} of {where} would be {gym_id}, as {twins[0]} is; give it another name")
     TASKS[name] = cls
     gymnasium.registry.pop(gym_id, None)
     one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}

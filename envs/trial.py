@@ -35,7 +35,10 @@ class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._left = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
-        obs, info = self.env.reset(seed=seed, options={"keep_theta": False, **(options or {})})
+        given = {} if options is None else options
+        if isinstance(given, dict):
+            given = {"keep_theta": False, **given}  # else `env` might go on with an earlier trial
+        obs, info = self.env.reset(seed=seed, options=given)
         self._left = int(self.env.unwrapped.episodes) - 1  # type: ignore[attr-defined]
         return self._started(obs), info
 

@@ -89,7 +89,8 @@ def facts(cls: type[World]) -> Facts:
     latents = tuple(DrawnLatent(text, "", x[0], x[-1], values=tuple(x)) for text, x in columns)
     env = made(name, world, draws[0])
     observations, space = env.observation_space.shape[0], env.action_space  # type: ignore[index]
-    env.close()
+    with part(name, "close"):
+        env.close()
     assert isinstance(space, spaces.Box | spaces.Discrete)
     if isinstance(space, spaces.Discrete) and noise > 1:
         raise InputError(f"noise of {name} was {noise!r}; of discrete actions it is a share, from 0 to 1")

@@ -171,7 +171,7 @@ def _weights(task: Task, file: Path, remedy: str) -> dict[str, NDArray[np.float3
         if _card(file).get("sha256") not in (None, hashlib.sha256(file.read_bytes()).hexdigest()):
             raise OSError(f"their sha256 is not that of {file.with_suffix('.json').name}")
         weights = load_file(file)
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, TypeError) as error:  # TypeError: numpy has no bfloat16
         raise InputError(f"expert weights at {file} are damaged ({error}); {remedy}") from None
     width = len(task.observation) + task.seen_width
     for i in range(max((len(weights) + 1) // 2, 1)):  # an odd number has a layer too many

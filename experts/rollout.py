@@ -3,7 +3,7 @@
 from __future__ import annotations  # as what only type checkers import is no name at run time
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.streams import Array, Streams, generators, unseeded
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.numbers import check_number, is_seed
-from deconfounded.experts.agent import Agent
+from deconfounded.experts.agent import Agent, AgentWrapper
 from deconfounded.experts.trials import Trials
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ def of_steps(theta: Array, steps: int) -> Array:
 
 def _group_seeds(seed: Seeds) -> list[int]:
     """The seed of each group of trials. Raises InputError for anything else."""
-    seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes) else [seed]
+    given: Any = seed.tolist() if isinstance(seed, np.ndarray) else seed
+    seeds = list(given) if isinstance(given, Sequence) and not isinstance(given, str | bytes) else [given]
     if not seeds or not all(is_seed(first) for first in seeds):
         raise InputError(f"seed was {seed!r}; it must be a whole number from 0 up, or one for each group of trials")
     return [int(group) for group in seeds]
@@ -78,7 +79,12 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     """
     task, n = env.task, env.n
     check_number("episodes", episodes)
-    if getattr(agent, "env", env) is not env and isinstance(agent.env, BatchEnv):  # type: ignore[attr-defined]
+    if env.privileged:
+        raise InputError("run_trials was given privileged environments; agents act on observations without theta")
+    inner = agent
+    while isinstance(inner, AgentWrapper):
+        inner = inner.agent
+    if isinstance(read := getattr(inner, "env", env), BatchEnv) and read is not env:
         raise InputError(f"{type(agent).__name__} reads the state or theta of other environments than it was to act in")
     each, seeds = trial_seeds(n, seed), _group_seeds(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)

@@ -42,6 +42,9 @@ class Sb3VecEnv(BatchVecEnv):
         self._reset_seeds()
         return self.env.reset(seed=seeds)[0]
 
+    def close(self) -> None:
+        self.env.close()
+
     def step_async(self, actions: Any) -> None:
         self._actions = actions
 

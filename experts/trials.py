@@ -122,6 +122,9 @@ def check_trials(what: str, given: object) -> None:
 
 
 def joined(parts: Sequence[Trials]) -> Trials:
-    """Concatenate trials of the same shape."""
+    """Concatenate trials of the same shape. Raises InputError where their actions are of different kinds."""
+    if len(kinds := {part.actions for part in parts}) > 1:
+        counts = " and ".join(map(str, sorted(kinds)))
+        raise InputError(f"trials to be joined had {counts} discrete actions (0: continuous); all must have as many")
     obs, action, mask = (np.concatenate([getattr(part, key) for part in parts]) for key in ("obs", "action", "mask"))
     return Trials(obs, action, mask, parts[0].actions)

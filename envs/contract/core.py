@@ -129,7 +129,7 @@ def any_batch_size(task: Task) -> None:
 
 
 def seed_streams(task: Task) -> None:
-    """Environment i of seed s draws theta, start and noise from SeedSequence(s + i).spawn(3), in this order."""
+    """Environment i of seed s draws theta, start and noise from children of SeedSequence(s + i), in this order."""
     batch = BatchEnv(task, 2)
     batch.reset(20)
     for i in range(2):

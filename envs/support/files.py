@@ -64,7 +64,8 @@ def write_json(file: Path, data: Any) -> None:
 
 
 def _digest(data: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+    as_read = json.loads(json.dumps(data))  # whose keys are texts, which are sorted otherwise than numbers
+    return hashlib.sha256(json.dumps(as_read, sort_keys=True).encode()).hexdigest()
 
 
 def sealed(data: dict[str, Any]) -> dict[str, Any]:

@@ -25,8 +25,8 @@ def is_outside(reference: str) -> bool:
 def find(kind: str, reference: str) -> Any:
     """Import the object that a reference names. kind: what it should be, for the error.
 
-    A file is executed once, and its folder is appended to the import path. Raises InputError if there is no such file,
-    module or name in it, or if executing it fails.
+    A file is executed once, and again if it has changed; its folder is appended to the import path. Raises InputError
+    if there is no such file, module or name in it, or if executing it fails.
     """
     where, _, name = reference.rpartition(":")
     if not where or not name:
@@ -89,7 +89,7 @@ def source(of: Any) -> Path | None:
 
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
-    name = f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
+    name = f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path) + path.read_bytes()).hexdigest()[:8]}"
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path)
         assert spec is not None

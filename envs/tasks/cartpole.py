@@ -12,7 +12,7 @@ class Cartpole(MujocoTask):
     """Joints `slider` (m) and `hinge` (rad, 0 is upright); action: the drive's force in units of its gear.
 
     Noise a step, where a task does not say otherwise: std .004 m and .1 m/s of the cart, .004 rad and .1 rad/s of the
-    pole. Reward: (1 + cos pole) / 2 times .3 + .7 exp(-8 x^2), at x m from the mark; a fallen pole ends the episode, of
+    pole. Reward: (1 + cos pole) / 2 (.3 + .7 exp(-8 x^2)), at x m from the mark; a fallen pole ends the episode, of
     at most 150 steps.
     """
 

@@ -12,7 +12,7 @@ has noise but the wheels' angles, which affect nothing. The chassis is damped ve
 grip at once.
 
 Action: steering, in units of .5 rad; torque on each wheel, in units of .03 N m. Reward: speed along the road above .6
-m/s, in units of 4 m/s, never less than 0. An episode is 10 s, and ends .35 m off the centreline, off the road.
+m/s, in units of 4 m/s, from 0 to 1. An episode is 10 s, and ends .35 m off the centreline, off the road.
 """
 
 from typing import ClassVar

@@ -65,7 +65,7 @@ def _ending(name: str, x: Column, later: dict[str, Column]) -> Column:
 def _robomimic(file: Path, data: Any) -> Table:
     """`data/demo_i` with `actions`, `obs/...` and perhaps `next_obs/...`; attributes of a demonstration are columns.
 
-    Pictures are left out. Without `next_obs`, the last observation of each demonstration is missing.
+    Pictures are left out. Without `next_obs` of all observations, the last one of each demonstration is missing.
     """
     names = sorted(data, key=natural)
     if not names:
@@ -82,7 +82,7 @@ def _robomimic(file: Path, data: Any) -> Table:
             raise InputError(f"{short[0]} of {where} has {len(arrays[short[0]])} rows; its actions have {n}")
         columns = _rows(where, arrays, n)
         later = {key[5:]: columns.pop(key) for key in list(columns) if key.startswith("next_obs/")}
-        if later:
+        if later.keys() >= {key for key in columns if key.startswith("obs/")}:
             columns = {key: np.append(x, _ending(key, x, later)[-1]) for key, x in columns.items()}
         demos.append(columns)
         attributes.append({"demo": name, **data[name].attrs})

@@ -42,7 +42,8 @@ def read_lerobot(folder: Path) -> Table:
             raise InputError(
                 f"{folder} holds {held} {what}; its meta/info.json says {promised[what]}: are files missing?"
             )
-    by_number = {entry.get("episode_index"): entry for entry in _episodes(folder)}
+    entries = [(entry.get("episode_index"), entry) for entry in _episodes(folder)]
+    by_number = {number: entry for number, entry in entries if isinstance(number, int | float)}
     if set(numbers) <= set(by_number):
         columns |= _new(of_episodes([by_number[number] for number in numbers], lengths.tolist()), columns)
     obs = tuple(name for name in columns if name.startswith("observation") and columns[name].dtype.kind == "f")
@@ -71,7 +72,7 @@ def _episodes(folder: Path) -> list[dict[str, Any]]:
     for file in sorted((folder / "meta" / "episodes").rglob("*.parquet")):
         columns = parquet_columns(file)
         tasks = [name for name in columns if name.startswith("tasks.")]
-        for i in range(len(next(iter(columns.values())))):
+        for i in range(len(next(iter(columns.values()), ()))):
             entry = {name: column[i] for name, column in columns.items() if name not in tasks}
             entries.append(entry | ({"tasks": [columns[name][i] for name in tasks]} if tasks else {}))
     return entries

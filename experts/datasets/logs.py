@@ -75,10 +75,13 @@ def read_together(
 ) -> list[Log]:
     """Several logs of the same columns, an expert's and exploration, say, with one range of actions; as `read`."""
     for what, given in (("obs", obs), ("action", action)):
-        if isinstance(given, str):
-            raise InputError(f"{what} was {given!r}; it must be a list of columns, [{given!r}]")
+        if isinstance(given, str) or not isinstance(given, Sequence):
+            right = f", [{given!r}]" if isinstance(given, str) else ""
+            raise InputError(f"{what} was {given!r}; it must be a list of columns{right}")
     roles = Roles(trial, episode, tuple(obs), tuple(action))
     files = [_files(source) for source in sources]
+    if not files:
+        raise InputError("no log was given; give one or several")
     if all(file.suffix.lower() == ".npz" for group in files for file in group) and max(map(len, files)) == 1:
         if roles != Roles(None, None, (), ()):
             raise InputError(

@@ -88,7 +88,7 @@ def spread(name: str, values: NDArray[Any], parts: Sequence[str] = ()) -> dict[s
         return {name: values}
     if values.ndim != 2:
         return {}
-    suffixes = parts if len(parts) == values.shape[1] else [str(i) for i in range(values.shape[1])]
+    suffixes = parts if len({*parts}) == len(parts) == values.shape[1] else [str(i) for i in range(values.shape[1])]
     return {f"{name}.{suffix}": values[:, i] for i, suffix in enumerate(suffixes)}
 
 

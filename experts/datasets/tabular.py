@@ -12,6 +12,7 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.datasets.table import EMPTY, EXTRA, WHOLE, Column, Table, number, spread
 
 BLOCK = 1 << 16  # rows that are converted at once
+DIGITS = 15  # that a float64 keeps of every decimal number
 
 
 def read_csv(file: Path) -> Table:
@@ -64,6 +65,8 @@ def _first_rows(file: Path, separator: str) -> tuple[list[str], list[str]]:
         raise InputError(f"{file} is no csv in UTF-8 ({error.reason} at byte {error.start})") from None
     except csv.Error as error:
         raise InputError(f"{file} cannot be read near its first line: {error}") from None
+    except OSError as error:
+        raise InputError(f"{file} cannot be read: {error.strerror}") from None
 
 
 def _blocks(file: Path, separator: str, width: int) -> Iterator[list[list[str]]]:
@@ -164,20 +167,22 @@ def _columns(arrays: dict[str, Any], parts: dict[str, list[str]] | None = None) 
 
 
 def _kept(array: Any) -> bool:
-    """Whether `_values` keep all that an arrow array holds: not of times, nor of larger whole numbers than WHOLE."""
+    """Whether `_values` keep all that an arrow array holds: not of times, nor of more digits than a float64 has."""
     from pyarrow import compute, types
 
     if types.is_integer(array.type):
         ends = compute.min_max(array).as_py().values()
         return all(end is None or abs(end) <= WHOLE for end in ends)
+    if types.is_decimal(array.type):
+        return array.type.precision <= DIGITS
     return not (types.is_timestamp(array.type) or types.is_duration(array.type))
 
 
 def _texts(array: Any) -> Column:
-    """Texts of whole numbers, or of times as whole numbers in their unit."""
+    """Texts of whole numbers and decimals, or of times as whole numbers in their unit."""
     from pyarrow import types
 
-    whole = array if types.is_integer(array.type) else array.cast("int64")
+    whole = array if types.is_integer(array.type) or types.is_decimal(array.type) else array.cast("int64")
     return np.array(["" if value is None else str(value) for value in whole.to_pylist()], object)
 
 

@@ -38,7 +38,7 @@ from deconfounded.deconf.wall import Wall
 from deconfounded.envs import registry
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support import outside
-from deconfounded.envs.support.files import write_sealed
+from deconfounded.envs.support.files import read_sealed, write_sealed
 from deconfounded.envs.tasks.bandit import Bandit
 from deconfounded.experts import policy, saved_agents
 from deconfounded.experts.agent import Agent, RandomAgent
@@ -822,6 +822,29 @@ class TestSaved:
             (tmp_path / "agent.safetensors").write_bytes(empty if "from_state" in says else b"half")
             with pytest.raises(envs.InputError, match=says):
                 deconfounded.load(tmp_path)
+
+    def test_another_agent_in_the_same_folder(self, tmp_path: Path) -> None:
+        """Its own code runs, though the former one's was imported from the same file."""
+        text = "from deconfounded.experts.agent import Agent\nclass Same(Agent):\n"
+        text += "    def act(self, obs): return obs[:, :1] * 0 + NUMBER\n"
+        text += "    def state(self): return {}, {}\n"
+        text += "    @classmethod\n    def from_state(cls, *state): return cls()\n"
+        for number in (1, 2):
+            (tmp_path / f"{number}.py").write_text(text.replace("NUMBER", str(number)))
+            agent = outside.find("agent", f"{tmp_path / f'{number}.py'}:Same")
+            saved_agents.save(agent(), tmp_path / "agent")
+            assert deconfounded.load(tmp_path / "agent").act(np.zeros((1, 1))) == number
+
+    def test_an_agent_of_a_script(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Another process has another script."""
+        monkeypatch.setattr(RandomAgent, "__module__", "__main__")
+        with pytest.raises(envs.InputError, match="RandomAgent cannot be saved; its class must be imported"):
+            saved_agents.save(RandomAgent(envs.get("bandit").action_space), tmp_path)
+
+    def test_settings_whose_keys_are_numbers(self, tmp_path: Path) -> None:
+        """JSON makes them texts, and sorts 10 before 2."""
+        write_sealed(tmp_path / "x.json", {"widths": {2: "a", 10: "b"}})
+        assert read_sealed(tmp_path / "x.json")["widths"] == {"2": "a", "10": "b"}
 
     @pytest.mark.slow
     @pytest.mark.parametrize("task", ["bandit", CONTROL])

@@ -132,6 +132,15 @@ def test_scaled_actions_are_in_the_space(low: float, high: float, dtype: str) ->
         assert space.contains(task.raw(np.array([action])))
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int8])
+def test_whole_actions_end_where_their_kind_does(kind: Any) -> None:
+    """The largest is the largest, and not what overflows to the least."""
+    low, high = np.iinfo(kind).min, np.iinfo(kind).max
+    wide = type("Wide", (Slide,), {"action_space": spaces.Box(low, high, (1,), kind)})
+    task = task_with(make=lambda self, theta: wide(theta[0]))
+    assert [task.raw(np.array([end]))[0] for end in (-1.0, 1.0)] == [low, high]
+
+
 def test_actions_of_an_infinite_range() -> None:
     huge = type("Huge", (Slide,), {"action_space": spaces.Box(-3e38, 3e38, (1,))})
     task = task_with(make=lambda self, theta: huge(theta[0]))
@@ -179,6 +188,26 @@ def test_worlds_are_closed() -> None:
     run_trials(BatchEnv(task, 4), RandomAgent(task.action_space), 2, 0)
     gc.collect()
     assert Steps.opened[0] == before
+
+
+def test_a_world_whose_closing_fails() -> None:
+    """Where an environment is replaced it does not matter; where the world is looked at, it is one line."""
+
+    class Stuck(Slide):
+        fails = False
+
+        def close(self) -> None:
+            if self.fails:
+                raise RuntimeError("the window is gone")
+
+    env = BatchEnv(task_with(make=lambda self, theta: Stuck(theta[0])), 2)
+    env.reset(0)
+    Stuck.fails = True
+    env.reset(1, {"theta": [0.5]})
+    simulator: Any = env.simulator
+    assert [each.theta for each in simulator._envs] == [0.5, 0.5]
+    with pytest.raises(envs.InputError, match=r"close of Sliding: the window is gone"):
+        envs.GymEnv(task_with(make=lambda self, theta: Stuck(theta[0])))
 
 
 def test_a_world_has_no_pictures() -> None:

@@ -1,5 +1,7 @@
 """Tasks of patches: which latent acts, and beliefs that factorise over patches."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,15 @@ def test_the_present_patch_alone_acts() -> None:
         np.testing.assert_array_equal(outcome, icy.outcome(state, action, own))
         np.testing.assert_array_equal(outcome, task.outcome(state, action, np.where(theta == own, theta, 0.3)))
     assert len(np.unique(patch)) > 2
+
+
+def test_an_open_loop_has_no_patches() -> None:
+    """It would stay in the patch that each model holds."""
+    env = envs.BatchEnv(PatchyRoad(), 2)
+    env.reset(0)
+    simulator: Any = env.simulator
+    with pytest.raises(envs.InputError, match="patchy_road has a theta for each place"):
+        simulator.rollout(env.state, np.zeros((2, 3, 2)))
 
 
 def test_one_model_serves_rows_in_several_patches() -> None:

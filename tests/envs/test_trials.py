@@ -113,6 +113,12 @@ def test_a_reset_in_the_middle_starts_a_new_trial() -> None:
     assert (batch.theta != first).all()
 
 
+def test_options_of_a_trial_are_a_dictionary() -> None:
+    whole = envs.TrialEnv(envs.make(NAME, episodes=3))
+    with pytest.raises(envs.InputError, match=r"reset options were \[1\]; they must be a dictionary"):
+        whole.reset(options=[1])  # type: ignore[arg-type]
+
+
 def test_a_seed_in_the_middle_starts_a_new_trial() -> None:
     """Whose theta is the seed's, where a reset without one goes on with the trial."""
     for env in (envs.make(NAME, episodes=3), envs.make_vec(NAME, 2, episodes=3)):

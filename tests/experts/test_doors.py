@@ -15,6 +15,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from safetensors.numpy import save_file
+from safetensors.torch import save_file as torch_save
 
 from deconfounded import envs
 from deconfounded.benchmarks import check, data
@@ -33,9 +34,9 @@ from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import datasets, policy
-from deconfounded.experts.agent import Agent, RandomAgent
+from deconfounded.experts.agent import Agent, AgentWrapper, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.trials import Trials, joined
 from tests.toys import Push
 
 OBS, ACTION = np.zeros((2, 1, 4, 3)), np.zeros((2, 1, 3, 1))
@@ -263,11 +264,45 @@ class TestTasks:
             (("x", "", 0, None), "high of latent x was None"),
             (("x", "", False, 1), "low of latent x was False"),
             (("x", "", 0, 1, "uniform", "slow"), "drift of latent x was 'slow'"),
+            ((None, "", 0, 1), "name and unit of a latent were None and ''; they must be texts"),
+            (("x", None, 0, 1), "name and unit of a latent were 'x' and None"),
         ],
     )
     def test_latents(self, given: Any, says: str) -> None:
         with pytest.raises(envs.InputError, match=says):
             envs.Latent(*given)
+
+    def test_a_task_is_made_without_arguments(self) -> None:
+        class Sized(SlipperyCartpole):
+            name = "sized"
+
+            def __init__(self, size: int) -> None:
+                self.size = size
+
+        with pytest.raises(
+            envs.InputError, match=r"task sized of .*test_doors.*missing 1 required .*; Sized\(\) must do"
+        ):
+            envs.register(Sized)
+
+    def test_two_tasks_of_one_gymnasium_id(self) -> None:
+        """It leaves underscores out."""
+        envs.register(type("Slope", (Push,), {"name": "slope_3"}))
+        with pytest.raises(envs.InputError, match=r"'slope3' of .* would be deconf/Slope3-v0, as slope_3 is; give it"):
+            envs.register(type("Slope", (Push,), {"name": "slope3"}))
+        assert "slope3" not in envs.names()
+
+    def test_seeds_of_one(self) -> None:
+        """A list of one, as a batch takes."""
+        env, resets = envs.make("bandit"), []
+        for seed in (3, [3], np.array([3]), [None]):
+            resets.append(env.reset(seed=seed)[0])  # type: ignore[arg-type]
+            assert env.np_random_seed == 3 or seed == [None]
+        for other in resets[1:3]:
+            np.testing.assert_array_equal(other, resets[0])
+
+    def test_a_first_reset_of_no_environment(self) -> None:
+        with pytest.raises(envs.InputError, match="`where` without any environment before the first reset"):
+            envs.BatchEnv(envs.get("bandit"), 2).reset(0, where=np.zeros(2, bool))
 
     @pytest.mark.parametrize("options", [{1: 1, "b": 2}, {None: 1}, {("a", 1): 1, 2: 2}])
     def test_reset_options(self, options: Any) -> None:
@@ -368,6 +403,11 @@ class TestTasks:
         with pytest.raises(envs.InputError, match=says):
             policy.load(task, tmp_path / "x.safetensors")
 
+    def test_expert_weights_that_numpy_has_no_type_for(self, tmp_path: Path) -> None:
+        torch_save({"0.weight": torch.zeros((1, 6), dtype=torch.bfloat16)}, tmp_path / "x.safetensors")
+        with pytest.raises(envs.InputError, match=r"x\.safetensors are damaged \(.*bfloat16"):
+            policy.load(envs.get("slippery_cartpole"), tmp_path / "x.safetensors")
+
 
 class TestRunTrials:
     @pytest.mark.parametrize(
@@ -388,6 +428,32 @@ class TestRunTrials:
         env = envs.BatchEnv(envs.get("bandit"), 2)
         with pytest.raises(envs.InputError, match=says):
             run_trials(env, RandomAgent(env.task.action_space), episodes, seed)
+
+    def test_a_seed_may_be_an_array(self) -> None:
+        """Of one number, or of one for each group."""
+        env, agent = envs.BatchEnv(envs.get("bandit"), 2), RandomAgent(spaces.Discrete(5))
+        for number, array in ((3, np.array(3)), ([3, 5], np.array([3, 5]))):
+            runs = [run_trials(env, agent, 1, seed).trials.sha256 for seed in (number, array)]
+            assert runs[0] == runs[1]
+
+    def test_environments_that_show_theta(self) -> None:
+        env = envs.BatchEnv(envs.get("bandit"), 2, privileged=True)
+        with pytest.raises(envs.InputError, match="run_trials was given privileged environments; agents act on"):
+            run_trials(env, RandomAgent(env.task.action_space), 1, 0)
+
+    def test_an_expert_of_other_environments(self) -> None:
+        """It would act by their theta; in a wrapper too."""
+        env, other = (envs.BatchEnv(task := envs.get("bandit"), 2) for _ in range(2))
+        for agent in (expert := ExpertAgent(other, policy.load(task)), AgentWrapper(AgentWrapper(expert))):
+            with pytest.raises(envs.InputError, match="reads the state or theta of other environments"):
+                run_trials(env, agent, 1, 0)
+
+    def test_trials_of_other_actions_do_not_join(self) -> None:
+        obs, action, mask = np.zeros((1, 1, 3, 1)), np.zeros((1, 1, 2, 1)), np.ones((1, 1, 2), bool)
+        parts = [Trials(obs, action, mask, actions) for actions in (5, 0)]
+        with pytest.raises(envs.InputError, match=r"had 0 and 5 discrete actions \(0: continuous\); all must have as"):
+            joined(parts)
+        assert len(joined([parts[0]] * 2)) == 2
 
     def test_actions_out_of_range(self) -> None:
         """They are clipped, as environments do, in trials and in what the agent observes."""

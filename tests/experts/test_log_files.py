@@ -1,5 +1,6 @@
 """Logs as other programs write them: byte-order marks, tabs, dictionaries, large numbers, rows in any order."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,52 @@ def test_demonstrations_of_different_arrays(lacking: int, tmp_path: Path) -> Non
         envs.InputError, match=r"demo_1 and demo_0 of .* hold different arrays; obs/y.0 is in one alone"
     ):
         datasets.read(file)
+
+
+@pytest.mark.parametrize("lacking", [(), ("y",), ("x", "y")])
+def test_a_last_observation_is_whole(lacking: tuple[str, ...], tmp_path: Path) -> None:
+    """Where `next_obs` lacks an observation, none is made up for the end."""
+    columns = {"x": np.arange(3.0)[:, None], "y": np.arange(4.0, 7)[:, None]}
+    file = demonstrations(tmp_path / "x.hdf5", columns, columns)
+    with pytest.importorskip("h5py").File(file, "a") as opened:
+        for demo in opened["data"].values():
+            for name in {*columns} - {*lacking}:
+                demo[f"next_obs/{name}"] = columns[name] + 1
+    last = datasets.read(file).obs[0, 0, -1]
+    np.testing.assert_array_equal(last, [3, 7] if not lacking else [2, 6])
+
+
+@pytest.mark.parametrize("kept", [2, 1])
+def test_parts_of_one_name(kept: int, tmp_path: Path) -> None:
+    """They are numbered, so that none is lost."""
+    of_lerobot(tmp_path)
+    info = json.loads((file := tmp_path / "set" / "meta" / "info.json").read_text())
+    info["features"]["observation.state"]["names"] = ["x", "y" if kept == 1 else "x"]
+    file.write_text(json.dumps(info))
+    log = datasets.read(tmp_path / "set", "vehicle")
+    assert log.units.obs == tuple(f"observation.state.{part}" for part in ("xy" if kept == 1 else "01"))
+
+
+def test_what_episodes_of_lerobot_are_not(tmp_path: Path) -> None:
+    """A number that is none is no episode's; where all lack one, nothing is known of them but their frames."""
+    of_lerobot(tmp_path, "v2.1")
+    (tmp_path / "set" / "meta" / "episodes.jsonl").write_text('{"episode_index": [0], "vehicle": "a"}\n')
+    assert len(datasets.read(tmp_path / "set").obs) == 5
+    of_lerobot(tmp_path / "later")
+    for file in (tmp_path / "later" / "set" / "meta" / "episodes").rglob("*.parquet"):
+        write_parquet(file, {"stats": [[[1.0]]] * 5})
+    assert len(datasets.read(tmp_path / "later" / "set").obs) == 5
+
+
+def test_a_csv_that_may_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = write_csv(tmp_path / "x.csv", rows())
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(envs.InputError, match=r"x\.csv cannot be read: Permission denied"):
+        datasets.read(file, **ROLES)
 
 
 def test_frames_of_lerobot_in_any_order(tmp_path: Path) -> None:

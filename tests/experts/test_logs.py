@@ -4,6 +4,7 @@ import csv
 import json
 import os
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -404,6 +405,17 @@ class TestNames:
         log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), trial="run", obs=["x"], action=["u"])
         assert log.names == tuple(map(str, names))
 
+    def test_decimals(self, tmp_path: Path) -> None:
+        """Of more digits than a float64 keeps they are different names; of less they are numbers."""
+        pyarrow = pytest.importorskip("pyarrow")
+        names = [Decimal(2**60), Decimal(2**60 + 1)]
+        made = self.named(names)
+        columns = {key: [row[key] for row in made] for key in made[0]}
+        columns["run"] = pyarrow.array(columns["run"], pyarrow.decimal128(38, 0))
+        columns["x"] = pyarrow.array([Decimal(f"{x:.2f}") for x in columns["x"]], pyarrow.decimal128(9, 2))
+        log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), trial="run", obs=["x"], action=["u"])
+        assert log.names == tuple(map(str, names))
+
     @pytest.mark.parametrize(("unit", "per_second"), [("s", 1), ("ms", 10**3), ("us", 10**6), ("ns", 10**9)])
     def test_times_are_in_seconds(self, unit: str, per_second: int, tmp_path: Path) -> None:
         """From the first of a file on, and durations from their least, whatever unit they are kept in."""
@@ -541,6 +553,7 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     "no trial": ({}, {"vehicle": ""}, "'vehicle' of .* is empty in row 3"),
     "nothing said": ({"obs": []}, {}, "does not say which columns are obs; give --obs, some of vehicle, lap"),
     "no episode": ({"trial": None, "episode": None}, {}, "does not say where an episode begins; give --episode or"),
+    "no list": ({"obs": None}, {}, "obs was None; it must be a list of columns$"),
     "one text": ({"obs": "speed x"}, {}, r"obs was 'speed x'; it must be a list of columns, \['speed x'\]"),
     "an action that is the trial": ({"action": ["vehicle"]}, {}, "action 'vehicle' of .* is what a trial or an"),
     "all used": ({"obs": ["thr*", "lap*"]}, {}, "no column of .* is left for obs, beside the trial"),
@@ -560,6 +573,10 @@ class TestBadInput:
     def test_no_path(self, source: Any) -> None:
         with pytest.raises(envs.InputError, match=r"a log was .*; it must be a \.csv, \.parquet"):
             datasets.read(source, **ROLES)
+
+    def test_no_logs(self) -> None:
+        with pytest.raises(envs.InputError, match="no log was given; give one or several"):
+            datasets.read_together([], **ROLES)
 
     def test_actions_of_the_row_before(self, tmp_path: Path) -> None:
         made = rows(AFTER)
