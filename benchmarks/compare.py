@@ -38,7 +38,10 @@ def main() -> None:
     every = [record for given in dict.fromkeys(args.results) for record in read(given)]
     if args.protocol is not None:
         check_names("protocol", [args.protocol], list(protocols.PROTOCOLS))
-        every = [record for record in every if record.get(records.NAME, protocols.STANDARD) == args.protocol]
+        of = records.grouped(every, lambda record: record.get(records.NAME, protocols.STANDARD))
+        if args.protocol not in of:
+            raise envs.InputError(f"--protocol was {args.protocol}; the records given are of {' and '.join(of)}")
+        every = of[args.protocol]
     scores = comparison.gathered(every, against)
     own = list(dict.fromkeys(records.named(record) for record in every))
     methods = [name for name in scores if name in own and (name not in against or len(against) > 1)]

@@ -60,6 +60,7 @@ class Refit:
         import numpy as np
 
         from deconfounded.benchmarks.engine import progress
+        from deconfounded.deconf.diagnosis.judgement import check_finite
         from deconfounded.deconf.diagnosis.measures import measure
         from deconfounded.experts.trials import Trials
 
@@ -73,6 +74,7 @@ class Refit:
         rng = np.random.default_rng(self.seed).spawn(self.refits)[self.index]
         explore = None if self.explore is None else Trials.load(self.explore)
         findings = measure(Trials.load(self.trials), explore, self.amounts, rng, tell)
+        check_finite(findings)
         write_json(self.file, findings._asdict())
         return f"measured in {time.time() - start:.0f} s"
 

@@ -82,6 +82,8 @@ def changed(settings: Preset, changes: Sequence[str]) -> Preset:
         own = bool(method) and bool(METHODS[method].reference)
         new = {name: _parsed(key, value, kinds, values[name], own)}
         settings = settings.configured(method, **new) if method else replace(settings, **new)
+    for method in {whose(change) for change in changes} - {""}:
+        METHODS[method].config(settings.configs[method])  # raises InputError for values that do not fit each other
     return settings
 
 

@@ -78,13 +78,18 @@ class Provider:
                 self._vectors.append(Vector(context, seed, n, int(self.rngs[seed].integers(2**31))))
                 return len(self._vectors) - 1
             case "reset":
-                return self._vectors[what[0]].reset()
+                return self._vector(what[0]).reset()
             case "step":
-                return self._vectors[what[0]].step(what[1])
+                return self._vector(what[0]).step(what[1])
             case "acting theta":
                 return context.task.encode_theta(context.env.theta)
             case _:
                 return context.env, context.expert
+
+    def _vector(self, number: Any) -> "Vector":
+        if not isinstance(number, int) or not 0 <= number < len(self._vectors):
+            raise envs.InputError(f"it asked for environments number {number!r}; it was given {len(self._vectors)}")
+        return self._vectors[number]
 
     @cached_property
     def _theta(self) -> Array:

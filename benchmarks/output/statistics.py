@@ -1,8 +1,8 @@
 """What scores of several seeds and tasks come to.
 
 After Agarwal et al. 2021, Deep RL at the edge of the statistical precipice. `Runs` are scores by task, each an array of
-its seeds [S]. A run is a seed of a task; tasks may differ in S. Intervals are of 95%. Over tasks they are percentile
-intervals of the stratified bootstrap: seeds are drawn anew within each task.
+its seeds [S]. A run is a seed of a task; tasks may differ in S. Intervals are of 95%: percentile intervals of the
+stratified bootstrap, which draws seeds anew within each task, but where a function says otherwise.
 """
 
 from collections.abc import Callable, Mapping

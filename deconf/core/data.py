@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.rollout import of_steps
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.trials import Trials, check_trials
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""
@@ -37,6 +37,16 @@ def trials_of(source: Source) -> Trials:
     if not isinstance(trials, Trials):
         raise InputError(f"trials were {trials!r}; they must be Trials, or a function that returns Trials")
     return trials
+
+
+def trials_and(what: str, given: Any) -> tuple[Trials, Any]:
+    """The trials that a function returned, with an array beside them. Raises InputError for anything else.
+
+    what: the array, for the error.
+    """
+    if not isinstance(given, Sequence) or len(given) != 2 or not isinstance(given[0], Trials):
+        raise InputError(f"roll-outs were {type(given).__name__}; they must be Trials and {what}, as a tuple")
+    return given[0], given[1]
 
 
 def stacked(of_seeds: list[Tensor]) -> Tensor:
@@ -91,7 +101,7 @@ class Signature:
 
         more: exploration, whose observations may be others than an expert's.
         """
-        trials = trials_of(trials)
+        check_trials("training", trials)
         binary = all(np.isin(part.obs, (0, 1)).all() for part in (trials, *more))
         return Signature(trials.obs.shape[-1], trials.action.shape[-1], trials.actions, binary)
 
@@ -162,7 +172,16 @@ def joined_trials(left: Tensor, right: Tensor) -> Tensor:
 
 
 def joined_theta(trials: Trials, theta: Array, seeds: int, device: str | torch.device = "cpu") -> Tensor:
-    """The theta [S, B, T, F] of each step of `Batch.of`, given that of episodes [B, E, F] or of steps [B, E, T, F]."""
+    """The theta [S, B, T, F] of each step of `Batch.of`, given that of episodes [B, E, F] or of steps [B, E, T, F].
+
+    Raises InputError for theta of another shape, or that is not finite.
+    """
+    theta, steps = np.asarray(theta, float), trials.mask.shape
+    if theta.ndim not in (3, 4) or theta.shape[: theta.ndim - 1] != steps[: theta.ndim - 1]:
+        right = f"{(*steps[:2], 'F')} of episodes, or {(*steps, 'F')} of steps".replace("'", "")
+        raise InputError(f"theta of trials had shape {theta.shape}; it must be {right}")
+    if not np.isfinite(theta).all():
+        raise InputError("theta of trials held NaN or infinity; it must be finite")
     return joined(of_steps(theta, trials.mask.shape[2]), trials.mask, seeds, device)
 
 
@@ -181,7 +200,7 @@ class Batch:
     @staticmethod
     def of(trials: Trials, seeds: int, device: str | torch.device = "cpu") -> "Batch":
         """Join the episodes of each trial; trials are in `seeds` equal groups, one after another."""
-        trials = trials_of(trials)
+        check_trials("training", trials)
         if len(trials) % seeds:
             right = "it must be a multiple of the number of seeds"
             raise InputError(f"{len(trials)} trials were given for {seeds} seeds; {right}")

@@ -7,7 +7,11 @@ from deconfounded.envs.support.errors import InputError
 
 LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
 SHARES = ("shortest", "random_share", "warm_up", "anywhere", "gamma")
-MOST = dict.fromkeys(SHARES, math.nextafter(1, 2)) | {"dropout": 1}  # below which settings of these names must be
+MOST = dict.fromkeys(SHARES, math.nextafter(1, 2)) | {
+    "dropout": 1,
+    "held_out": 1,
+}  # below which settings of these names must be
+LEAST = {"ridge": 1e-9}  # of settings without which a regression may have no solution
 HEAVY = 30.0  # excess kurtosis, of labels and columns: a normal distribution has 0, Laplace's 3
 LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker
 
@@ -28,10 +32,10 @@ class Configuration:
     def __post_init__(self) -> None:
         for name, kind in get_type_hints(type(self)).items():
             value, kinds = getattr(self, name), get_args(kind) or (kind,)
-            least = 0 if float in kinds or name.endswith(("updates", "grid")) else 1
+            least = LEAST.get(name, 0 if float in kinds or name.endswith(("updates", "grid")) else 1)
             most = MOST.get(name, math.inf)
             if not fits(value, kinds, least, most):
                 right = " or ".join(getattr(kind, "__name__", repr(kind)) for kind in kinds)
-                limit = f", from {least} up" if {int, float} & set(kinds) else ""
+                limit = f", from {least:g} up" if {int, float} & set(kinds) else ""
                 limit += f", below {most:g}" if most == 1 else ", at most 1" if most < math.inf else ""
                 raise InputError(f"{name} of {type(self).__name__} was {value!r}; it must be {right}{limit}")

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from deconfounded.deconf.core.data import Batch
+from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.diagnosis import fits, labels, state
 from deconfounded.deconf.diagnosis.held_out import Report
 from deconfounded.deconf.diagnosis.judgement import judge
@@ -22,7 +23,7 @@ VERSION = 15  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)
-class DiagnoseConfig:
+class DiagnoseConfig(Configuration):
     """refits: independent splits of the trials; an interval is their range. least: the number of trials required."""
 
     refits: int = 3

@@ -18,7 +18,7 @@ MENDED = 4.0  # excess kurtosis
 HIDDEN, FITTED, RIDGE = 128, 20_000, 1e-4  # random features; steps, at most; of standardised features
 FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hidden, left what looked like it
 CLIP = 4.0  # usual deviations
-ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
+ALIKE, APART, LONGEST = 24, 10, 1500  # trials in which alike observations are looked for; rows apart; of a trial
 
 
 @dataclass(frozen=True)
@@ -179,6 +179,7 @@ def lasting(trials: Trials, steps: Steps) -> tuple[float, float, float] | None:
     both = trials.mask[:, :, 1:] & trials.mask[:, :, :-1]
     pairs: tuple[list[Array], list[Array]] = [], []
     for rows in _by_trial(steps.trial)[:ALIKE]:
+        rows = rows[:LONGEST]  # the time grows with its square
         distance = np.square(inputs[rows][:, None] - inputs[rows]).sum(-1)
         near = np.abs(np.subtract.outer(np.arange(len(rows)), np.arange(len(rows)))) < APART
         nearest = np.where(near, np.inf, distance).argmin(1)

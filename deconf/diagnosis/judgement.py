@@ -64,13 +64,20 @@ def judge(
     return replace(diagnosis, agreeing=len(alone) - len(dissent), refits=len(refits), dissenting=tuple(dissenting))
 
 
+def check_finite(findings: Findings) -> None:
+    """Raises InputError if a figure is not finite."""
+    for key, value in findings._asdict().items():
+        if value is not None and not np.isfinite(value):
+            raise InputError(f"learning failed: {key} is {value}; are there outliers, or scales that differ a lot?")
+
+
 def _figures(refits: Sequence[Findings]) -> dict[str, Figure]:
     """Figures of Diagnosis; those of traits only if all refits have them."""
+    for refit in refits:
+        check_finite(refit)
     figures = {}
     for key, column in zip(Findings._fields, zip(*refits, strict=True), strict=True):
         values = [value for value in column if value is not None]
-        if not np.isfinite(values).all():
-            raise InputError(f"learning failed: {key} is {values}; are there outliers, or scales that differ a lot?")
         if len(values) == len(refits):
             figures[key] = Figure.of(values)
     figures["gap"] = Figure.of([refit.latent - refit.naive for refit in refits])

@@ -19,7 +19,7 @@ from deconfounded.deconf.core import termination
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.data import Batch, Draws, Signature, take
 from deconfounded.deconf.core.drift import episodes_of
-from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE
+from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE, Configuration
 from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
 from deconfounded.deconf.diagnosis.fits import Steps, copies
@@ -46,7 +46,7 @@ RESOLVED = 0.5  # correlation of halves of trials that must be visible, if trial
 
 
 @dataclass(frozen=True)
-class Amounts:
+class Amounts(Configuration):
     """Hyperparameters of one split; offline: of Eq. (7); exploring: of Algorithm 1.
 
     candidates: number of latents in rollouts, drawn from the data's. rollouts: trials of each rollout in the learned

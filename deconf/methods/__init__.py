@@ -36,7 +36,7 @@ METHODS = {
     "expert": "references:expert",
     "random": "references:random",
 }
-"""In the order of tables and of a run: the longest first."""
+"""In the order of tables."""
 
 
 def load(name: str) -> Callable[[Given], Agent]:

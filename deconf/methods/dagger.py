@@ -23,7 +23,17 @@ from torch import Tensor, nn
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, joined_trials, take, take_steps
+from deconfounded.deconf.core.data import (
+    Batch,
+    Draws,
+    Rngs,
+    Signature,
+    as_generators,
+    joined_trials,
+    take,
+    take_steps,
+    trials_and,
+)
 from deconfounded.deconf.core.drift import split_episodes
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -116,7 +126,7 @@ def labelled(
     query: Query, behaviour: Agent | None, seeds: int, drifts: bool, device: str
 ) -> tuple[Signature, Batch, Tensor]:
     """Roll-outs, and labels [S, B, T, A] aligned with their actions; where theta drifts, each episode is a trial."""
-    trials, labels = query(behaviour)
+    trials, labels = trials_and("labels [B, E, T, A]", query(behaviour))
     unit = split_episodes if drifts else lambda trials: trials
     relabelled = Trials(trials.obs, labels, trials.mask, trials.actions)
     batch, label = (Batch.of(unit(x), seeds, device) for x in (trials, relabelled))

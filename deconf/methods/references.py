@@ -1,7 +1,7 @@
 """Reference policies, without learning, on the environments that evaluation steps.
 
-The exact policies hold the posterior of theta on a grid, or by particles where it has more than two
-latents: `conditional` takes its own actions for evidence, Eq. (2), and
+The exact policies hold the posterior of theta on a grid, or by particles where it has more than two latents, unless
+each has a grid of its own, as those of patches have: `conditional` takes its own actions for evidence, Eq. (2), and
 `interventional` does not, Eq. (5).
 """
 

@@ -16,7 +16,16 @@ from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joined_theta, joined_trials, take
+from deconfounded.deconf.core.data import (
+    Batch,
+    Draws,
+    Rngs,
+    as_generators,
+    joined_theta,
+    joined_trials,
+    take,
+    trials_and,
+)
 from deconfounded.deconf.core.gru import GruMemory
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
@@ -34,7 +43,7 @@ from deconfounded.experts.trials import Trials
 Explore = Callable[[Agent | None], tuple[Trials, Array]]
 """Rolls out a behaviour (None: uniformly random actions) under fresh thetas, as many trials for each seed.
 
-Returns trials, and the encoded theta [B, E, F] of their episodes."""
+Returns trials, and the encoded theta of their episodes [B, E, F], or of their steps [B, E, T, F]."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +120,8 @@ def train(
 ) -> RmaAgent:
     """Clone the teacher, then train the student on its own roll-outs.
 
-    trials: of the expert, in as many equal groups as there are generators in rng; theta [B, E, F] of their episodes.
+    trials: of the expert, in as many equal groups as there are generators in rng; theta: of their episodes [B, E, F],
+    or of their steps [B, E, T, F].
     """
     rngs, monitor = as_generators(rng), monitor or Monitor()
     draws = Draws(rngs, config.device)
@@ -128,7 +138,7 @@ def train(
     if before := checkpoint.load():
         begin, data, targets = before["round"], Batch(*before["data"]), before["targets"]
     for i in range(begin, config.rounds):
-        own, thetas = explore(agent if i > 0 else None)
+        own, thetas = trials_and("their theta [B, E, F]", explore(agent if i > 0 else None))
         new, target = Batch.of(own, len(rngs), config.device), joined_theta(own, thetas, len(rngs), config.device)
         data, targets = (new, target) if data is None else (data.joined(new), joined_trials(targets, target))
         for j in range(passes[i]):

@@ -387,7 +387,7 @@ class TestComparison:
             f"note: runs of {kind}" for kind in kinds
         ]
 
-    def test_bad_input(self, tmp_path: Path) -> None:
+    def test_bad_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
         with pytest.raises(InputError, match="two records of mine on curling with seed 0"):
             comparison.gathered(twice, [])
@@ -395,6 +395,10 @@ class TestComparison:
             comparison.gathered(twice[:1], ["nobody"])
         with pytest.raises(InputError, match="holds no records"):
             compare.read(tmp_path)
+        records.write(tmp_path, twice[:1])
+        monkeypatch.setattr("sys.argv", ["compare", str(tmp_path / "curling.jsonl"), "--protocol", "scarce"])
+        with pytest.raises(InputError, match="--protocol was scarce; the records given are of standard"):
+            compare.main()
 
 
 def test_records_name_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

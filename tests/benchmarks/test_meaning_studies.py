@@ -61,6 +61,17 @@ def test_each_split_has_a_generator_of_its_own(tmp_path: Path, monkeypatch: pyte
     assert json.loads((tmp_path / "jobs" / "refit-1.json").read_text()) == {"draw": drawn[1]}
 
 
+def test_a_split_whose_learning_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not kept, and its error says what may help."""
+    trials = run_trials(envs.BatchEnv(PUSH, 4), RandomAgent(PUSH.action_space), 2, 0).trials
+    trials.save(tmp_path / "trials.npz")
+    figures = measures.Findings(**dict.fromkeys(measures.Findings._fields, 1.0))._replace(naive=float("nan"))
+    monkeypatch.setattr(measures, "measure", lambda *_: figures)
+    with pytest.raises(envs.InputError, match="learning failed: naive is nan; are there outliers, or scales"):
+        diagnose.Refit(tmp_path / "trials.npz", None, Amounts(), 0, 5, 3, tmp_path).run()
+    assert not (tmp_path / "jobs").exists()
+
+
 def diagnosis(verdict: Any, tier: int | None, advice: Next = EXPLORE) -> Diagnosis:
     return Diagnosis(verdict, {"gap": Figure.of([0.4])}, (), tier, advice)
 

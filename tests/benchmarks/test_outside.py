@@ -797,6 +797,9 @@ def test_environments_of_no_seed(seed: Any) -> None:
     provider = Provider(Context(envs.get(CONTROL), tiny_preset(), [7]), ["exploration"], [np.random.default_rng(0)])
     with pytest.raises(envs.InputError, match=f"asked for environments of seed {seed!r}; it has 1, numbered from 0"):
         provider("environments", seed, 4)
+    for kind, rest in (("reset", ()), ("step", (np.zeros((4, 1)),))):
+        with pytest.raises(envs.InputError, match=f"it asked for environments number {seed!r}; it was given 0"):
+            provider(kind, seed, *rest)
 
 
 class TestSaved:

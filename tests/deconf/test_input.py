@@ -8,21 +8,39 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
+from deconfounded.benchmarks.engine import presets
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.nets import Scales
+from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
+from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.method import uses
-from deconfounded.deconf.methods import deconfounded, deconfounded_mean
+from deconfounded.deconf.methods import (
+    dagger,
+    deconfounded,
+    deconfounded_mean,
+    deconfounded_offline,
+    dml_il,
+    dpt,
+    memoryless_bc,
+    rma,
+)
+from deconfounded.deconf.methods.dagger import DaggerConfig
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.deconfounded_mean import MeanConfig
-from deconfounded.deconf.methods.deconfounded_offline import starts_of
+from deconfounded.deconf.methods.deconfounded_offline import OfflineConfig, starts_of
+from deconfounded.deconf.methods.dml_il import DmlConfig
+from deconfounded.deconf.methods.dpt import DptConfig
 from deconfounded.deconf.methods.flow_bc import FlowConfig
+from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.naive_dropout import DropoutConfig
+from deconfounded.deconf.methods.palr import PalrConfig
+from deconfounded.deconf.methods.rma import RmaConfig
 from deconfounded.deconf.particles import Particles
 from deconfounded.envs.streams import Streams
-from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
+from deconfounded.experts.agent import Agent, AgentWrapper, ExpertAgent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials
 from tests.deconf.test_particles import Three, expert
@@ -80,6 +98,9 @@ def test_steps_that_an_agent_refuses(agents: dict[str, Agent], task: str, change
         (FlowConfig, {"executed": 9}, "executed of FlowConfig was 9; it must be at most ahead, 8"),
         (DropoutConfig, {"dropout": 1.0}, "it must be float, from 0 up, below 1"),
         (DeconfoundedConfig, {"shortest": 3.0}, "it must be float, from 0 up, at most 1"),
+        (PalrConfig, {"ridge": 0.0}, "ridge of PalrConfig was 0.0; it must be float, from 1e-09 up"),
+        (DiagnoseConfig, {"refits": 0}, "refits of DiagnoseConfig was 0; it must be int, from 1 up"),
+        (Amounts, {"held_out": 1.0}, "held_out of Amounts was 1.0; it must be float, from 0 up, below 1"),
     ],
 )
 def test_settings_that_do_not_fit(config: Any, values: Any, says: str) -> None:
@@ -114,6 +135,66 @@ class Plain:
 def test_declarations_that_no_run_could_use(declared: dict[str, Any], says: str) -> None:
     with pytest.raises(envs.InputError, match=f"^a method declares {says}"):
         uses("demonstrations", **declared)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (
+            "deconfounded.random_share=1.5",
+            "random_share of DeconfoundedConfig was 1.5; it must be float, from 0 up, at",
+        ),
+        ("flow_bc.executed=99", "executed of FlowConfig was 99; it must be at most ahead, 8"),
+    ],
+)
+def test_settings_that_a_command_refuses(change: str, says: str) -> None:
+    """Before a run makes anything; two that fit each other alone may be given in any order."""
+    settings = presets.preset("default", envs.get(CONTROL), "cpu")
+    with pytest.raises(envs.InputError, match=says):
+        presets.changed(settings, [change])
+    presets.changed(settings, ["flow_bc.executed=99", "flow_bc.ahead=99"])
+
+
+TRIALS = Trials(np.zeros((4, 2, 9, 2)), np.zeros((4, 2, 8, 1)), np.ones((4, 2, 8), bool))
+
+
+@pytest.mark.parametrize(
+    "train",
+    [
+        lambda given: memoryless_bc.train(given, MemorylessConfig(updates=1), np.random.default_rng(0)),
+        lambda given: deconfounded_offline.train(given, OfflineConfig(), np.random.default_rng(0)),
+        lambda given: dml_il.train(given, DmlConfig(), np.random.default_rng(0)),
+    ],
+)
+def test_one_set_of_trials(train: Any) -> None:
+    """A function gives other trials each time, so that sizes and data might be of two sets."""
+    with pytest.raises(envs.InputError, match="training was given a function; it must be Trials"):
+        train(lambda: TRIALS)
+
+
+@pytest.mark.parametrize("answer", [None, TRIALS, (TRIALS,), (TRIALS.obs, TRIALS.action)])
+def test_rollouts_and_what_is_beside_them(answer: Any) -> None:
+    rng = np.random.default_rng(0)
+    for train, config, what in ((dagger.train, DaggerConfig(), "labels"), (dpt.train, DptConfig(), "labels")):
+        with pytest.raises(envs.InputError, match=f"roll-outs were .*; they must be Trials and {what}"):
+            train(lambda behaviour: answer, config, rng)  # type: ignore[operator]
+    tiny = RmaConfig(teacher_updates=1, rounds=1)
+    with pytest.raises(envs.InputError, match=r"roll-outs were .*; they must be Trials and their theta"):
+        rma.train(TRIALS, np.zeros((4, 2, 1)), lambda behaviour: answer, tiny, rng)
+
+
+@pytest.mark.parametrize(
+    ("theta", "says"),
+    [
+        (np.zeros((4, 1)), r"had shape \(4, 1\); it must be \(4, 2, F\) of episodes, or \(4, 2, 8, F\) of steps"),
+        (np.zeros((3, 2, 1)), r"had shape \(3, 2, 1\)"),
+        (np.zeros((4, 2, 9, 1)), r"had shape \(4, 2, 9, 1\)"),
+        (np.full((4, 2, 1), np.nan), "held NaN or infinity; it must be finite"),
+    ],
+)
+def test_theta_of_other_trials(theta: Any, says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"theta of trials {says}"):
+        memoryless_bc.train(TRIALS, MemorylessConfig(updates=1), np.random.default_rng(0), theta)
 
 
 def test_shares_of_one() -> None:
@@ -176,8 +257,9 @@ def test_the_expert_of_other_environments() -> None:
     task = envs.get(CONTROL)
     env, other = envs.BatchEnv(task, 2), envs.BatchEnv(task, 2)
     agent = ExpertAgent(other, expert(task))
-    with pytest.raises(envs.InputError, match="ExpertAgent reads the state or theta of other environments"):
-        run_trials(env, agent, 1, 0)
+    for given in (agent, AgentWrapper(AgentWrapper(agent))):
+        with pytest.raises(envs.InputError, match="reads the state or theta of other environments"):
+            run_trials(env, given, 1, 0)
 
 
 class TestLikelihoods:

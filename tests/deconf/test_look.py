@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
 from deconfounded.deconf.diagnosis import columns, diagnose, fits
+from deconfounded.deconf.diagnosis import look as look_module
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -82,6 +84,29 @@ def test_trials_without_a_step() -> None:
     obs[5] += 1000
     remarks = look(changed(trials, obs=obs, mask=mask))
     assert any(remark.kind == "outlier" and "Trial 5 is unlike" in remark.text for remark in remarks)
+
+
+def test_trials_that_are_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Enough of them are looked at, by their beginnings, to see how they differ."""
+    trials = driven()
+    whole = look(trials)
+    monkeypatch.setattr(look_module, "MOST", B * E * T // 3)
+    part = look_module._part(Log.of(trials, ""))
+    assert part.mask.shape[:2] == (look_module.FEWEST, E)
+    assert part.mask.shape[2] == T // 2
+    for remarks in (whole, look(trials)):
+        assert said(remarks, "dynamics").startswith("Trials differ in their dynamics")
+
+
+def test_memory_of_long_trials() -> None:
+    """It does not grow with the square of their length: that would be 288 MB here."""
+    rng = np.random.default_rng(0)
+    trials = Trials(rng.normal(size=(2, 1, 3001, 4)), rng.uniform(-1, 1, (2, 1, 3000, 1)), np.ones((2, 1, 3000), bool))
+    tracemalloc.start()
+    fits.lasting(trials, fits.Steps.of(trials))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 200e6
 
 
 def odd(remarks: list[Remark]) -> list[str]:
