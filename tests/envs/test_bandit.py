@@ -58,6 +58,13 @@ def test_exact_policies(env: envs.BatchEnv, who: str, pulls: float, curve: list[
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("arm", [-1, 5, 2.5])
+def test_there_are_five_arms(env: envs.BatchEnv, arm: float) -> None:
+    env.reset(0)
+    with pytest.raises(envs.InputError, match="0 to 4"):
+        env.step(np.full((env.n, 1), arm))
+
+
 def test_payouts(env: envs.BatchEnv) -> None:
     """Eq. (4): 3/4 for the best arm, 1/4 for others, 4 standard errors."""
     trials = run_trials(env, ExpertAgent(env, policy.load(env.task)), 1, seed=6).trials

@@ -15,12 +15,15 @@ from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.forked_path import ForkedPath
+from deconfounded.envs.tasks.loaded_arm import INNER, OUTER
+from deconfounded.envs.tasks.windy_drone import HEIGHT
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import run_trials
 from tests import toys
 
+UPRIGHT = (0.0, 0.0, 0.75, 1.0, 0.0, 0.0, 0.0)  # place and rotation of an ant
 TASKS = envs.names()
 PHYSICAL = [name for name in TASKS if isinstance(envs.get(name), MujocoTask)]
 
@@ -224,6 +227,46 @@ def test_servos_reach_the_speed_that_is_asked_for(name: str, joint: str, velocit
     assert task.qvel(state, joint)[0] == pytest.approx(velocity, rel=0.05)
 
 
+BELL = np.exp(-0.5)
+REWARDS: tuple[tuple[str, dict[str, Any], list[float], list[float], float], ...] = (  # by the formula of a task's page
+    ("tilted_cartpole", {"slider": 0.25, "hinge": 0.3}, [1], [0], (1 + np.cos(0.3)) / 2 * (0.3 + 0.7 * BELL)),
+    ("slippery_cartpole", {"slider": -0.25, "hinge": -0.3}, [0], [0.2], (1 + np.cos(0.3)) / 2 * (0.3 + 0.7 * BELL)),
+    ("heavy_payload", {"load": 1.2, "target": 1.0}, [1], [0.2], 0.8 * BELL + 0.2 * np.exp(-0.2)),
+    ("dragged_sled", {"sled": 0.8, "target": 1.0}, [1], [0.2], 0.8 * BELL + 0.2 * np.exp(-0.2)),
+    ("slippery_walker", {"rootx": -0.06, "rooty": 0.2}, [0.5] * 6, [0.2, 0.12], 0.1 + 0.9 * np.exp(-1) - 0.025),
+    ("hidden_goal", {"x": 0.0, "y": 0.7}, [1, 1], [0], 0.8 * BELL + 0.2 * np.exp(-0.3)),
+    ("icy_stop", {"line": 5.25, "car": 5.0}, [1], [0.1], 0.9 * BELL + 0.1 * np.exp(-0.25 / 3)),
+    ("icy_stop", {"line": 5.0, "car": 5.25}, [-1], [0.1], 0.9 * BELL + 0.1 * np.exp(-0.25 / 3)),
+    ("weak_thruster", {"height": -0.25}, [1], [15], 0.9 * BELL + 0.1 * np.exp(-0.25 / 3)),
+    ("cheetah_speed", {"rootx": (0.0, 1.4)}, [0.5] * 6, [2.0], 0.8 * BELL + 0.2 * np.exp(-0.6) - 0.025),
+    ("ant_goal", {"root": UPRIGHT}, [0.5] * 8, [0.3, 0.4], 0.3 + 0.4 * np.exp(-0.125) - 0.0125),
+    # an engine that is off costs nothing, and half of the main one a quarter of all of it:
+    ("swapped_lander", {"x": 0.3, "z": 0.4}, [-1, 0], [0], 0.2 * np.exp(-0.25) + 0.8 * BELL),
+    ("swapped_lander", {"x": 0.3, "z": 0.4}, [0, 0], [1], 0.2 * np.exp(-0.25) + 0.8 * BELL - 0.05 / 8),
+    ("swapped_lander", {"pitch": 0.5}, [1, -1], [1], (1 + np.cos(0.5)) / 2 - 0.05),
+    ("windy_drone", {"flight": (0.0, 0.25, HEIGHT, 1, 0, 0, 0)}, [0] * 4, [4, 0], 0.7 * BELL + 0.3 * np.exp(-0.25)),
+    ("loaded_arm", {"target_x": INNER + OUTER, "target_y": 0.05}, [1, 1], [0] * 4, BELL),
+    ("lame_ant", {"root": (0.15, 0.2, *UPRIGHT[2:])}, [1] * 8, [1] * 4, BELL),
+    ("drifting_raft", {"mark_x": 2.0, "x": 2.0, "y": 0.3}, [1, 1], [0] * 6, 0.8 * BELL + 0.2 * np.exp(-0.3)),
+)
+
+
+@pytest.mark.parametrize(("name", "joints", "action", "theta", "reward"), REWARDS)
+def test_rewards_by_hand(
+    name: str, joints: dict[str, Any], action: list[float], theta: list[float], reward: float
+) -> None:
+    """Of the state after a step alone: the one before is far from any mark."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    there = {
+        joint: value if isinstance(value, tuple) and len(value) == 2 else (value, 0.0)
+        for joint, value in joints.items()
+    }
+    after, before = task.state(**there), task.state()
+    made = task.reward(before, np.array([action], float), after, np.array([theta], float))
+    np.testing.assert_allclose(made, [reward], atol=1e-9)
+
+
 ENDS = (  # task, joints, and whether an episode ends there, as the task's page has it
     ("tilted_cartpole", {"hinge": ([1.1, -1.1, 1.3, -1.3], 0.0)}, [False, False, True, True]),
     ("slippery_walker", {"rooty": ([0.55, -0.55, 0.65, -0.65], 0.0)}, [False, False, True, True]),
@@ -309,6 +352,18 @@ def test_bearings_point_to_the_goal() -> None:
     state, goals = task.state(root=(place, 0)), np.array([[0.5, 1.0], [-1.0, 0.0]])
     seen = task.observe(task.sense(state, goals, np.zeros((2, 3))))[:, -3:]
     np.testing.assert_allclose(seen, [[1.0, 0.0, 1.0], [1.5, -1.0, 0.0]], atol=1e-9)
+
+
+def test_errors_of_bearings_are_their_own() -> None:
+    """And not those of the body, which is observed: they would show the goal."""
+    task, rng = envs.get("ant_goal"), np.random.default_rng(0)
+    assert isinstance(task, MujocoTask)
+    state, theta = task.state(root=(UPRIGHT, 0.0)), np.zeros((2, 2))
+    noise = rng.standard_normal((2, task.noise.size + task.readings))
+    noise[1, -3:] = noise[0, -3:]
+    first, second = task.sense(np.repeat(state, 2, 0), theta, noise)[:, -3:]
+    np.testing.assert_array_equal(first, second)
+    assert (task.sense(state.copy(), theta[:1], noise[:1] + 1)[0, -3:] != first).all()
 
 
 def test_bearings_have_the_density_of_their_noise() -> None:
