@@ -6,6 +6,7 @@ foreign.json has a row each. It needs `pip install .[foreign]`; interrupted, it 
 
 import json
 from collections.abc import Callable
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,12 @@ from deconfounded.benchmarks.studies.foreign.cases import CASES, EXPLORED, SEED,
 from deconfounded.benchmarks.studies.foreign.report import KEPT
 from deconfounded.benchmarks.studies.foreign.world import (
     LinearFilter,
-    Scorer,
     WorldExpert,
     demonstrations,
     explorer,
+    roll_out,
     task,
+    thetas,
 )
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.files import write_json
@@ -42,18 +44,16 @@ class Bench:
         self.case, self.file = case, folder / "measured.json"
         made = json.loads(self.file.read_bytes()) if self.file.is_file() else {"returns": {}, "method_versions": {}}
         self.made: dict[str, dict[str, Any]] = made
-        self._scorer: Scorer | None = None
-        self._demonstrated: Rollout | None = None
 
-    @property
-    def scorer(self) -> Scorer:
-        self._scorer = self._scorer or Scorer(self.case.world, SCORED, SCORING)
-        return self._scorer
+    @cached_property
+    def theta(self) -> Array:
+        """Theta [N, L] of the trials in which agents are scored."""
+        return thetas(self.case.world, SCORED, SCORING)
 
-    @property
+    @cached_property
     def demonstrated(self) -> Rollout:
-        self._demonstrated = self._demonstrated or demonstrations(self.case.world, TRIALS, SEED)
-        return self._demonstrated
+        """The expert's trials."""
+        return demonstrations(self.case.world, TRIALS, SEED)
 
     def encoded(self, theta: Array) -> Array:
         """Of about unit scale."""
@@ -67,7 +67,7 @@ class Bench:
             agent = (AGENTS | LATER)[name](self)
             if agent is None:
                 return "none"
-            returns[name] = self.scorer.returns(agent).mean(0).tolist()
+            returns[name] = roll_out(self.case.world, agent, self.theta, SCORING).returns.mean(0).tolist()
             if name in METHODS:
                 versions[name] = METHODS[name].version
             write_json(self.file, self.made)
@@ -94,7 +94,7 @@ def _oracle(bench: Bench) -> Agent:
 
     trials, theta = bench.demonstrated.trials, bench.encoded(bench.demonstrated.theta)
     return memoryless_bc.train(
-        trials, memoryless_bc.MemorylessConfig(), rng(), theta, lambda: bench.encoded(bench.scorer.theta)
+        trials, memoryless_bc.MemorylessConfig(), rng(), theta, lambda: bench.encoded(bench.theta)
     )
 
 
@@ -112,8 +112,8 @@ def _deconfounded(bench: Bench) -> Agent:
 
 AGENTS: dict[str, Callable[[Bench], Agent | None]] = {
     "random": lambda bench: RandomAgent(task(bench.case.world).action_space),
-    "expert": lambda bench: WorldExpert(bench.case.world, bench.scorer.theta),
-    "wrong theta": lambda bench: WorldExpert(bench.case.world, np.roll(bench.scorer.theta, 1, 0)),
+    "expert": lambda bench: WorldExpert(bench.case.world, bench.theta),
+    "wrong theta": lambda bench: WorldExpert(bench.case.world, np.roll(bench.theta, 1, 0)),
     "filter": lambda bench: LinearFilter(bench.case.world, TRIALS, SEED) if bench.case.world.evidence else None,
     "naive_rnn": _naive_rnn,
 }

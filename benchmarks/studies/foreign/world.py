@@ -2,7 +2,6 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from functools import cached_property
 
 import gymnasium
 import numpy as np
@@ -111,32 +110,6 @@ def explorer(world: World, n: int, rng: np.random.Generator) -> Callable[[Agent 
         return roll_out(world, agent or random, thetas(world, n, seed), seed).trials
 
     return explore
-
-
-class Scorer:
-    """Scores of agents by returns in n trials: 0 of an expert given a wrong theta, 1 of the expert."""
-
-    def __init__(self, world: World, n: int, seed: int) -> None:
-        self.world, self.seed, self.theta = world, seed, thetas(world, n, seed)
-
-    @cached_property
-    def expert(self) -> Array:
-        """The returns [N, E] of the expert."""
-        return self.returns(WorldExpert(self.world, self.theta))
-
-    @cached_property
-    def other(self) -> Array:
-        """The returns [N, E] of the expert given a wrong theta."""
-        return self.returns(WorldExpert(self.world, np.roll(self.theta, 1, 0)))
-
-    def returns(self, agent: Agent) -> Array:
-        """The returns [N, E]."""
-        return roll_out(self.world, agent, self.theta, self.seed).returns
-
-    def __call__(self, agent: Agent) -> float:
-        """The score in the last episode."""
-        expert, other, returns = (x[:, -1].mean() for x in (self.expert, self.other, self.returns(agent)))
-        return float((returns - other) / (expert - other))
 
 
 class LinearFilter(Agent):
