@@ -608,6 +608,7 @@ class TestBadInput:
             ("x.csv", b"", "has no header"),
             ("x.csv", b"a,b\n", "holds no rows beside its header"),
             ("x.csv", b"a,b\n1,2\n1,2,3\n", "line 3 of .*x.csv has 3 cells; its header has 2"),
+            ("x.csv", b"a,b\n1,2\n1\n3,4\n", "line 3 of .*x.csv has 1 cells; its header has 2"),
             ("x.csv", b"a,a\n1,2\n", "two columns that are called 'a'"),
             ("x.parquet", b"junk", "x.parquet cannot be read as parquet"),
             ("x.hdf5", b"junk", "x.hdf5 cannot be read as HDF5"),
