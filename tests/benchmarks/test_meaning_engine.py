@@ -234,6 +234,15 @@ def test_amounts_of_presets(name: str, control: tuple[int, int], bandit: tuple[i
         assert (paper.seeds, paper.expert_trials >= made.expert_trials) == (10, True)
 
 
+def test_the_paper_s_architecture_is_of_its_bandit() -> None:
+    """On control, which the paper does not have, preset paper has the settings of the default one."""
+    changed = [name for name, method in METHODS.items() if method.paper not in (None, method.on_bandit)]
+    assert {"deconfounded", "naive_rnn"} <= {*changed}
+    for task, same in (("tilted_cartpole", True), ("bandit", False)):
+        default, paper = (preset(each, envs.get(task), "cpu", changed).configs for each in ("default", "paper"))
+        assert [default[name] == paper[name] for name in changed] == [same] * len(changed)
+
+
 def test_progress_of_a_training_is_its_share_of_the_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of a training that takes .8 of a job are .4 of its ticks; the rest come when it is done."""
     ticks: queue.Queue[int] = queue.Queue()
