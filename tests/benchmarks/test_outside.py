@@ -1,6 +1,7 @@
 """Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; docs/'s."""
 
 import hashlib
+import importlib
 import importlib.metadata
 import json
 import os
@@ -34,7 +35,7 @@ from deconfounded.deconf.guest import ChannelAsk, ChannelMonitor, live, serve
 from deconfounded.deconf.method import uses
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
-from deconfounded.deconf.wall import Wall
+from deconfounded.deconf.wall import Wall, refuse_imports
 from deconfounded.envs import registry
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support import outside
@@ -553,6 +554,16 @@ class TestEndOfGuest:
                 Wall().find_spec(module)
         else:
             Wall().find_spec(module)
+
+
+def test_the_wall_is_asked_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the finder that would find the module."""
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path])
+    monkeypatch.setitem(sys.modules, "deconfounded.envs", sys.modules["deconfounded.envs"])
+    monkeypatch.delitem(sys.modules, "mujoco.viewer", raising=False)
+    refuse_imports()
+    with pytest.raises(ImportError, match=r"mujoco\.viewer cannot be imported here"):
+        importlib.import_module("mujoco.viewer")
 
 
 def test_methods_declare_what_they_use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

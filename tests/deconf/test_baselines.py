@@ -628,6 +628,16 @@ def test_interrupted_training_resumes(method: str) -> None:
         np.testing.assert_array_equal(others, actions[0])
 
 
+def test_arrays_of_a_seed_of_two() -> None:
+    agent = made("blind_bc", seeds=(0, 1))
+    assert isinstance(agent, LearnedAgent)
+    whole = agent.state()[1]
+    for seed in (0, 1):
+        for key, array in agent.of_seed(seed).state()[1].items():
+            np.testing.assert_array_equal(array, whole[key][seed : seed + 1] if whole[key].ndim else whole[key])
+    assert any((x[0] != x[1]).any() for x in whole.values() if x.ndim)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("method", NEW)
 def test_a_seed_of_two_alone(method: str) -> None:

@@ -141,6 +141,7 @@ def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.Monkey
     given, of_given = online.memories(made, data, streams(), 10 * number[..., :1].expand(-1, -1, 2))
     assert torch.equal(given, memory)
     assert torch.equal(of_given, 10 * latent[..., :1].expand(-1, -1, 2))
+    assert (latent[..., 1] == STEPS - 1).all(), "a latent is of the whole trial"
     assert memory.shape == (1, 70 * online.PER_TRIAL, 2)
     assert torch.equal(memory[..., 0], latent[..., 0])
     short, whole = (memory[0, memory[0, :, 0] % 2 == rest, 1] for rest in (0, 1))
@@ -150,6 +151,23 @@ def test_memories_go_with_the_latents_of_their_trials(monkeypatch: pytest.Monkey
     monkeypatch.setattr(made.encoder, "hindsight", lambda batch, memories: batch.obs)  # a latent for every step
     memory, latent = online.memories(made, data, streams())
     assert torch.equal(memory, latent)
+
+
+def test_a_step_is_predicted_by_the_belief_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a step led to is no evidence for its own prediction, and is for that of the step after it."""
+    data, _ = pushed(6, np.random.default_rng(0))
+    made = VariationalModel("innovations", 2, 8, Scales.of(Signature(1, 1, 0, False), data), streams()).eval()
+    means: list[Tensor] = []
+    bound = made.negative_elbo
+    monkeypatch.setattr(made, "negative_elbo", lambda *given: (means.append(given[1].detach()), bound(*given))[1])
+    led = data.next_obs.clone()
+    led[:, :, 5] += 1
+    for next_obs in (data.next_obs, led):
+        made.loss(Batch(data.obs, data.action, next_obs, data.mask), None, 1.0, streams())
+    before, after = (mean.unflatten(1, (6, STEPS)) for mean in means)
+    moved = (before != after).any(-1)[0]
+    assert not moved[:, :6].any()
+    assert moved[:, 6:].all()
 
 
 def test_no_latent_of_padding_enters_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,6 +121,19 @@ def test_the_expert_heeds_the_stream_within_the_lag() -> None:
     np.testing.assert_allclose(raft.expert_mean(obs, np.tile(currents, (500, 1))), wanted, atol=1e-9)
 
 
+def test_actions_are_evidence_of_the_patch_that_is_heeded() -> None:
+    """And a step of the patch that it was in; of others nothing is learned."""
+    task, rng = PatchyRoad(), np.random.default_rng(0)
+    grid, apart = PatchGrid(envs.BatchEnv(task, 8), policy.load(task), 2), 0
+    for state, obs, _, _ in drive(task, 12):
+        before, nothing, likely = grid.prior(8), np.zeros((8, 2)), rng.normal(size=(8, 2))
+        for given, patch in (((nothing, likely), task.heeded(obs)), ((likely, None), task.patch(state))):
+            learned = (grid.updated(before, state, obs, *given) != before).any(-1)
+            np.testing.assert_array_equal(learned, patch[:, None] == np.arange(6))
+        apart += int((task.heeded(obs) != task.patch(state)).sum())
+    assert apart > 8
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("conditional", [False, True])
 def test_the_factorised_posterior_is_the_joint_one(conditional: bool) -> None:
