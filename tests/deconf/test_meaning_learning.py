@@ -15,9 +15,10 @@ from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.layers import Linear
 from deconfounded.deconf.core.models import VariationalModel, new_model
 from deconfounded.deconf.core.nets import Scales, Whitener, gaussian_log_prob
+from deconfounded.deconf.core.online import OnlineBelief
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import dagger as dagger_method
-from deconfounded.deconf.methods import deconfounded_mean, rma
+from deconfounded.deconf.methods import deconfounded, deconfounded_mean, rma
 from deconfounded.deconf.methods.dagger import DaggerAgent
 from deconfounded.deconf.methods.deconfounded_mean import MeanAgent, MeanConfig
 from deconfounded.deconf.methods.dpt import DptAgent
@@ -27,6 +28,7 @@ from deconfounded.deconf.methods.naive_transformer import TransformerAgent
 from deconfounded.deconf.methods.sequence_bc import RecurrentAgent
 from deconfounded.envs.streams import Array
 from deconfounded.experts.trials import Trials
+from tests.tools import FEW
 
 FLAT = Signature(obs=2, action=1, actions=0, binary=False)
 
@@ -252,6 +254,34 @@ def test_dagger_learns_what_the_expert_would_have_done(monkeypatch: pytest.Monke
     )
     assert len(seen) == 2
     assert all((action == 0.5).all() and (label == -0.5).all() for action, label in seen)
+
+
+@pytest.mark.parametrize("model", ["linear", "innovations", "gru"])
+def test_dynamics_are_learned_from_exploration_alone(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the policy from the expert: its actions are .5, those of exploration -.5."""
+    seen: dict[str, list[Tensor]] = {"dynamics": [], "policy": []}
+
+    def spied(kind: type, method: str, what: str) -> None:
+        true = getattr(kind, method)
+
+        def spy(self: object, *given: object, **rest: object) -> object:
+            seen[what].extend(batch.action for batch in given if isinstance(batch, Batch))
+            return true(self, *given, **rest)
+
+        monkeypatch.setattr(kind, method, spy)
+
+    spied(LatentModel, "learn", "dynamics")
+    spied(OnlineBelief, "fit", "dynamics")
+    spied(DeconfoundedAgent, "loss", "policy")
+    rng = np.random.default_rng(0)
+    expert, explored = (
+        Trials(rng.random((8, 1, 6, 2)), np.full((8, 1, 5, 1), action), np.ones((8, 1, 5))) for action in (0.5, -0.5)
+    )
+    config = deconfounded.DeconfoundedConfig(**{**FEW, "model": model})
+    deconfounded.train(expert, lambda behaviour: explored, config, rng)
+    for what, action in (("dynamics", -0.5), ("policy", 0.5)):
+        assert len(seen[what]) > 1
+        assert all((each == action).all() for each in seen[what]), what
 
 
 def loaded_mass(n: int, rng: np.random.Generator) -> tuple[Array, Batch]:
