@@ -24,6 +24,7 @@ from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, LearnedEnv
 from deconfounded.deconf.diagnosis.measures import Amounts, split
 from deconfounded.deconf.diagnosis.thresholds import GOOD, MISFIT, NEGLIGIBLE, STAKES
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
+from deconfounded.deconf.methods import memoryless_bc, naive_rnn
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials
@@ -80,6 +81,29 @@ def test_a_bar_of_the_page_is_of_the_figure_beside_it(figures: list[Any]) -> Non
             assert list(ranges[i].get_xdata()) == [low, high]
             labels.append(text.get_text())
     assert labels == list(names)
+
+
+def test_clones_are_trained_without_the_trials_that_judge_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those with a memory and those without, on the same three quarters of the trials."""
+    number = np.arange(16.0)
+    obs = np.broadcast_to(number[:, None, None, None], (16, 1, 6, 1))
+    given: list[set[float]] = []
+
+    def note(trials: Trials, *_: Any, **__: Any) -> None:
+        given.append({*trials.obs.ravel().tolist()})
+        if len(given) == 2:
+            raise StopIteration
+
+    judged: list[Batch] = []
+    monkeypatch.setattr(measures, "BestMonitor", lambda *rest: judged.append(rest[-1]))
+    for method in (memoryless_bc, naive_rnn):
+        monkeypatch.setattr(method, "train", note)
+    trials = Trials(obs, np.random.default_rng(0).uniform(-1, 1, (16, 1, 5, 1)), np.ones((16, 1, 5)))
+    with pytest.raises(StopIteration):
+        measures.measure(trials, None, Amounts(), np.random.default_rng(0))
+    rest = {*judged[0].obs.ravel().tolist()}
+    assert given == [{*number} - rest] * 2
+    assert len(rest) == 4
 
 
 def test_printed_lines_explore_by_the_log_of_exploration() -> None:
