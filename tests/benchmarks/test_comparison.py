@@ -238,6 +238,16 @@ class TestScores:
             assert aggregation.references(foreign[0], foreign) != aggregation.references(both[0][0], both[0])
 
     @pytest.mark.slow
+    def test_episodes_beyond_the_trial_s_do_not_count(self) -> None:
+        """A record may hold the returns of more episodes than a trial of its task has."""
+        made = record("mine", 0, 0.5)
+        episodes = made["episodes"]
+        zero, one = aggregation.references(made)
+        longer = {**made, "returns": [*made["returns"][:episodes], one, one]}
+        scores = comparison.gathered([longer], [])["mine"]["curling"][0]
+        np.testing.assert_allclose(scores, [0.5] * episodes)
+        assert zero != one
+
     def test_coverage(self) -> None:
         """Of the interval that tables show, by an independent simulation."""
         rng = np.random.default_rng(1)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
 
 from deconfounded import envs
@@ -16,6 +17,7 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import jobs, progress, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.local import Here, Local
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.envs import registry
@@ -232,6 +234,15 @@ def test_amounts_of_presets(name: str, control: tuple[int, int], bandit: tuple[i
         made, paper = (preset(each, envs.get(task), "cpu", ["random"]) for each in (name, "paper"))
         assert (made.seeds, made.expert_trials) == amounts
         assert (paper.seeds, paper.expert_trials >= made.expert_trials) == (10, True)
+
+
+def test_each_exploration_is_under_thetas_of_its_own() -> None:
+    """Those of a round are not those of the round before, and each seed has its own."""
+    context = Context(envs.get("tilted_cartpole"), tiny_preset(), (0, 1))
+    rngs = context.rngs
+    drawn = np.concatenate([context.explore_with_theta(None, rngs)[1][:, 0, 0] for _ in range(2)])
+    assert len(drawn) == 2 * 2 * context.preset.explore_trials
+    assert len({*drawn.tolist()}) == len(drawn)
 
 
 def test_the_paper_s_architecture_is_of_its_bandit() -> None:
