@@ -72,6 +72,24 @@ def test_a_split_whose_learning_fails(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not (tmp_path / "jobs").exists()
 
 
+def test_the_two_explorations_of_a_case_are_under_other_thetas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """That by a clone is more than the same trials once more."""
+    drawn: list[Any] = []
+    roll_out = Context._roll_out
+
+    def spy(self: Context, *given: Any) -> Any:
+        made = roll_out(self, *given)
+        drawn.append(made.theta[:, 0, 0].tolist())
+        return made
+
+    monkeypatch.setattr(Context, "_roll_out", spy)
+    monkeypatch.setattr(validate, "TRIALS", {"tilted_cartpole": 8})
+    monkeypatch.setattr(explorers, "fit", lambda *_: None)
+    validate.data(envs.get("tilted_cartpole"), None, tmp_path)
+    assert [len(thetas) for thetas in drawn] == [2, 2]
+    assert len({*drawn[0], *drawn[1]}) == 4
+
+
 def diagnosis(verdict: Any, tier: int | None, advice: Next = EXPLORE) -> Diagnosis:
     return Diagnosis(verdict, {"gap": Figure.of([0.4])}, (), tier, advice)
 
