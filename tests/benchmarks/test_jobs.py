@@ -22,6 +22,7 @@ from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.methods import naive_rnn, references
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
+from deconfounded.experts import policy
 from deconfounded.experts.agent import Agent, ExpertAgent
 from deconfounded.experts.rollout import run_trials
 
@@ -164,6 +165,25 @@ def test_held_out_trials_are_no_others(tmp_path: Path, monkeypatch: pytest.Monke
     every = [Batch.of(trials, 2).obs for trials in (context.demonstrations, scored)]
     payouts = [row.numpy().tobytes() for obs in (held_out.obs, *every) for row in obs.flatten(0, 1)]
     assert len(payouts) == len(set(payouts)) == 3 * 2 * 8
+
+
+def test_an_onlooker_notes_what_it_would_have_done() -> None:
+    """The expert acts, and the onlooker's memory is of that."""
+    observed: list[Any] = []
+
+    class Zero(Agent):
+        def act(self, obs: Any) -> Any:
+            return np.zeros((len(obs), 1))
+
+        def observe(self, obs: Any, action: Any, *_: Any) -> None:
+            observed.append(action)
+
+    env = envs.BatchEnv(envs.get("bandit"), 4)
+    onlooker = paper.Onlooker(Zero(), ExpertAgent(env, policy.load(env.task)))
+    action = run_trials(env, onlooker, 1, 0).trials.action[:, 0]
+    assert (np.stack(onlooker.would) == 0).all()
+    assert len(np.unique(action)) == 5
+    np.testing.assert_array_equal(np.stack(observed, 1), action)
 
 
 @pytest.mark.slow
