@@ -6,6 +6,7 @@ import importlib.util
 import inspect
 import os
 import sys
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -87,11 +88,18 @@ def source(of: Any) -> Path | None:
         return None
 
 
+class _Loader(SourceFileLoader):
+    """Compiles a file each time: cached bytecode is told apart by size and by seconds alone."""
+
+    def path_stats(self, path: Any) -> Any:
+        raise OSError("no bytecode is to be used")
+
+
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
     name = f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path) + path.read_bytes()).hexdigest()[:8]}"
     if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path)
+        spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
