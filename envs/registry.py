@@ -44,7 +44,7 @@ def register(cls: type[Task]) -> type[Task]:
     if outside.is_outside(cls.reference):
         copyreg.pickle(cls, _parts)
     gym_id, steps = task.gym_id, task.horizon
-    if twins := [of for of, other in TASKS.items() if of != name and other().gym_id == gym_id]:
+    if twins := [each for each in TASKS if each != name and TASKS[each]().gym_id == gym_id]:
         raise InputError(f"task {name!r} of {where} would be {gym_id}, as {twins[0]} is; give it another name")
     TASKS[name] = cls
     gymnasium.registry.pop(gym_id, None)

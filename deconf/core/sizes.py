@@ -7,10 +7,7 @@ from deconfounded.envs.support.errors import InputError
 
 LARGE_OBSERVATION, WIDE = 16, 128  # for observations of so many numbers or more, networks on control have this width
 SHARES = ("shortest", "random_share", "warm_up", "anywhere", "gamma")
-MOST = dict.fromkeys(SHARES, math.nextafter(1, 2)) | {
-    "dropout": 1,
-    "held_out": 1,
-}  # below which settings of these names must be
+MOST = dict.fromkeys(SHARES, math.nextafter(1, 2)) | dict.fromkeys(("dropout", "held_out"), 1.0)  # values are below
 LEAST = {"ridge": 1e-9}  # of settings without which a regression may have no solution
 HEAVY = 30.0  # excess kurtosis, of labels and columns: a normal distribution has 0, Laplace's 3
 LARGE_LATENT = 8  # dimensions of theta_hat there; with 4, one seed of three was worse on ant_goal and slippery_walker

@@ -18,7 +18,8 @@ MENDED = 4.0  # excess kurtosis
 HIDDEN, FITTED, RIDGE = 128, 20_000, 1e-4  # random features; steps, at most; of standardised features
 FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hidden, left what looked like it
 CLIP = 4.0  # usual deviations
-ALIKE, APART, LONGEST = 24, 10, 1500  # trials in which alike observations are looked for; rows apart; of a trial
+ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
+LONGEST = 1500  # rows of a trial that are looked at for that
 
 
 @dataclass(frozen=True)
