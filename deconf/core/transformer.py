@@ -33,6 +33,12 @@ def rotated(x: Tensor, by: tuple[Tensor, Tensor]) -> Tensor:
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
+def check_heads(width: int, heads: int) -> None:
+    """Raises InputError for a width that cannot be divided between heads whose numbers are rotated in pairs."""
+    if width % (2 * heads):
+        raise InputError(f"a transformer of {heads} heads had width {width}; it must be a multiple of {2 * heads}")
+
+
 class Cache:
     """A ring buffer of keys and values [2, N H, D, window] of each layer's latest tokens, for N trials of one seed.
 
@@ -108,8 +114,6 @@ class Transformer(nn.Module):
 
     def __init__(self, inputs: int, width: int, layers: int, heads: int, window: int, draws: Draws) -> None:
         super().__init__()
-        if width % (2 * heads):
-            raise InputError(f"a transformer of {heads} heads had width {width}; it must be a multiple of {2 * heads}")
         self.width, self.heads, self.window, self.depth = width, heads, window, layers
         self.embed = Linear(inputs, width, draws)
         self.attend = nn.ModuleList(Linear(width, 3 * width, draws) for _ in range(layers))

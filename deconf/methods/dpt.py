@@ -32,7 +32,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, as_generators, joi
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.sizes import Configuration
-from deconfounded.deconf.core.transformer import Transformer, normed, rotated, rotation
+from deconfounded.deconf.core.transformer import Transformer, check_heads, normed, rotated, rotation
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -57,6 +57,10 @@ class DptConfig(Configuration):
     learning_rate: float = 2e-3
     drifts: bool = False  # theta changes between episodes: the context is emptied at each
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_heads(self.width, self.heads)
 
 
 class InContext(Transformer):

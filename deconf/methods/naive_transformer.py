@@ -21,7 +21,7 @@ from deconfounded.deconf.core.data import Batch, Draws, Rngs, Source, stacked
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.core.sizes import Configuration
-from deconfounded.deconf.core.transformer import Cache, Transformer
+from deconfounded.deconf.core.transformer import Cache, Transformer, check_heads
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import uses
@@ -40,6 +40,10 @@ class TransformerConfig(Configuration):
     shortest: float = 1 / 8
     learning_rate: float = 2e-3
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_heads(self.width, self.heads)
 
 
 class TransformerAgent(LearnedAgent):

@@ -145,6 +145,8 @@ def test_declarations_that_no_run_could_use(declared: dict[str, Any], says: str)
             "random_share of DeconfoundedConfig was 1.5; it must be float, from 0 up, at",
         ),
         ("flow_bc.executed=99", "executed of FlowConfig was 99; it must be at most ahead, 8"),
+        ("naive_transformer.width=20", "a transformer of 4 heads had width 20; it must be a multiple of 8"),
+        ("dpt.width=20", "a transformer of 4 heads had width 20"),
     ],
 )
 def test_settings_that_a_command_refuses(change: str, says: str) -> None:
@@ -199,12 +201,6 @@ def test_theta_of_other_trials(theta: Any, says: str) -> None:
 
 def test_shares_of_one() -> None:
     assert DeconfoundedConfig(shortest=1.0, random_share=1).shortest == 1
-
-
-def test_heads_that_do_not_divide_the_width() -> None:
-    preset = tiny_preset().configured("naive_transformer", width=20, heads=4)
-    with pytest.raises(envs.InputError, match="a transformer of 4 heads had width 20; it must be a multiple of 8"):
-        fit(Context(envs.get("bandit"), preset, [0]), "naive_transformer")
 
 
 @pytest.mark.parametrize("wrong_round", [0, 1])
