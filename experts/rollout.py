@@ -81,11 +81,12 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
     check_number("episodes", episodes)
     if env.privileged:
         raise InputError("run_trials was given privileged environments; agents act on observations without theta")
-    inner = agent
-    while isinstance(inner, AgentWrapper):
-        inner = inner.agent
-    if isinstance(read := getattr(inner, "env", env), BatchEnv) and read is not env:
-        raise InputError(f"{type(agent).__name__} reads the state or theta of other environments than it was to act in")
+    layer: Agent | None = agent
+    while layer is not None:
+        if isinstance(read := getattr(layer, "env", env), BatchEnv) and read is not env:
+            who = type(layer).__name__
+            raise InputError(f"{who} reads the state or theta of other environments than it was to act in")
+        layer = layer.agent if isinstance(layer, AgentWrapper) else None
     each, seeds = trial_seeds(n, seed), _group_seeds(seed)
     obs = np.zeros((n, episodes, task.horizon + 1, len(task.observation)), np.float32)
     mask = np.zeros((n, episodes, task.horizon), bool)

@@ -33,7 +33,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     cls, file, code = type(agent), folder / "agent.json", None
     if "." in cls.__qualname__:
         raise InputError(f"{cls.__qualname__} cannot be saved; its class must stand at the top of its file")
-    if cls.__module__ in ("__main__", "__mp_main__"):
+    if cls.__module__ in outside.SCRIPTS:
         raise InputError(f"{cls.__qualname__} cannot be saved; its class must be imported, from a file of its own")
     if cls.__module__.startswith(outside.PREFIX) and (source := outside.source(cls)) is not None:
         code = source.read_bytes()

@@ -20,6 +20,7 @@ FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hi
 CLIP = 4.0  # usual deviations
 ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
 LONGEST = 1500  # rows of a trial that are looked at for that
+MOST, FEWEST = 50_000, 32  # steps of a look's fits; trials: fits of what differs between trials take 16
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,18 @@ class Steps:
         now, then = trials.obs[:, :, :-1][trials.mask], trials.obs[:, :, 1:][trials.mask]
         action = trials.action[trials.mask].astype(float)
         return Steps(now.astype(float), then.astype(float), action, np.nonzero(trials.mask)[0])
+
+
+def sample(trials: Trials) -> Trials:
+    """Evenly spaced trials of about MOST steps in all; of long ones FEWEST, and the beginnings of their episodes."""
+    if (total := trials.mask.sum()) <= MOST:
+        return trials
+    whole, horizon = len(trials) * MOST / total, trials.mask.shape[2]
+    index = np.linspace(0, len(trials) - 1, min(len(trials), max(FEWEST, int(whole)))).astype(int)
+    if whole < len(index):
+        horizon = max(2, int(horizon * MOST / trials.mask[index].sum()))
+    obs, action, mask = (x[index] for x in (trials.obs, trials.action, trials.mask))
+    return Trials(obs[:, :, : horizon + 1], action[:, :, :horizon], mask[:, :, :horizon], trials.actions)
 
 
 def by_trial(x: Array, trial: Numbers, count: int) -> Array:

@@ -14,8 +14,6 @@ from deconfounded.experts.trials import Trials, check_trials
 
 Array = NDArray[np.float64]
 OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials
-MOST = 50_000  # steps that are fitted
-FEWEST = 32  # trials: fits of what differs between trials take 16
 FEW = 8  # values of a column that does not move, but jumps
 STILL, PAUSE = 0.02, 5  # of the motion's 90th percentile; steps
 LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing follows
@@ -33,7 +31,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     check_trials("look", given)
     log = given if isinstance(given, Log) else Log.of(given, "Trials")
     steps = Steps.of(log)
-    part = given if len(steps.trial) <= MOST else _part(log)
+    part = fits.sample(given)
     fitted = Steps.of(part)
     remarks = [Remark("size", note, isinstance(note, Odd)) for note in log.notes]
     for describe in (
@@ -53,16 +51,6 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     remarks += [*columns.of_trials(log)] * (not blind)
     remarks += _dynamics(part, fitted, log.units.obs, blind)
     return sorted(remarks, key=lambda remark: remark.odd)
-
-
-def _part(log: Log) -> Trials:
-    """Evenly spaced trials of about MOST steps in all; of long ones FEWEST, and the beginnings of their episodes."""
-    whole, horizon = len(log) * MOST / log.mask.sum(), log.mask.shape[2]
-    index = np.linspace(0, len(log) - 1, min(len(log), max(FEWEST, int(whole)))).astype(int)
-    if whole < len(index):
-        horizon = max(2, int(horizon * MOST / log.mask[index].sum()))
-    obs, action, mask = log.obs[index, :, : horizon + 1], log.action[index, :, :horizon], log.mask[index, :, :horizon]
-    return Trials(obs, action, mask, log.actions)
 
 
 def _ranges(log: Log, steps: Steps) -> Iterator[Remark]:

@@ -64,13 +64,13 @@ def write_json(file: Path, data: Any) -> None:
 
 
 def _digest(data: dict[str, Any]) -> str:
-    as_read = json.loads(json.dumps(data))  # whose keys are texts, which are sorted otherwise than numbers
-    return hashlib.sha256(json.dumps(as_read, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def sealed(data: dict[str, Any]) -> dict[str, Any]:
     """The data with its checksum added: `sha256`, of all other entries."""
-    return {**data, "sha256": _digest(data)}
+    as_read = json.loads(json.dumps(data))  # whose keys are texts, which are sorted otherwise than numbers
+    return {**data, "sha256": _digest(as_read)}
 
 
 def write_sealed(file: Path, data: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from deconfounded.envs.support.errors import InputError, error_line, users_line
 
 SENT = "DECONFOUNDED_OUTSIDE"  # environment variable of a cluster worker: the folder that plug-in files were sent to
 FOLDERS: set[str] = set()  # of plug-in files, which are on the import path for their sake
+SCRIPTS = ("__main__", "__mp_main__")  # names of a process's script as a module, of which each process has its own
 PREFIX = "outside_"  # of the module names of plug-in files
 
 
@@ -60,7 +61,7 @@ def reference(cls: type) -> str:
     """The reference of a class, for `find` in another process; "" if it has none, as a class inside a function."""
     if cls.__qualname__ != cls.__name__:
         return ""
-    if cls.__module__ in ("__main__", "__mp_main__") or cls.__module__.startswith(PREFIX):
+    if cls.__module__ in SCRIPTS or cls.__module__.startswith(PREFIX):
         return f"{file}:{cls.__name__}" if (file := source(cls)) else ""
     return f"{cls.__module__}:{cls.__name__}"
 

@@ -242,11 +242,11 @@ class TestScores:
         """A record may hold the returns of more episodes than a trial of its task has."""
         made = record("mine", 0, 0.5)
         episodes = made["episodes"]
-        zero, one = aggregation.references(made)
-        longer = {**made, "returns": [*made["returns"][:episodes], one, one]}
+        random, expert = aggregation.references(made)
+        longer = {**made, "returns": [*made["returns"][:episodes], expert, expert]}
         scores = comparison.gathered([longer], [])["mine"]["curling"][0]
         np.testing.assert_allclose(scores, [0.5] * episodes)
-        assert zero != one
+        assert random != expert
 
     def test_coverage(self) -> None:
         """Of the interval that tables show, by an independent simulation."""

@@ -18,7 +18,6 @@ from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
 from deconfounded.deconf.diagnosis import columns, diagnose, fits
-from deconfounded.deconf.diagnosis import look as look_module
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -90,9 +89,9 @@ def test_trials_that_are_long(monkeypatch: pytest.MonkeyPatch) -> None:
     """Enough of them are looked at, by their beginnings, to see how they differ."""
     trials = driven()
     whole = look(trials)
-    monkeypatch.setattr(look_module, "MOST", B * E * T // 3)
-    part = look_module._part(Log.of(trials, ""))
-    assert part.mask.shape[:2] == (look_module.FEWEST, E)
+    monkeypatch.setattr(fits, "MOST", B * E * T // 3)
+    part = fits.sample(trials)
+    assert part.mask.shape[:2] == (fits.FEWEST, E)
     assert part.mask.shape[2] == T // 2
     for remarks in (whole, look(trials)):
         assert said(remarks, "dynamics").startswith("Trials differ in their dynamics")
