@@ -145,6 +145,9 @@ def certify(
     done: called with the name of each stage when it is over.
     """
     env = envs.BatchEnv(task, trials)
+    if constant := [latent for latent in task.latents if latent.low == latent.high]:
+        what = f"{constant[0].name} of {task.name} was {constant[0].low:g} in all draws of theta"
+        raise envs.InputError(f"{what}; it must vary, or be left out")
     learned: dict[str, Any] = {}
     thetas: int | Grid = grid or grid_size(task)
     if not task.has_likelihood:

@@ -15,6 +15,7 @@ from sklearn.preprocessing import StandardScaler
 from deconfounded.deconf.exact import Grid
 from deconfounded.envs import BatchEnv, Task
 from deconfounded.envs.streams import Array, Mask, Streams
+from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import Expert
 from deconfounded.experts.rollout import Rollout, of_steps, run_trials
@@ -77,6 +78,8 @@ def learn(task: Task, expert: Expert, trials: int, seed: int) -> LearnedDynamics
     rounding = np.finfo(np.float32).eps * np.abs(obs).max(0)  # all that tells the steps of a clock apart
     scale[scale < np.maximum(1e-9, rounding)] = 0
     moves = scale > 0
+    if not moves.any():
+        raise InputError(f"observations of {task.name} never changed within an episode; there are no dynamics to learn")
     rows = features(task, obs, action, theta)
     inputs = StandardScaler().fit(rows)
     network = MLPRegressor(

@@ -130,6 +130,9 @@ def check_values(method: Method) -> None:
         if not is_dataclass(config) or type(config) is not type(method.on_control) or isinstance(config, type):
             right = "an object of a dataclass, and all of the same"
             raise InputError(f"a method declares {name}={config!r}; configurations must be {right}")
+        if nested := [each.name for each in fields(config) if is_dataclass(getattr(config, each.name))]:
+            right = "numbers, texts, lists and the like, which a run's --set and results can hold"
+            raise InputError(f"a method declares {name} with the dataclass {nested[0]}; its values must be {right}")
         _check_json(name, config)
     on_bandit = method.on_bandit or method.on_control
     changed = (("two_latents", method.on_control), ("smoke", method.on_control), ("smoke_bandit", on_bandit))

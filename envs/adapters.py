@@ -39,7 +39,7 @@ def _metadata(task: Task, render_mode: str | None) -> dict[str, Any]:
     if render_mode not in (None, *modes):
         right = "'rgb_array' or None" if modes else "None, as a black box has no pictures"
         raise InputError(f"render_mode of {task.name} was {render_mode!r}; it must be {right}")
-    return {"render_modes": modes, "render_fps": round(1 / task.control_dt)}
+    return {"render_modes": modes, "render_fps": max(1, round(1 / task.control_dt))}
 
 
 class _Pictures:

@@ -21,6 +21,7 @@ from deconfounded.envs.task import Renderer, Simulator, Task
 from deconfounded.envs.world import Facts, World, bounds, drawn, facts, made, part
 
 LARGEST = float(np.finfo(np.float32).max)  # of an observation
+LEAST_PART = 4  # draws that a theta of a grid stands for, at least
 LEAST_NOISE = 0.01  # of an expert, as Eq. (1) needs a density: a share of half the action range, or of actions
 PARTS = ("make", "sample_theta", "expert", "episodes", "steps")
 SHAPE = "make(theta), sample_theta(rng), expert(obs, theta), episodes and steps"
@@ -217,16 +218,26 @@ class BlackBox(Task):
         return np.stack([drawn(self.name, self.facts.world, generator) for generator in rng.rngs])
 
     def theta_grid(self, k: int) -> Array:
-        """For each theta of a product of quantiles, sized as `Task.theta_grid`, the draw that is nearest in quantiles.
+        """Draws of theta [K, L] that stand for about as many draws each, however theta's numbers depend on each other.
 
-        So each can occur, however theta's numbers depend on each other.
+        If k thetas or fewer occur, they are all there, each as often as its share asks for. Else draws are parted by
+        the first number, each part by the second, and so on, as often as `Task.theta_grid` has values; of each part the
+        middle is taken.
         """
         draws = self.facts.draws
-        quantiles, wanted = (
-            np.stack([lat.cdf(x[:, i]) for i, lat in enumerate(self.latents)], -1)
-            for x in (draws, super().theta_grid(k))
-        )
-        return draws[[int(((quantiles - row) ** 2).sum(-1).argmin()) for row in wanted]]
+        if draws.shape[1] == 1:
+            return super().theta_grid(k)
+        distinct, counts = np.unique(draws, axis=0, return_counts=True)
+        if len(distinct) <= k:
+            unit = max(counts.min(), len(draws) / k)  # a rare theta would else take thousands of the others beside it
+            return np.repeat(distinct, np.maximum(1, np.rint(counts / unit)).astype(int), 0)
+        each, parts, parted = self._values_each(k), [np.arange(len(draws))], 0
+        while parted < draws.shape[1] and len(parts) * each <= len(draws) / LEAST_PART:
+            in_order = (part[draws[part, parted].argsort(kind="stable")] for part in parts)
+            parts, parted = [piece for part in in_order for piece in np.array_split(part, each)], parted + 1
+        quantiles = np.stack([lat.cdf(draws[:, i]) for i, lat in enumerate(self.latents[:parted])], -1)
+        off = [np.square(quantiles[part] - np.median(quantiles[part], 0)).sum(-1) for part in parts]
+        return draws[[part[of.argmin()] for part, of in zip(parts, off, strict=True)]]
 
     def _check_bounds(self, theta: Array) -> None:
         if not np.isfinite(theta).all():
@@ -237,7 +248,8 @@ class BlackBox(Task):
         space, rows = self.facts.space, []
         for seen, hidden in zip(obs, theta, strict=True):
             with part(self.name, "expert"):
-                rows.append(np.asarray(given := self.facts.world.expert(seen.astype(float), hidden.copy()), float))
+                given = self.facts.world.expert(seen.astype(float), hidden.copy())
+                rows.append(np.asarray(given, float).reshape(-1))
             right = () if isinstance(space, spaces.Discrete) else space.shape
             if rows[-1].size != np.prod(right) or not np.isfinite(rows[-1]).all():
                 wrong = f"{given if given is None else rows[-1].tolist()} for an observation"

@@ -91,6 +91,8 @@ class Latent:
 
     def drifted(self, theta: Array, normal: Array) -> Array:
         """Theta [...] of a trial's next episode, by standard normal draws of the same shape."""
+        if not self.drift:  # of the same bits, beside a latent that drifts
+            return theta
         return self.ppf(folded(self.cdf(theta) + self.drift * normal)).clip(self.low, self.high)
 
     def transition(self, k: int) -> Array:

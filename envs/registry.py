@@ -96,8 +96,9 @@ def get(name: str) -> Task:
     if not outside.is_outside(name):
         raise closest("task", name, names(), "; your own is path/file.py:Class")
     reference = outside.absolute(name)
-    if registered := [task for task in TASKS.values() if task.reference == reference]:
-        return registered[0]()
+    before = next((task for task in TASKS.values() if task.reference == reference), None)
+    if before and not outside.edited(before):
+        return before()
     cls = outside.find("task", name)
     if cls in TASKS.values():  # one of this package's, by the module that it is in
         return cls()
@@ -106,6 +107,8 @@ def get(name: str) -> Task:
     if not issubclass(cls, Task):
         cls = blackbox.task_of(cls)
     cls.reference = reference
+    if before:
+        del TASKS[before.name]
     return register(cls)()
 
 

@@ -26,12 +26,13 @@ class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         if getattr(env.unwrapped, "episodes", 1) < 2:
             raise InputError("TrialEnv was given an environment of one episode a trial; make it with episodes=5, say")
-        inner, (width, self._actions) = env.observation_space, action_sizes(env.action_space)
+        inner, acts, (width, self._actions) = env.observation_space, env.action_space, action_sizes(env.action_space)
         assert isinstance(inner, spaces.Box)
         self._before = np.zeros(self._actions or width, np.float32)
-        more = np.ones(len(self._before) + 1, np.float32)
-        low = np.array([0 if self._actions else -1] * len(self._before) + [0], np.float32)
-        self.observation_space = spaces.Box(np.append(inner.low, low), np.append(inner.high, more))
+        self._range = (acts.low, acts.high) if isinstance(acts, spaces.Box) else (self._before, self._before + 1)
+        low = np.concatenate([inner.low, self._range[0].clip(max=0), [0]])  # 0 where there is no action before
+        high = np.concatenate([inner.high, self._range[1].clip(min=0), [1]])
+        self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self._left = 0
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
@@ -48,8 +49,8 @@ class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
             self._left -= 1
             following, _ = self.env.reset(options={"keep_theta": True})
             return self._started(following), reward, False, False, {**info, "final_obs": obs}
-        taken = np.asarray(action, np.float32).reshape(-1).clip(-1, 1)
-        before = np.eye(self._actions, dtype=np.float32)[int(action)] if self._actions else taken
+        taken = np.asarray(action).reshape(-1)
+        before = np.eye(self._actions)[int(taken[0])] if self._actions else taken.clip(*self._range)
         return np.concatenate([obs, before, [0]], dtype=np.float32), reward, terminated, truncated, info
 
     def _started(self, obs: Obs) -> Obs:

@@ -94,7 +94,8 @@ def facts(cls: type[World]) -> Facts:
     assert isinstance(space, spaces.Box | spaces.Discrete)
     if isinstance(space, spaces.Discrete) and noise > 1:
         raise InputError(f"noise of {name} was {noise!r}; of discrete actions it is a share, from 0 to 1")
-    return Facts(world, world.episodes, world.steps, float(noise), draws, latents, observations, space)
+    amounts = int(world.episodes), int(world.steps), float(noise)  # of plain types, as json has them
+    return Facts(world, *amounts, draws, latents, observations, space)
 
 
 def _names(name: str, world: World, count: int) -> Sequence[str]:

@@ -143,7 +143,8 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
     """
     if task.n_actions:
         if source is not None:
-            raise InputError(f"expert was {source}; that of {task.name} is its closed form, `expert_probs`")
+            own = "its closed form, `expert_probs`" if task.has_likelihood else "the world's own `expert`"
+            raise InputError(f"expert was {source}; that of {task.name} is {own}, as actions are discrete")
         return DiscreteExpert(task)
     if source is not None and (not isinstance(source, str | Path) or not str(source).strip()):
         raise InputError(f"expert was {source!r}; it must be weights.safetensors, or path/file.py:name of a callable")

@@ -109,7 +109,9 @@ def load(folder: Path | str) -> Agent:
         content = from_bytes(arrays(folder, about))
         where, _, name = about["class"].rpartition(":")
         cls, settings = outside.find("agent", f"{folder / where if where == CODE else where}:{name}"), about["settings"]
-    except InputError:
+    except InputError as error:
+        if isinstance(error.__cause__, ModuleNotFoundError):
+            raise InputError(f"{error}; modules that it imports must be importable, as by PYTHONPATH") from None
         raise
     except Exception as error:
         raise InputError(f"the agent in {folder} is damaged ({error_line(error)}); run the benchmark again") from None

@@ -5,6 +5,7 @@ environments in which the method's agent acts.
 """
 
 import contextlib
+import hashlib
 import os
 import secrets
 import signal
@@ -137,7 +138,7 @@ class Guest(Agent):
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         """A generator knows the seed it came from: what the guest gets is a number drawn from it."""
-        self._do("reset", fresh(rngs))
+        self._do("reset", fresh(rngs, self.context.salt))
 
     def act(self, obs: NDArray[np.float32]) -> Array:
         """Clipped to [-1, 1] if continuous, as environments do. Raises InputError for what is not a row for each."""
@@ -191,16 +192,37 @@ class Guest(Agent):
         self.folder.cleanup()
 
 
-def fresh(rngs: Sequence[np.random.Generator]) -> list[int]:
-    """A number from each generator, to make another one of that does not know where it came from."""
-    return [int(rng.integers(2**63)) for rng in rngs]
+def fresh(rngs: Sequence[np.random.Generator], salt: str = "") -> list[int]:
+    """A number from each generator, to make another one of that does not know where it came from.
+
+    A generator comes from a seed of 31 bits, which thetas are drawn by: all of these could be tried. With a salt, what
+    was drawn cannot be told from the number.
+    """
+    drawn = [int(rng.integers(2**63)) for rng in rngs]
+    digests = (hashlib.sha256(f"{number} {salt}".encode("utf-8", "surrogateescape")).digest() for number in drawn)
+    return [int.from_bytes(digest[:8]) >> 1 for digest in digests] if salt else drawn
 
 
 class ReseededAgent(AgentWrapper):
-    """An agent of somebody else's class in this process: it gets the random numbers that it would get as a guest."""
+    """An agent of somebody else's class in this process: it gets the random numbers that it would get as a guest.
+
+    So are arrays copies of its own, which it may change. salt: of a guest's training.
+    """
+
+    def __init__(self, agent: Agent, salt: str = "") -> None:
+        super().__init__(agent)
+        self.salt = salt
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
-        super().reset([np.random.default_rng(seed) for seed in fresh(rngs)])
+        super().reset([np.random.default_rng(seed) for seed in fresh(rngs, self.salt)])
+
+    def act(self, obs: NDArray[np.float32]) -> Array:
+        return super().act(obs.copy())
+
+    def observe(
+        self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
+    ) -> None:
+        super().observe(obs.copy(), action.copy(), next_obs.copy(), alive.copy())
 
     def features(self) -> NDArray[np.float32] | None:
         return self.agent.features()
@@ -212,7 +234,7 @@ def fit_guest(context: Context, name: str, method: Method) -> Agent:
     provider.open -= {"acting theta"}
 
     def ask(kind: str, *details: Any, agent: Agent | None = None) -> Any:
-        return provider(kind, *details, agent=agent and ReseededAgent(agent))
+        return provider(kind, *details, agent=agent and ReseededAgent(agent, context.salt))
 
     rngs = [np.random.default_rng(stream(GUEST, context.seeds[0], context.salt))]
     config = function.method.config(context.preset.configs.get(name, {}))
@@ -220,4 +242,4 @@ def fit_guest(context: Context, name: str, method: Method) -> Agent:
     provider.fitted = True
     if not isinstance(agent, Agent):
         raise envs.InputError(f"method {name} returned {agent!r}; it must return a deconfounded.experts.agent.Agent")
-    return ReseededAgent(agent)
+    return ReseededAgent(agent, context.salt)

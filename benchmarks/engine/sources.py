@@ -1,13 +1,14 @@
 """Source files of tasks, methods and experts from outside, and digests that comments and docstrings do not change.
 
-A digest covers the file named, the modules and packages beside it that it imports, and the files that an MJCF names.
-Installed libraries count by their versions instead (`identity.versions`).
+A digest covers the file named, the modules and packages beside it that it imports, the data files beside these that
+they name, and the files that an MJCF names. Installed libraries count by their versions instead (`identity.versions`).
 """
 
 import ast
 import hashlib
 import inspect
 import os
+import re
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from deconfounded.envs.support import outside
 from deconfounded.envs.support.origin import LIBRARIES, OURS, is_library, is_ours
 
 MODELS = ("include", "model")  # MJCF elements that name further MJCF
+FILE_NAME = re.compile(r"[^\0\n]{1,200}\.\w{1,12}")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
@@ -111,11 +113,17 @@ def mjcf(*files: Path) -> set[Path]:
 
 @cache
 def _named(file: Path, changed: int) -> tuple[Path, ...]:
-    """MJCF files that a Python file names, beside it or in a folder there; `changed` as above."""
+    """Files other than Python's that a Python file names, beside it or in a folder there; `changed` as above."""
     texts = (node.value for node in ast.walk(ast.parse(file.read_bytes(), str(file))) if isinstance(node, ast.Constant))
-    names = [text for text in texts if isinstance(text, str) and text.endswith(".xml") and "\0" not in text]
+    names = [text for text in texts if isinstance(text, str) and FILE_NAME.fullmatch(text)]
     places = (folder / name for name in names for folder in (file.parent, *file.parent.glob("*/")))
-    return tuple(place for place in places if place.is_file())
+    return tuple(place for place in places if place.suffix != ".py" and place.is_file())
+
+
+def with_data(files: set[Path]) -> set[Path]:
+    """Python files, and the files beside them that they name: weights, tables, MJCF and what it names."""
+    named = [data for file in files for data in _named(file, file.stat().st_mtime_ns)]
+    return files | mjcf(*named)
 
 
 def of_task(task: envs.Task) -> set[Path]:
@@ -124,15 +132,13 @@ def of_task(task: envs.Task) -> set[Path]:
     own = {file for file in classes if not is_library(file)}
     if not own:
         return set()
-    files = closure(own)
-    named = [model for file in files for model in _named(file, file.stat().st_mtime_ns)]
-    return files | mjcf(task.home / f"{task.name}.xml", *named)
+    return with_data(closure(own)) | mjcf(task.home / f"{task.name}.xml")
 
 
 def of_reference(reference: str) -> set[Path]:
     """The files of a method or expert from outside, `path/file.py:name` or `package.module:name`."""
     file = outside.file(reference)
-    return closure([file]) if file else set()
+    return with_data(closure([file])) if file else set()
 
 
 def digest(files: Iterable[Path], name: str = "") -> str:

@@ -48,10 +48,12 @@ def check_task(task: Task) -> None:
         env = BatchEnv(task, n)
     with _part(task, "init_state"):
         state = task.init_state(rng)
+        state.flags.writeable = False  # what is changed in place would change the trial
     with _part(task, "outcome"):
         env.simulator.outcome(state[:1], action[:1], np.arange(1))  # alone: a failure in a thread would end the process
         noise = task.sample_noise(rng)[:, 0]
         then = task.apply_noise(env.simulator.outcome(state, action), noise)
+        then.flags.writeable = False
     for name, shape, ask in (
         ("observe", (n, len(task.observation)), lambda: task.observe(state)),
         ("reward", (n,), lambda: task.reward(state, action, then, env.theta)),
@@ -70,11 +72,14 @@ def check_task(task: Task) -> None:
 
 def _check_world(task: BlackBox) -> None:
     """The expert acts, and an episode of random actions runs in two environments; errors name the world's part."""
+    if (task.sample_theta(streams(0)) != task.sample_theta(streams(0))).any():
+        right = "it must draw from `rng` alone, or methods that see theta get another one than the environments have"
+        raise InputError(f"sample_theta of {task.name} gave two thetas for one state of its generator; {right}")
     env = BatchEnv(task, 2)
     obs = env.reset(0)
     acted = task.expert_probs if task.n_actions else task.expert_mean
     for action in actions(task, env.n, task.horizon):
-        once, again = (acted(obs[env.alive], env.theta[env.alive]) for _ in range(2))
+        once, again = (acted(obs, env.theta) for _ in range(2))  # after an episode's end too, as in runs
         if not np.allclose(once, again, atol=1e-4):
             right = "it must give the action without noise, and `noise` is added to it"
             raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
@@ -88,8 +93,8 @@ def _check_numbers(task: Task) -> None:
     least = {"horizon": 1, "episodes": 1, "version": 0, **({"substeps": 1} if isinstance(task, MujocoTask) else {})}
     for name, low in least.items():
         value = getattr(task, name)
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < low:
-            raise InputError(f"{name} of {task.name} was {value!r}; it must be a whole number from {low} up")
+        if isinstance(value, bool) or not isinstance(value, int) or value < low:
+            raise InputError(f"{name} of {task.name} was {value!r}; it must be a whole number, an int, from {low} up")
     if task.tier not in TIERS or isinstance(task.tier, bool):
         raise InputError(f"tier of {task.name} was {task.tier!r}; it must be 1, 2, 3 or None")
 

@@ -29,7 +29,7 @@ from deconfounded.envs.contract.probe import (
     streams,
 )
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.task import Task
+from deconfounded.envs.task import Array, Task
 
 STARTS = 12
 
@@ -126,6 +126,27 @@ def any_batch_size(task: Task) -> None:
     for i in (0, 4):
         alone = observations(task, acts[:, i : i + 1], 11 + i)
         same(together[:, i], alone[:, 0], f"runs of seed {11 + i} among five and alone")
+
+
+def episodes_repeat(task: Task) -> None:
+    """The same seeds give an environment the same episode again: nothing of the one before is left, to the bit.
+
+    A simulator that draws from a generator of its own, which its `reset` does not seed, has another episode.
+    """
+    simulator, row, acts = task.simulator(1), np.arange(1), actions(task, 1, task.horizon)
+    simulator.set_theta(0, task.sample_theta(streams(5))[0])
+
+    def episode() -> list[Array]:
+        start, noise = task.init_state(streams(6)), task.sample_noise(streams(7))
+        states = [simulator.start(row, start, noise)]
+        for action, drawn in zip(acts, noise[0], strict=True):
+            states.append(task.apply_noise(simulator.outcome(states[-1], action, row), drawn[None]))
+            if task.terminated(states[-1])[0] or task.truncated(states[-1])[0]:
+                break
+        return [task.observe(state) for state in states]
+
+    same(episode(), episode(), "two episodes of an environment with the same seeds")
+    simulator.close()
 
 
 def seed_streams(task: Task) -> None:
@@ -228,7 +249,7 @@ CONTRACT: dict[str, Callable[[Task], None]] = {
     for check in (
         *protocols.CHECKS,
         *(no_leak, effect, privileged_view, keep_theta, theta_follows_its_distribution),
-        *(any_batch_size, seed_streams, seed_kinds, forced_theta_moves_nothing_else),
+        *(any_batch_size, episodes_repeat, seed_streams, seed_kinds, forced_theta_moves_nothing_else),
         *(starts_vary_and_nothing_is_constant, observations_share_no_memory),
         *(theta_out_of_bounds, wrong_actions, reset_options),
         *densities.CHECKS,

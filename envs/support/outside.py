@@ -1,5 +1,6 @@
 """Plug-ins: tasks, methods, experts and agents from outside, by `path/file.py:name` or `package.module:name`."""
 
+import ast
 import hashlib
 import importlib
 import importlib.util
@@ -96,9 +97,33 @@ class _Loader(SourceFileLoader):
         raise OSError("no bytecode is to be used")
 
 
+def _module_name(path: Path) -> str:
+    return f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path) + path.read_bytes()).hexdigest()[:8]}"
+
+
+def edited(cls: type) -> bool:
+    """Whether the plug-in file that a class comes from has changed since it was executed."""
+    file = source(cls) if cls.__module__.startswith(PREFIX) else None
+    return file is not None and file.is_file() and cls.__module__ != _module_name(file)
+
+
+def _check_helpers(path: Path) -> None:
+    """Raise InputError if a plug-in file imports a module beside it, and got that of another plug-in's folder."""
+    nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.Import | ast.ImportFrom)]
+    named = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    named += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    for name in {each.partition(".")[0] for each in named}:
+        beside = [path.parent / f"{name}.py", path.parent / name / "__init__.py"]
+        got = getattr(sys.modules.get(name), "__file__", None)
+        if not got or not any(file.is_file() for file in beside) or Path(got) in beside:
+            continue
+        if any(Path(got).is_relative_to(folder) for folder in FOLDERS):
+            raise InputError(f"{path} imports {name}, and got {got} of another plug-in; rename one of the two")
+
+
 def _run(file: Path) -> ModuleType:
     path = file.resolve()
-    name = f"{PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path) + path.read_bytes()).hexdigest()[:8]}"
+    name = _module_name(path)
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
         assert spec is not None
@@ -110,6 +135,7 @@ def _run(file: Path) -> ModuleType:
             FOLDERS.add(folder)
         try:
             spec.loader.exec_module(module)
+            _check_helpers(path)
         except BaseException:
             del sys.modules[name]
             raise

@@ -15,6 +15,7 @@ from deconfounded.benchmarks.engine import catalogue, guest_host, job_files, loc
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import cards, table
 from deconfounded.experts.agent import RandomAgent
+from deconfounded.experts.rollout import run_trials
 from tests import toys
 from tests.tools import deconf
 
@@ -200,6 +201,38 @@ def test_an_agent_of_another_class_gets_numbers_as_in_its_run(monkeypatch: pytes
     agent.reset([np.random.default_rng(seed) for seed in guest_host.fresh([np.random.default_rng(3)])])
     obs = np.zeros((4, 2), np.float32)
     np.testing.assert_array_equal(ready.act(obs), agent.act(obs))
+
+
+def test_what_a_guest_hears_at_a_reset_does_not_tell_the_seed_of_theta() -> None:
+    """Environments have one of 2^31 seeds, which a guest could try one by one, were it not for the salt."""
+    numbers = [guest_host.fresh([np.random.default_rng([7, 1, 0])], salt)[0] for salt in ("", "a", "b", "a")]
+    assert numbers[1] == numbers[3]
+    assert len({*numbers}) == 3
+    assert numbers[0] == np.random.default_rng([7, 1, 0]).integers(2**63)
+    assert all(0 <= number < 2**63 for number in numbers)
+
+
+def test_an_agent_of_others_may_change_its_arrays() -> None:
+    """As it may in a process of its own: what is recorded, and observed next, stays what it was."""
+
+    class Normalising(RandomAgent):
+        def act(self, obs: Any) -> Any:
+            obs -= 5
+            return super().act(obs)
+
+        def observe(self, obs: Any, action: Any, next_obs: Any, alive: Any) -> None:
+            for array in (obs, action, next_obs):
+                array += 3
+            alive[:] = False
+
+    task = toys.Push()
+    played = []
+    for of in (RandomAgent, Normalising):
+        env = envs.BatchEnv(task, 6)
+        played.append(run_trials(env, guest_host.ReseededAgent(of(task.action_space), "salt"), 2, 0))
+    for one, other in zip(vars(played[0].trials).values(), vars(played[1].trials).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(played[0].returns, played[1].returns)
 
 
 def test_the_first_five_seeds_of_a_table_come_first(tmp_path: Path) -> None:

@@ -982,6 +982,18 @@ class Odd(Still):
             saved_agents.save(agent, tmp_path / "kept")
         assert (tmp_path / "kept").exists() == (not says)
 
+    def test_an_agent_whose_file_imports_another(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """That one is not kept; where it is missing, the message says what to do."""
+        (tmp_path / "beside_odd.py").write_text("VALUE = 0.25")
+        text = "    def state(self): return {}, {}\n    @classmethod\n    def from_state(cls, *given): return cls()\n"
+        (tmp_path / "odd.py").write_text(f"import beside_odd\n{HEAD}\nclass Odd(Still):\n{text}")
+        saved_agents.save(outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")(), tmp_path / "kept")
+        monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry != str(tmp_path)])
+        monkeypatch.delitem(sys.modules, "beside_odd")
+        says = r"No module named 'beside_odd' .*; modules that it imports must be importable, as by PYTHONPATH$"
+        with pytest.raises(envs.InputError, match=says):
+            deconfounded.load(tmp_path / "kept")
+
     def test_an_agent_from_outside(self, tmp_path: Path) -> None:
         """It is kept with its code, and does not need the file it came from."""
         text = """

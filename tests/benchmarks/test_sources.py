@@ -95,6 +95,20 @@ def test_whatever_is_read_counts(task: envs.MujocoTask, tmp_path: Path) -> None:
     assert sources.digest(sources.of_task(task)) == first
 
 
+def test_data_files_that_code_names_count(tmp_path: Path) -> None:
+    """Weights and tables beside an expert, or in a folder there; not those that nobody names."""
+    (tmp_path / "weights").mkdir()
+    code = "import helper\nFILE, OTHER, TEXT = 'k.npy', 'gone.npy', 'see 3.5'\ndef control(obs, theta): return obs\n"
+    texts = {"ex.py": code, "helper.py": "ZIP = 'ppo.zip'", "k.npy": "1", "weights/ppo.zip": "2", "not_named.npy": "3"}
+    digests = []
+    for changed in (None, "k.npy", "weights/ppo.zip", "not_named.npy"):
+        for name, text in texts.items():
+            (tmp_path / name).write_text(text + "9" * (name == changed))
+        digests.append(sources.digest(sources.of_reference(f"{tmp_path}/ex.py:control")))
+    assert digests[0] == digests[3]
+    assert len({*digests}) == 3
+
+
 def test_whatever_is_read_travels(task: envs.MujocoTask, tmp_path: Path) -> None:
     """To a cluster's worker, where the task is found and compiles, though its folder is gone."""
     pytest.importorskip("ray")

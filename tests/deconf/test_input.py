@@ -1,6 +1,6 @@
 """What learned agents, configurations, roll-outs and exact policies refuse: one line says what would be right."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -114,10 +114,16 @@ class Plain:
     folder: Any = None
 
 
+@dataclass(frozen=True)
+class Nested:
+    net: Plain = field(default_factory=Plain)
+
+
 @pytest.mark.parametrize(
     ("declared", "says"),
     [
         ({"on_control": {"updates": 3}}, r"on_control={'updates': 3}; configurations must be an object of a dataclass"),
+        ({"on_control": Nested()}, "on_control with the dataclass net; its values must be numbers, texts, lists and"),
         ({"on_control": Plain}, "on_control=<class .*; configurations must be an object"),
         ({"on_control": Plain(), "on_bandit": FlowConfig()}, "on_bandit=FlowConfig.*, and all of the same"),
         ({"on_bandit": Plain()}, "on_bandit=Plain.*, and all of the same"),

@@ -11,6 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from deconfounded import envs
+from deconfounded.benchmarks.certify import certify
 from deconfounded.benchmarks.engine import protocols
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.deconf import learned_reference
@@ -263,6 +264,24 @@ def test_it_is_a_task() -> None:
     assert not isinstance(envs.get(f"{WORLDS}/{EXAMPLES[0]}"), type(task))
 
 
+def test_the_contract_catches_a_generator_of_one_s_own() -> None:
+    """Seeds would not reach it: all trials would have the same noise."""
+
+    class Own(Slide):
+        def __init__(self, theta: float) -> None:
+            super().__init__(theta)
+            self.rng = np.random.default_rng(0)
+
+        def step(self, action: Any) -> Any:
+            obs, *rest = super().step(action)
+            return obs + self.rng.normal(size=1).astype("f4"), *rest
+
+    task = task_with(make=lambda self, theta: Own(theta[0]))
+    with pytest.raises(AssertionError, match=r"^two episodes of an environment with the same seeds differ"):
+        CONTRACT["episodes_repeat"](task)
+    CONTRACT["episodes_repeat"](task_with())
+
+
 def test_actions_are_in_the_world_s_units() -> None:
     task = task_with()
     env = BatchEnv(task, 3)
@@ -370,6 +389,106 @@ def test_thetas_of_a_grid_can_occur() -> None:
     np.testing.assert_allclose(east.cdf(east.ppf(np.linspace(0.1, 0.9, 9))), np.linspace(0.1, 0.9, 9), atol=0.01)
 
 
+@pytest.mark.parametrize("share", [(0.2,) * 5, (0.8, 0.1, 0.1), (0.6, 0.2, 0.2), (0.5, 0.25, 0.25, 0.0)])
+@pytest.mark.parametrize("k", [21, 59])
+def test_a_grid_of_a_category_in_several_numbers(share: tuple[float, ...], k: int) -> None:
+    """Each of those that occur is there, as often as it occurs."""
+    task = task_with(sample_theta=lambda self, rng: np.eye(len(share))[rng.choice(len(share), p=share)])
+    grid = task.theta_grid(k)
+    assert len(grid) <= k
+    np.testing.assert_allclose(grid.mean(0), share, atol=0.04)
+
+
+def test_a_rare_theta_takes_a_place_of_a_grid() -> None:
+    task = task_with(sample_theta=lambda self, rng: np.eye(3)[rng.choice(3, p=[0.989, 0.01, 0.001])])
+    assert sorted(np.unique(task.theta_grid(21), axis=0, return_counts=True)[1]) == [1, 1, 21]
+
+
+def test_a_grid_of_numbers_that_depend_on_each_other() -> None:
+    """It has their means, variances and correlation; of independent ones it has the quantiles of each."""
+
+    def together(self: Any, rng: np.random.Generator) -> Any:
+        x, y = rng.standard_normal(2)
+        return np.array([x, 0.9 * x + 0.2 * y])
+
+    def apart(self: Any, rng: np.random.Generator) -> Any:
+        return rng.uniform(0, 1, 2)
+
+    def mixed(self: Any, rng: np.random.Generator) -> Any:
+        arm = rng.choice(3, p=[0.5, 0.3, 0.2])
+        return np.array([*np.eye(3)[arm], arm + rng.uniform()])
+
+    grid = task_with(sample_theta=together).theta_grid(59)
+    np.testing.assert_allclose(np.cov(grid.T), [[1.0, 0.9], [0.9, 0.85]], atol=0.13)  # of draws: the tails are cut off
+    grid = task_with(sample_theta=apart).theta_grid(21)
+    by_quantile = np.sort(grid, 0).reshape(7, 7, 2)
+    np.testing.assert_allclose(by_quantile.mean(1), np.repeat(np.arange(0.5, 7)[:, None] / 7, 2, 1), atol=0.03)
+    assert abs(np.corrcoef(grid.T)[0, 1]) < 0.05
+    grid = task_with(sample_theta=mixed).theta_grid(59)
+    np.testing.assert_allclose(grid[:, :3].mean(0), [0.5, 0.3, 0.2], atol=0.03)
+    np.testing.assert_array_equal(np.floor(grid[:, 3]), grid[:, :3].argmax(1))
+
+
+def test_a_grid_of_many_numbers_is_no_larger_than_their_draws() -> None:
+    task = task_with(sample_theta=lambda self, rng: rng.uniform(-1, 1, 14))
+    grid = task.theta_grid(21)
+    assert 128 <= len(grid) <= 500
+    np.testing.assert_allclose(grid.std(0), 3**-0.5, atol=0.1)
+    assert task.facts.draws.shape == (2000, 14)
+
+
+def test_amounts_of_numpy_are_plain_ones() -> None:
+    """Results hold them as json does."""
+    task = task_with(episodes=np.int64(2), steps=np.int64(6))
+    assert [type(amount) for amount in (task.episodes, task.horizon)] == [int, int]
+    envs.check_task(task)
+
+
+def test_an_expert_may_give_an_action_in_any_shape_of_its_size() -> None:
+    task = task_with(expert=lambda self, obs, theta: 2.0 if obs[0] > 0 else np.array([[2.0]]))
+    np.testing.assert_array_equal(task.expert_mean(np.array([[1.0], [-1.0]]), np.zeros((2, 1))), np.zeros((2, 1)))
+
+
+def test_an_expert_is_asked_after_the_end_by_the_check_too() -> None:
+    """As it is in runs, where one environment of many has ended."""
+
+    def expert(self: Any, obs: Any, theta: Any) -> Any:
+        assert abs(obs[0]) <= 4, "no action after the end"
+        return 2 - 9 * obs
+
+    task = task_with(expert=expert, sample_theta=lambda self, rng: rng.uniform(4, 9, 1))
+    with pytest.raises(envs.InputError, match=r"^expert of sliding: no action after the end"):
+        envs.check_task(task)
+
+
+def test_a_world_of_long_steps_has_a_frame_rate() -> None:
+    assert envs.GymEnv(task_with().changed(control_dt=5.0)).metadata["render_fps"] == 1
+
+
+def test_a_theta_that_does_not_vary_is_left_out() -> None:
+    """Before anything is measured."""
+    task = task_with(sample_theta=lambda self, rng: np.array([rng.uniform(-1, 1), 10.0]), names=("push", "g"))
+    with pytest.raises(envs.InputError, match=r"^g of sliding was 10 in all draws of theta; it must vary, or be left"):
+        certify(task, policy.load(task))
+
+
+def test_observations_that_never_change_have_no_dynamics() -> None:
+    class Still(Slide):
+        def step(self, action: Any) -> Any:
+            super().step(action)
+            return np.zeros(1, "f4"), 0.0, False, False, {}
+
+        def reset(self, **options: Any) -> Any:
+            super().reset(**options)
+            return np.zeros(1, "f4"), {}
+
+    task = task_with(make=lambda self, theta: Still(theta[0]))
+    with pytest.raises(
+        envs.InputError, match=r"^observations of sliding never changed within an episode; there are no"
+    ):
+        learn(task, policy.load(task), 8, 0)
+
+
 def dict_obs(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"observation_space": spaces.Dict(x=spaces.Box(-1, 1, (1,)))})(0.0)
 
@@ -434,6 +553,7 @@ class TestErrors:
         ("make", paid(np.ones(2)), r"step of sliding gave the reward array\(\[1., 1.\]\); it must be a number"),
         ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),
         ("sample_theta", lambda self, rng: [np.nan], "sample_theta of Sliding gave .nan.; it must be"),
+        ("sample_theta", lambda self, rng: UNSURE.random(1), "sample_theta of sliding gave two thetas for one state"),
         ("sample_theta", lambda self, rng: [1] * rng.integers(1, 3), "it must be . finite numbers, as at first"),
         ("expert", lambda self, obs, theta: np.zeros(3), r"expert of sliding gave .* must be of shape \(1,\)"),
         ("expert", lambda self, obs, theta: None, "expert of sliding gave None for an observation; it must be of"),

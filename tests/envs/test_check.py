@@ -118,6 +118,16 @@ class NarrowBounds(SlipperyCartpole):
     observation = {**SlipperyCartpole.observation, "velocity": (-20, 0.5)}
 
 
+class ChangesItsState(SlipperyCartpole):
+    def observe(self, state: Array) -> Array:
+        state[:, 0] += 1
+        return super().observe(state)
+
+
+class NumpyHorizon(SlipperyCartpole):
+    horizon = np.int64(400)  # type: ignore[assignment]  # which no results hold
+
+
 class NoCamera(SlipperyCartpole):
     def spec(self) -> mujoco.MjSpec:
         spec = super().spec()
@@ -147,6 +157,8 @@ class NoCamera(SlipperyCartpole):
         (TableOfActions, r"action_space of slippery_cartpole was .* \(1, 1\), .*; it must be Box\(-1, 1, "),
         (NarrowBounds, "observation velocity of slippery_cartpole was .*; its bounds, -20 to 0.5, must be wide enough"),
         (NoCamera, "cameras of slippery_cartpole were side; one must be called view"),
+        (ChangesItsState, r"observe of slippery_cartpole: .*read-only.* \(ValueError, test_check.py:\d+\)"),
+        (NumpyHorizon, r"horizon of slippery_cartpole was .*400.*; it must be a whole number, an int, from 1 up"),
         (MisspeltName, r"terminated of slippery_cartpole: .*'LIMIT'.* \(NameError, test_check.py:\d+\)"),
     ],
 )
@@ -308,6 +320,17 @@ class LenientActions(SlipperyCartpole):
         return np.zeros((n, 1))
 
 
+class LeftoverState(SlipperyCartpole):
+    def simulator(self, n: int) -> Any:
+        simulator, outcome, steps = super().simulator(n), type(super().simulator(n)).outcome, iter(range(10**9))
+
+        def worn(state: Array, action: Array, rows: Any = None) -> Array:
+            return outcome(simulator, state, action, rows) + 1e-9 * next(steps)
+
+        simulator.outcome = worn  # type: ignore[method-assign]
+        return simulator
+
+
 class UnnamedGeom(SlipperyCartpole):
     def spec(self) -> mujoco.MjSpec:
         spec = super().spec()
@@ -327,6 +350,7 @@ class UnnamedGeom(SlipperyCartpole):
         (OwnRandomness, "gymnasium_env", "gymnasium's checker: "),
         (OwnRandomness, "adapters_agree", "first observations of GymVectorEnv and SyncVectorEnv differ"),
         (OwnRandomness, "any_batch_size", "runs of seed 11 among five and alone differ"),
+        (LeftoverState, "episodes_repeat", "two episodes of an environment with the same seeds differ"),
         (OwnRandomness, "seed_streams", "the start and what the seed's second stream draws differ"),
         (OwnRandomness, "seed_kinds", "first observations of seed 3 and .* differ"),
         (OwnRandomness, "privileged_view", "observations with and without the privileged view differ"),
@@ -414,7 +438,7 @@ def test_the_contract_is_whole() -> None:
     of_interfaces = "gymnasium_env stable_baselines dm_env_tests adapters_agree time_limit reset_options wrong_actions"
     of_theta = "no_leak effect privileged_view keep_theta theta_follows_its_distribution theta_out_of_bounds"
     of_theta += " forced_theta_moves_nothing_else"
-    of_seeds = "any_batch_size seed_streams seed_kinds"
+    of_seeds = "any_batch_size episodes_repeat seed_streams seed_kinds"
     of_maths = "starts_vary_and_nothing_is_constant observations_share_no_memory"
     of_maths += " log_prob_is_the_density_of_the_noise log_sense_is_the_density_of_the_readings"
     of_physics = "bounds_are_wide_enough set_in_place_equals_recompiled nominal_model_is_not_touched"

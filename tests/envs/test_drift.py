@@ -75,6 +75,19 @@ def test_what_does_not_drift_stays() -> None:
         envs.Latent("x", "", 0, 3, "categorical", 0.1)
 
 
+def test_what_does_not_drift_stays_beside_what_does() -> None:
+    """To the bit, and whatever category it is of."""
+    latents = (
+        *(envs.Latent("gain", "", 0, 48, "categorical"), envs.Latent("mass", "kg", 0.3, 7.0, "loguniform")),
+        *(envs.Latent("wind", "m/s", -0.7, 0.4), envs.Latent("walk", "", 0, 1, drift=0.3)),
+    )
+    task = type("Mixed", (Push,), {"latents": latents})()
+    theta = task.sample_theta(streams(*range(500)))
+    later = task.drifted(theta, streams(*range(500)))
+    np.testing.assert_array_equal(later[:, :3], theta[:, :3])
+    assert (later[:, 3] != theta[:, 3]).all()
+
+
 def test_thetas_are_those_of_the_trials() -> None:
     """Drawn once more from their seeds, episode by episode; they move, and stay where they may be."""
     task, seen = Walking(), list[Array]()

@@ -131,6 +131,24 @@ def test_a_seed_in_the_middle_starts_a_new_trial() -> None:
         assert (new != first).all()
 
 
+def test_a_trial_of_actions_in_other_units() -> None:
+    """The action before is in the units of the environment that was wrapped."""
+    for low, high, taken in np.array([(-5.0, 5.0, 2.5), (1.0, 3.0, 2.5)], np.float32):
+        whole = envs.TrialEnv(gymnasium.wrappers.RescaleAction(envs.make(NAME, episodes=2), low, high))
+        assert whole.observation_space.contains(whole.reset(seed=0)[0])  # where there is no action before, 0
+        for action, before in ((taken, taken), (9.0, high), (-9.0, low)):
+            obs = whole.step(np.array([np.clip(action, low, high)], np.float32))[0]
+            assert obs[-2] == before
+            assert whole.observation_space.contains(obs)
+
+
+@pytest.mark.parametrize("action", [1, np.int64(1), np.array(1), np.array([1])])
+def test_a_trial_takes_what_its_environment_takes(action: Any) -> None:
+    whole = envs.TrialEnv(envs.make("bandit", episodes=2))
+    whole.reset(seed=0)
+    np.testing.assert_array_equal(whole.step(action)[0][-6:-1], np.eye(5)[1])
+
+
 def test_a_trial_has_the_action_that_was_taken() -> None:
     """Of an action beyond the bounds it is the bound."""
     whole = envs.TrialEnv(envs.make(NAME, episodes=2))

@@ -1,0 +1,80 @@
+"""Files of one's own: what is executed of them, and when."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deconfounded import envs
+from deconfounded.envs.support import outside
+from deconfounded.experts import policy
+
+TASK = "from tests.toys import Push\nclass {name}(Push):\n    name = 'own_push'\n    horizon = {horizon}\n"
+
+
+@pytest.fixture(autouse=True)
+def clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Tasks, modules and folders of one test are unknown to the next."""
+    monkeypatch.setattr("sys.path", [*os.sys.path])  # type: ignore[attr-defined]
+    monkeypatch.setattr("sys.modules", {**os.sys.modules})  # type: ignore[attr-defined]
+    monkeypatch.setattr(outside, "FOLDERS", {*outside.FOLDERS})
+    yield
+    envs.TASKS.pop("own_push", None)
+
+
+def test_a_task_is_that_of_the_file_as_it_is_now(tmp_path: Path) -> None:
+    """Within a process, as in a notebook; what was made before stays what it was."""
+    file, reference = tmp_path / "mine.py", f"{tmp_path / 'mine.py'}:Mine"
+    file.write_text(TASK.format(name="Mine", horizon=6))
+    first = envs.get(reference)
+    assert type(envs.get(reference)) is type(first) is type(envs.get("own_push"))
+    file.write_text(TASK.format(name="Mine", horizon=9))
+    assert [task.horizon for task in (first, envs.get(reference), envs.get("own_push"))] == [6, 9, 9]
+    file.unlink()
+    assert envs.get(reference).horizon == 9
+
+
+def test_a_world_is_that_of_the_file_as_it_is_now(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    text = "from tests.envs.test_blackbox import Sliding\nclass OwnPush(Sliding):\n    steps = {}\n"
+    horizons = []
+    for steps in (6, 9, 9):
+        file.write_text(text.format(steps))
+        horizons.append(envs.get(f"{file}:OwnPush").horizon)
+    assert horizons == [6, 9, 9]
+
+
+def test_two_tasks_of_one_file_and_name_stay_refused(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("\n".join(TASK.format(name=name, horizon=6) for name in ("Mine", "Other")))
+    envs.get(f"{tmp_path}/mine.py:Mine")
+    with pytest.raises(envs.InputError, match=r"^task name 'own_push' of .* is taken by"):
+        envs.get(f"{tmp_path}/mine.py:Other")
+
+
+def test_helpers_of_one_name_in_two_folders(tmp_path: Path) -> None:
+    """The second file would silently get the first one's; of one folder, and of installed modules, nothing is said."""
+    for folder, gain in (("a", 1), ("b", -1)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "util.py").write_text(f"GAIN = {gain}")
+        (tmp_path / folder / "random.py").write_text("")  # which Python does not take
+        for name in ("mine", "more"):
+            text = "import random\nimport numpy as np\nfrom util import GAIN\n"
+            (tmp_path / folder / f"{name}.py").write_text(text + "def control(obs, theta): return GAIN * obs[:, :1]\n")
+    task = envs.get("slippery_cartpole")
+    obs, theta = np.full((2, 6), 0.5), np.ones((2, 1))
+    for name in ("mine", "more"):
+        expert = policy.load(task, f"{tmp_path}/a/{name}.py:control")
+        np.testing.assert_array_equal(expert.mean(obs, theta), np.full((2, 1), 0.5))  # type: ignore[attr-defined]
+    for _ in range(2):
+        with pytest.raises(
+            envs.InputError, match=r"b/mine.py imports util, and got .*a/util.py of another plug-in; re"
+        ):
+            policy.load(task, f"{tmp_path}/b/mine.py:control")
+
+
+def test_a_discrete_world_has_its_own_expert() -> None:
+    world = Path(__file__).parents[2] / "docs" / "worlds" / "reversed_cart.py"
+    with pytest.raises(envs.InputError, match=r"that of reversed_cart is the world's own `expert`, as actions are dis"):
+        policy.load(envs.get(f"{world}:ReversedCart"), "mine.py:control")
