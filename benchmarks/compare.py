@@ -54,5 +54,7 @@ def main() -> None:
     for key in ("set", "salt") if package else ():
         if changed := sorted({str(record[key]) for record in every if record[key]}):
             print(f"note: runs of {key} {', '.join(changed)}; the records that come with the package have none")
+    if len(salts := sorted({record["salt"] or "none" for record in every})) > 1:
+        print(f"note: runs of salts {', '.join(salts)}: a seed has other thetas in each, and nothing is paired")
     for line in comparison.outdated(every, against):
         print(f"note: {line}")

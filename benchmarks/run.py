@@ -99,6 +99,7 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
         for task in tasks:
             folder = folders[task.name]
             try:
+                run_report.check_kept(task, folder)
                 finished, about, errors = commands.run(
                     BenchmarkJob, task, args, methods, folder, where, run_report.check_references
                 )

@@ -1,6 +1,7 @@
 """The benchmark's job: train one method with some seeds, deploy it, and write down what came of it."""
 
 import contextlib
+import errno
 import secrets
 import shutil
 from collections.abc import Callable, Sequence
@@ -28,6 +29,7 @@ from deconfounded.experts.rollout import of_steps, run_trials
 from deconfounded.experts.trials import Trials
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
+FULL = (errno.ENOSPC, errno.EDQUOT)  # of a disk
 QUANTILE = 0.85  # of the first latent, in the trial of the video
 
 
@@ -169,6 +171,9 @@ class BenchmarkJob(Job):
                 elif isinstance(agent, LearnedAgent):
                     saved_agents.save(agent.of_seed(i), folder, **about)
             except Exception as error:  # the results stand, whatever becomes of the agent
+                shutil.rmtree(folder, ignore_errors=True)  # what of it was written
+                if isinstance(error, OSError) and error.errno in FULL:
+                    raise  # a later run goes on from the checkpoint, and keeps it
                 note = f"its agent is not kept: {error_line(error)}"
         return note
 

@@ -232,6 +232,8 @@ def fit_guest(context: Context, name: str, method: Method) -> Agent:
     """The agent of a method from outside, fitted in this process to the data that `Guest` would hand it."""
     provider, function = Provider(context, method.uses, context.rngs), outside.find("method", method.reference)
     provider.open -= {"acting theta"}
+    if (file := outside.file(method.reference)) and method.reference.rpartition(":")[0].endswith(".py"):
+        outside.check_helpers(file)
 
     def ask(kind: str, *details: Any, agent: Agent | None = None) -> Any:
         return provider(kind, *details, agent=agent and ReseededAgent(agent, context.salt))

@@ -18,6 +18,8 @@ META: dict[str, Any] = {  # what a file says of itself, and of what types
 }
 SCORED = {"agents": dict, "curve": dict, "tier": str}  # and what a file of run.py says beside that
 OF_AGENT = ("returns", "objective", "probe")
+LARGEST = 1e100  # return, whose square is still a number
+DAMAGED = "it is damaged"
 
 
 def broken(data: dict[str, Any]) -> str:
@@ -35,6 +37,8 @@ def broken(data: dict[str, Any]) -> str:
         returns, objective, probe = (data.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
         if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
             return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
+        if np.abs(returns).max(initial=0) > LARGEST:
+            return f"returns of {name} are up to {np.abs(returns).max():.2g}; they must be at most {LARGEST:g}"
     for key, value in data.items():
         if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
             return f"{key} holds NaN or infinity"
@@ -79,7 +83,11 @@ def left_in(folder: Path) -> Finished:
     """
     finished = []
     for file in sorted(folder.glob("*-*.npz")):
-        if (data := read(file)) is None or "agents" not in (meta := data["meta"]):
+        if (data := read(file)) is None:
+            if not file.stem.startswith("demonstrations-"):
+                print(f"{file.name} is left out: {DAMAGED}; run it again with --resume")
+            continue
+        if "agents" not in (meta := data["meta"]):
             continue
         if why := broken(data):
             print(f"{file.name} is left out: {why}")

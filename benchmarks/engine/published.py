@@ -7,6 +7,7 @@ from typing import Any
 
 from deconfounded import envs
 from deconfounded.benchmarks.console import ROOT
+from deconfounded.envs.support import outside
 
 CERTIFICATES, RECORDS = ROOT / "docs" / "certificates", ROOT / "docs" / "records"
 GROUPS = ("certified", "suite", "hard")  # names for several tasks
@@ -31,5 +32,8 @@ def passed(certificates: Mapping[str, Any]) -> list[str]:
 def tasks(asked: list[str]) -> list[envs.Task]:
     """Tasks by names, references and GROUPS, each once. Raises InputError for a name that is unknown."""
     groups = {"certified": certified, "suite": lambda: list(envs.SUITE), "hard": lambda: list(envs.HARD)}
+    for each in asked:
+        if each not in (known := [*envs.names(), *groups]) and not outside.is_outside(each):
+            raise envs.closest("task", each, known, "; your own is path/file.py:Class")
     names = [name for each in asked for name in (groups[each]() if each in groups else [each])]
     return [envs.get(name) for name in dict.fromkeys(names)]

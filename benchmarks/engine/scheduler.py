@@ -12,7 +12,7 @@ import numpy as np
 
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
-from deconfounded.benchmarks.engine.job_files import Finished, in_name, read
+from deconfounded.benchmarks.engine.job_files import DAMAGED, Finished, in_name, read
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.errors import InputError, error_line
@@ -95,9 +95,10 @@ def run_all(
     for job, missing in zip(every, left, strict=True):
         for seed in job.seeds:
             found = read(job.file(seed))
-            if found is not None and (why := job.unfit(seed, found)):
+            why = DAMAGED if found is None else job.unfit(seed, found)
+            if why and job.file(seed).exists():
                 print(f"{job.file(seed).name} is made again: {why}")
-            if found is None or why:
+            if why:
                 missing.append(seed)
     parts = [
         replace(job, seeds=part)
@@ -121,14 +122,22 @@ def run_all(
     for job in () if failed else every:
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
-    finished = results(written(every[0], folder))
+    finished = results(written(every[0], folder), say=True)
     made = {(job.method, seed) for job, missing in zip(every, left, strict=True) for seed in missing}
     return finished, sum((method, seed) not in made for method, seed, _ in finished), failed
 
 
-def results(done: Sequence[Job]) -> Finished:
-    """What jobs of a seed each have written: method, seed and arrays of each file that fits."""
-    return [(job.method, job.seeds[0], data) for job in done if (data := job.load(job.seeds[0])) is not None]
+def results(done: Sequence[Job], say: bool = False) -> Finished:
+    """What jobs of a seed each have written: method, seed and arrays of each file that fits. say: print of others."""
+    finished: Finished = []
+    for job in done:
+        found = read(file := job.file(seed := job.seeds[0]))
+        why = DAMAGED if found is None else job.unfit(seed, found)
+        if found is not None and not why:
+            finished.append((job.method, seed, found))
+        elif say:
+            print(f"{file.name} is left out: {why}; run it again with --resume")
+    return finished
 
 
 def written(like: Job, folder: Path) -> list[Job]:

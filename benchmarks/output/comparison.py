@@ -4,6 +4,7 @@ Scores are normalised by one rule (`aggregation.references`). A method is compar
 """
 
 import csv
+import difflib
 import io
 import re
 from collections.abc import Mapping, Sequence
@@ -40,12 +41,15 @@ def published(every: Sequence[Record], against: Sequence[str]) -> list[Record]:
 
 
 def outdated(every: Sequence[Record], against: Sequence[str]) -> list[str]:
-    """A line for each method whose `published` records are of another version than today's."""
-    versions = {record["method"]: record["method_version"] for record in published(every, against)}
+    """A line for each method of which records that are compared are of another version than today's."""
+    versions: dict[tuple[str, str], set[int]] = {}
+    for where, made in (("given", every), ("of the package", published(every, against))):
+        for record in made:
+            versions.setdefault((record["method"], where), set()).add(record["method_version"])
     return [
-        f"{name} is of version {version} in the records of the package; today's is {METHODS[name].version}"
-        for name, version in versions.items()
-        if version != METHODS[name].version
+        f"{name} is of version {' and '.join(map(str, sorted(of)))} in the records {where}; today's is {today}"
+        for (name, where), of in versions.items()
+        if name in METHODS and not METHODS[name].reference and of != {today := METHODS[name].version}
     ]
 
 
@@ -83,6 +87,9 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
         of[record["seed"]] = scoring.normalise(np.array(record["returns"][: record["episodes"]]), zero, one)
 
     aggregation.one_text(every)
+    for name, of_method in records.grouped(every, lambda record: record["method"]).items():
+        if len({record["outside"].get("method") for record in of_method}) > 1:
+            raise InputError(f"records of {name} are of two texts of its file; make them again with one")
     for record in every:
         if records.named(record) not in REFERENCES:
             add(record)
@@ -91,9 +98,15 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
     for record in published(every, against):
         add(record)
     for name in against:
+        if name in REFERENCES:
+            raise InputError(f"--against {name}: scores are made by random, 0, and expert, 1; give a method")
         if name not in scores:
-            known = list(dict.fromkeys([*scores, *METHODS]))
-            raise InputError(f"--against {name}: no record is of it on these tasks; there are {', '.join(known)}")
+            tasks = dict.fromkeys(record["task"] for record in every)
+            package = [records.named(one) for task in tasks for one in records.of_task(RECORDS, task)]
+            known = [each for each in dict.fromkeys([*scores, *package]) if each not in REFERENCES]
+            near = difflib.get_close_matches(name, known, 1)
+            hint = f"did you mean {near[0]}? " if near else ""
+            raise InputError(f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(known)}")
     return scores
 
 
@@ -206,7 +219,7 @@ def notes(scores: Scores) -> str:
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
         " come with the package, or of the runs on a task that these do not have. Regret is the expert's score less the"
         " method's, summed over the episodes; less is better. Differences are paired by seed; their 95% intervals are"
-        " Student's, over tasks Welch's."
+        " Student's, over tasks Welch's. Over tasks they are of means, not of interquartile means."
         f" IQM is the interquartile mean of all runs; its interval is a stratified bootstrap{held}. The interval of P"
         " is a stratified bootstrap too."
     )

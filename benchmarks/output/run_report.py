@@ -26,12 +26,22 @@ def check_references(task: envs.Task, about: dict[str, Any], finished: Finished)
     aggregation.references(made[0], made)
 
 
+def check_kept(task: envs.Task, folder: Path) -> None:
+    """Raises InputError if the records of an earlier report in a run's folder are damaged."""
+    file = folder / "records" / records.place(task.name)
+    try:
+        records.held(file)
+    except envs.InputError as error:
+        raise envs.InputError(f"{error}; remove that file, and `deconf report` makes it again from jobs/") from None
+
+
 def write(task: envs.Task, about: dict[str, Any], finished: Finished, folder: Path) -> str:
     """Everything that a folder shows, from what its jobs left there; returns the table. No training happens here.
 
     about: what the folder is for, as its settings.json says. Numbers come first: they stand, whatever pictures do.
     """
     made = records.of_run(finished, about["preset"], about["set"], task.episodes)
+    check_kept(task, folder)
     records.write(folder / "records", made)
     results = {**aggregation.gather(made, list(METHODS)), "resumed": about.get("resumed", len(finished))}
     write_json(folder / "results.json", results)

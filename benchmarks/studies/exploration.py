@@ -4,6 +4,7 @@ Each method that explores or queries the expert, with all of its preset's trials
 Records in docs/ stand for the first. Interrupted, it goes on where it was; points of former runs are kept.
 """
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,7 @@ AMOUNTS = ("explore_trials", "query_trials")
 ENOUGH = 3  # amounts, from which on a task is drawn
 TASKS = ("slippery_cartpole", "curling")
 ENDS = ("first", "last")
+PLAIN: dict[str, Any] = {"preset": "default", "set": []}  # of which a point says nothing
 TICKS = (8, 32, 128, 512)  # trials
 
 Key = tuple[str, str, int]
@@ -129,6 +131,14 @@ def measured(made: "list[Record]", method: str, share: int) -> Point:
     }
 
 
+def check_file(file: Path, asked: dict[str, Any]) -> None:
+    """Raises InputError if a file holds points of another preset or --set than those asked for."""
+    for point in json.loads(file.read_bytes()) if file.is_file() else ():
+        if (before := {key: point.get(key, plain) for key, plain in PLAIN.items()}) != asked:
+            what = ", ".join(f"{key} {before[key] or 'none'}" for key in PLAIN if before[key] != asked[key])
+            raise envs.InputError(f"{file} holds points of {what}; give another --out")
+
+
 def added(file: Path, point: Point) -> dict[Key, Point]:
     """The points of a file, with one more or in place of the one before."""
 
@@ -156,6 +166,8 @@ def main() -> None:
     folder = args.out or Path("results") / "exploration"
     check_folder(folder)
     file, points = folder / "exploration.json", dict[Key, Point]()
+    check_file(file, asked := {"preset": args.preset, "set": list(args.set)})
+    stated = {} if asked == PLAIN else asked
     for task in tasks:
         whole = changed(preset(args.preset, task, args.device), args.set)
         for share in args.shares:
@@ -165,7 +177,7 @@ def main() -> None:
             for method in methods:
                 made = [] if changes or args.preset != "default" else recorded(task, settings, method, args.seeds)
                 made = made or runs.run(task, settings, (*REFERENCES, method), range(args.seeds), own, **options)
-                points = added(file, point := measured(made, method, share))
+                points = added(file, point := {**measured(made, method, share), **stated})
                 ends = ", ".join(two_decimals(float(np.mean(point[end]))) for end in ENDS)
                 print(f"{task.name}, {method}, {point['explored']} trials: {ends} in the first and the last episode")
     picture(list(points.values()), folder / "exploration.png")

@@ -29,7 +29,8 @@ def find(kind: str, reference: str) -> Any:
     """Import the object that a reference names. kind: what it should be, for the error.
 
     A file is executed once, and again if it has changed; its folder is appended to the import path. Raises InputError
-    if there is no such file, module or name in it, or if executing it fails.
+    if there is no such file, module or name in it, or if executing it fails; and by `check_helpers`, but for methods,
+    which are fitted in processes of their own.
     """
     where, _, name = reference.rpartition(":")
     if not where or not name:
@@ -44,6 +45,8 @@ def find(kind: str, reference: str) -> Any:
         raise InputError(f"{error} ({line})") from error
     except (Exception, SystemExit) as error:
         raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
+    if where.endswith(".py") and kind != "method":
+        check_helpers(here(Path(where)))
     if not hasattr(module, name):
         public = {key: value for key, value in vars(module).items() if not key.startswith("_")}
         own = [key for key, value in public.items() if getattr(value, "__module__", "") == module.__name__]
@@ -107,8 +110,9 @@ def edited(cls: type) -> bool:
     return file is not None and file.is_file() and cls.__module__ != _module_name(file)
 
 
-def _check_helpers(path: Path) -> None:
+def check_helpers(file: Path) -> None:
     """Raise InputError if a plug-in file imports a module beside it, and got that of another plug-in's folder."""
+    path = file.resolve()
     nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.Import | ast.ImportFrom)]
     named = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
     named += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
@@ -135,7 +139,6 @@ def _run(file: Path) -> ModuleType:
             FOLDERS.add(folder)
         try:
             spec.loader.exec_module(module)
-            _check_helpers(path)
         except BaseException:
             del sys.modules[name]
             raise

@@ -74,6 +74,10 @@ class TestSeveralTasks:
         assert names[-1] == "hidden_goal"
         assert set(envs.SUITE) - set(names) == {"forked_path"}
         assert [task.name for task in published.tasks(["suite"])] == list(envs.SUITE)
+        with pytest.raises(
+            InputError, match=r"^task 'certifed' is unknown; did you mean 'certified'\? there are bandit"
+        ):
+            published.tasks(["bandit", "certifed"])
 
     @pytest.mark.slow
     @pytest.mark.usefixtures("no_pictures")
@@ -160,6 +164,14 @@ def test_records_of_two_kinds_are_not_compared(key: str) -> None:
     other = {**other, key: "0" * 64 if key == "expert" else other[key] + 1}
     with pytest.raises(InputError, match=f"have {key} .*; such are not to be compared"):
         comparison.gathered([one, other], [])
+
+
+def test_records_of_two_texts_of_a_method_are_not_compared() -> None:
+    """On two tasks; they would be averaged over."""
+    of_texts = [record("mine", 0, 0.5, task) | {"outside": {"method": task}} for task in ("curling", "bandit")]
+    with pytest.raises(InputError, match="records of mine are of two texts of its file; make them again with one"):
+        comparison.gathered(of_texts, [])
+    assert comparison.gathered([made | {"outside": {"method": "a"}} for made in of_texts], [])
 
 
 @pytest.mark.slow
@@ -367,6 +379,17 @@ class TestComparison:
             assert comparison.outdated([record("mine", 0, 0.5)], ["naive_rnn"]) == lines
             (tmp_path / "curling.jsonl").unlink()
 
+    def test_records_of_several_versions_are_named(self) -> None:
+        """In whatever order their tasks are given; methods from outside have no versions."""
+        today = catalogue.METHODS["gail"].version
+        made = [
+            record("gail", 0, 0.5, task) | {"method_version": version}
+            for task, version in (("curling", today), ("bandit", today - 1))
+        ]
+        line = f"gail is of version {today - 1} and {today} in the records given; today's is {today}"
+        assert comparison.outdated(made, []) == comparison.outdated(made[::-1], []) == [line]
+        assert comparison.outdated([*made[:1], record("mine", 0, 0.5)], []) == []
+
     def test_a_mean_over_tasks(self) -> None:
         """Welch's interval holds the mean as often as it says, of three seeds."""
         rng, held = np.random.default_rng(0), []
@@ -385,6 +408,7 @@ class TestComparison:
         monkeypatch.setattr(comparison, "write", lambda *_: "written")
         monkeypatch.setattr(comparison, "outdated", lambda *_: [])
         changes = ({}, {"preset": "smoke"}, {"salt": "x"}, {"set": ["seeds=2"], "preset": "paper"})
+        unpaired = "note: runs of salts none, x: a seed has other thetas in each, and nothing is paired"
         made = [record("mine", seed, 0.5) | change for seed, change in enumerate(changes)]
         for name, kept in (("plain", made[:1]), ("all", made)):
             records.write(tmp_path / name, kept)
@@ -393,9 +417,8 @@ class TestComparison:
         assert [each["seed"] for each in read] == [0, 0, 1, 2, 3]
         kinds = ("preset paper, smoke", "set ['seeds=2']", "salt x")
         lines = capsys.readouterr().out.splitlines()
-        assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + [
-            f"note: runs of {kind}" for kind in kinds
-        ]
+        noted = [f"note: runs of {kind}" for kind in kinds]
+        assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + noted + [unpaired]
 
     def test_bad_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
@@ -403,6 +426,14 @@ class TestComparison:
             comparison.gathered(twice, [])
         with pytest.raises(InputError, match="--against nobody: no record is of it"):
             comparison.gathered(twice[:1], ["nobody"])
+        for wrong, near in (("naive_rn", "naive_rnn"), ("deconfounded_modes", "deconfounded_mode")):
+            with pytest.raises(
+                InputError, match=f"--against {wrong}: .*; did you mean {near}. there are mine, .*, rma"
+            ):
+                comparison.gathered(twice[:1], [wrong])
+        for reference in ("random", "expert"):
+            with pytest.raises(InputError, match=f"--against {reference}: scores are made by random, 0, and expert, 1"):
+                comparison.gathered(twice[:1], [reference])
         with pytest.raises(InputError, match="holds no records"):
             compare.read(tmp_path)
         records.write(tmp_path, twice[:1])

@@ -59,6 +59,23 @@ def test_two_programs_add_to_a_file(tmp_path: Path) -> None:
     assert {key[0]: of["last"] for key, of in points.items()} == {"curling": [0.7], "windy_drone": [0.6]}
 
 
+def test_points_of_two_presets_are_not_in_one_file(tmp_path: Path) -> None:
+    """They would take each other's places; points of the default preset do not say so."""
+    file, plain = tmp_path / "exploration.json", {"preset": "default", "set": []}
+    smoke = {"preset": "smoke", "set": ["dpt.rounds=1"]}
+    exploration.check_file(file, smoke)
+    exploration.added(file, point("curling", "dpt", 1, [0.9]))
+    exploration.check_file(file, plain)
+    with pytest.raises(envs.InputError, match=r"exploration.json holds points of preset default, set none; give anoth"):
+        exploration.check_file(file, smoke)
+    exploration.added(file, point("curling", "dpt", 1, [0.9]) | smoke)
+    exploration.check_file(file, smoke)
+    with pytest.raises(
+        envs.InputError, match=r"holds points of preset smoke, set \['dpt.rounds=1'\]; give another --out"
+    ):
+        exploration.check_file(file, plain)
+
+
 def test_records_that_stand_for_all_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of the method and of the references, of as many seeds as the other amounts have; none if one is missing."""
     task, methods = envs.get("curling"), ("random", "expert", "dagger", "rma")

@@ -322,6 +322,10 @@ class TestCommands:
         assert scored["return"]["random"] == pytest.approx(own, abs=1e-4)
         assert scored["return"] != score_command.rescore(agent, PUSH, EXPERT, 16, 7, PUSH)["return"]
 
+    def test_a_range_that_ends_before_it_begins(self) -> None:
+        with pytest.raises(envs.InputError, match=r"--range was 'best_arm=3:1'; 3 must be at most 1"):
+            score_command.with_ranges(envs.get("bandit"), ["best_arm=3:1"])
+
     def test_salt_of_a_score(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         seeds: list[int] = []
         scored = {"score": [0.0], "ci95_last": None}

@@ -1,5 +1,6 @@
 """Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; docs/'s."""
 
+import errno
 import hashlib
 import importlib
 import importlib.metadata
@@ -890,6 +891,25 @@ class TestSaved:
         monkeypatch.setattr(LearnedAgent, "of_seed", lambda *_: 1 / 0)
         assert "its agent is not kept" in job.run()
         assert not (tmp_path / "agents" / "blind_bc-0").exists()
+
+    def test_a_full_disk_loses_no_agent(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """The job fails, and is not finished: a later run goes on, and keeps it. Nothing is left of half an agent."""
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        (tmp_path / "jobs").mkdir()
+        job, save = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), tmp_path / "jobs"), saved_agents.save
+
+        def full(agent: Any, folder: Path, **about: Any) -> None:
+            save(agent, folder, **about)
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(saved_agents, "save", full)
+        with pytest.raises(OSError, match="No space left"):
+            job.run()
+        assert not job.file(0).exists()
+        assert not (tmp_path / "agents" / "blind_bc-0").exists()
+        monkeypatch.setattr(saved_agents, "save", save)
+        job.run()
+        assert deconfounded.load(tmp_path / "agents" / "blind_bc-0")
 
     @pytest.mark.slow
     @pytest.mark.parametrize("task", ["bandit", CONTROL])

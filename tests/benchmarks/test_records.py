@@ -3,6 +3,7 @@
 import json
 import platform
 import queue
+import re
 import shutil
 from dataclasses import replace
 from functools import partial
@@ -21,8 +22,9 @@ from deconfounded.benchmarks.engine import identity, job_files, local, progress,
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.local import Here
-from deconfounded.benchmarks.output import aggregation, records
+from deconfounded.benchmarks.output import aggregation, records, run_report
 from deconfounded.benchmarks.studies import table as table_command
+from deconfounded.deconf import methods
 from deconfounded.deconf.methods import dagger
 from deconfounded.envs.support.files import PARTIAL, write_sealed
 from deconfounded.envs.support.origin import ROOT
@@ -201,6 +203,34 @@ class TestKeptFiles:
         shutil.copy(job.file(1), job.file(0))
         assert [(method, seed) for method, seed, _ in job_files.left_in(job.folder)] == [("blind_bc", 1)]
         assert capsys.readouterr().out == "blind_bc-0.npz is left out: it is of blind_bc-1\n"
+
+    def test_a_damaged_file_is_told_of(self, job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
+        """Of a report, and of a run that makes it again or not; demonstrations are made where they are needed."""
+        job.file(0).write_bytes(job.file(0).read_bytes()[:-9])
+        job.context().demonstrations  # noqa: B018 (made, and kept)
+        assert [(method, seed) for method, seed, _ in job_files.left_in(job.folder)] == [("blind_bc", 1)]
+        left = scheduler.results(scheduler.written(job, job.folder), say=True)
+        assert [(method, seed) for method, seed, _ in left] == [("blind_bc", 1)]
+        line = "blind_bc-0.npz is left out: it is damaged; run it again with --resume\n"
+        assert capsys.readouterr().out == line * 2
+
+    def test_a_result_of_another_version_is_told_of(
+        self, job: BenchmarkJob, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """It is no part of what a run shows, though no seed of this command is it."""
+        method = METHODS["blind_bc"]
+        monkeypatch.setattr(methods.load("blind_bc"), "method", replace(method, version=method.version + 1))
+        assert scheduler.results(scheduler.written(job, job.folder), say=True) == []
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.partition(": it was made with another method_version")[0] for line in lines] == [
+            f"blind_bc-{seed}.npz is left out" for seed in (0, 1)
+        ]
+
+    def test_returns_that_no_record_could_hold(self, job: BenchmarkJob) -> None:
+        """Their spread is no number any more."""
+        says = r"returns of blind_bc are up to 1e\+300; they must be at most 1e\+100"
+        returns = job_files.read(job.file(0))["blind_bc/returns"]  # type: ignore[index]
+        assert re.search(says, self.spoilt(job, **{"blind_bc/returns": 0 * returns - 1e300}))
 
     @pytest.mark.parametrize("text", ["[]", "{", '{"kind": "BenchmarkJob"}', "\xff", "[" * 100_000])
     def test_settings_of_wrong_shape(self, text: str, tmp_path: Path) -> None:
@@ -592,3 +622,16 @@ def test_table_makes_what_is_missing(
     monkeypatch.setattr(dagger.fit, "method", replace(other, on_bandit=config))
     assert table().startswith("2 seeds to make")
     assert table("--list") == "0 seeds are missing or stale\n"
+
+
+def test_damaged_records_of_a_report_are_no_surprise_after_a_training(tmp_path: Path) -> None:
+    """They are found before it, and the line says how they are made again."""
+    task = envs.get("bandit")
+    run_report.check_kept(task, tmp_path)
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "bandit.jsonl").write_text("{")
+    says = r"^line 1 of .*bandit.jsonl is not json; remove that file, and `deconf report` makes it again from jobs/$"
+    with pytest.raises(envs.InputError, match=says):
+        run_report.check_kept(task, tmp_path)
+    with pytest.raises(envs.InputError, match=says):
+        run_report.write(task, {"preset": "smoke", "set": []}, [], tmp_path)

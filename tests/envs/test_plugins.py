@@ -1,6 +1,6 @@
 """Files of one's own: what is executed of them, and when."""
 
-import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,11 +17,11 @@ TASK = "from tests.toys import Push\nclass {name}(Push):\n    name = 'own_push'\
 @pytest.fixture(autouse=True)
 def clean(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Tasks, modules and folders of one test are unknown to the next."""
-    monkeypatch.setattr("sys.path", [*os.sys.path])  # type: ignore[attr-defined]
-    monkeypatch.setattr("sys.modules", {**os.sys.modules})  # type: ignore[attr-defined]
+    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(outside, "FOLDERS", {*outside.FOLDERS})
     yield
     envs.TASKS.pop("own_push", None)
+    sys.modules.pop("util", None)
 
 
 def test_a_task_is_that_of_the_file_as_it_is_now(tmp_path: Path) -> None:
