@@ -218,19 +218,31 @@ class Particles:
     def _move(self, rows: NDArray[np.int64]) -> None:
         """Draw particles of trials `rows` anew by their weights, and move them, but for categorical latents."""
         u, weight = self._u[rows], np.exp(self.log_weight[rows])
-        mean = np.einsum("nk,nkl->nl", weight, u)[:, None]
+        mean = self._centre(rows, u, weight)
         spread = np.einsum("nk,nkl,nkm->nlm", weight, u - mean, u - mean)
         root = np.linalg.cholesky(spread + 1e-12 * np.eye(u.shape[-1]))
         draws = Streams([self._rngs[i] for i in rows.tolist()])
         start = draws.random((len(rows), 1))
         level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
         index = (weight.cumsum(-1)[:, None] < level[..., None] * weight.sum(-1)[:, None, None]).sum(-1)
-        kept = np.take_along_axis(u, index.clip(0, PARTICLES - 1)[..., None], 1)
+        index = index.clip(0, PARTICLES - 1)[..., None]
+        kept, mean = (np.take_along_axis(x, index[:, : x.shape[1]], 1) if x.shape[1] > 1 else x for x in (u, mean))
         normal = draws.standard_normal((u[..., 0].size, u.shape[-1])).reshape(u.shape)
         noise = np.einsum("nlm,nkm->nkl", root, normal)
         moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise
         self.log_weight[rows] = -np.log(PARTICLES)
         self._set(rows, np.where(self._categorical, kept, moved))
+
+    def _centre(self, rows: NDArray[np.int64], u: Array, weight: Array) -> Array:
+        """The mean [M, 1, L] of quantiles u [M, K, L]; or, of each particle, that of its own categories [M, K, L].
+
+        So other latents go on depending on a category as they do: towards a mean over categories they would forget it.
+        """
+        if not self._categorical.any():
+            return np.einsum("nk,nkl->nl", weight, u)[:, None]
+        category = self.theta[rows][..., self._categorical]
+        share = (category[:, :, None] == category[:, None]).all(-1) * weight[:, None]
+        return (share @ u) / np.maximum(share.sum(-1, keepdims=True), 1e-300)
 
 
 def quadratic(x: Array) -> Array:

@@ -53,7 +53,7 @@ def explore(agent):  # blind to theta; better than the log are trials in which t
 
 """,
     "query": """
-def query(agent):  # trials in which the agent acts (None: the expert), and the expert's action at each step of them
+def query(agent):  # trials in which the agent acts (None, at first: random actions), and the expert's actions in them
     raise NotImplementedError("ask the expert: return trials, actions")
 
 

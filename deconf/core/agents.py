@@ -16,8 +16,11 @@ from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.support.numbers import is_seed
 from deconfounded.experts import saved_agents
 from deconfounded.experts.agent import Agent, State
+
+ROUNDING = 1e-6  # of an action at an end of its range
 
 
 class Stateful(Protocol):
@@ -124,12 +127,25 @@ class LearnedAgent(Agent):
         before, after = self._tensor(obs), self._tensor(next_obs)
         if not np.isfinite(np.concatenate([obs, action, next_obs], 1)).all():
             raise InputError("observations or actions held NaN or infinity, which a memory would never lose")
-        if signature.actions and (action.min() < 0 or action.max() >= signature.actions):
+        if signature.actions and (action.min() < 0 or action.max() >= signature.actions or (action % 1).any()):
             raise InputError(f"an action was none of 0 to {signature.actions - 1}")
+        if not signature.actions and (most := np.abs(action).max()) > 1 + ROUNDING:
+            raise InputError(
+                f"an action was of size {most:g}; agents act in [-1, 1], and `units.agent` in a log's units"
+            )
         self.remember(Batch.step(before, action, after, alive))
 
     def remember(self, step: Batch) -> None:
         """Update the memory with a transition of each trial; nothing, for agents without memory."""
+
+    def features(self) -> NDArray[np.float32] | None:
+        if not self._n:
+            raise InputError("features was called before begin; begin(n) says how many trials there are")
+        return self.remembered()
+
+    def remembered(self) -> NDArray[np.float32] | None:
+        """The `features`; None for agents without memory."""
+        return None
 
     @abstractmethod
     def parts(self) -> dict[str, nn.Module]:
@@ -161,7 +177,11 @@ class LearnedAgent(Agent):
         return agent
 
     def of_seed(self, i: int) -> "LearnedAgent":
-        """The agent of the i-th seed alone, on the CPU."""
+        """The agent of the i-th seed alone, on the CPU. Raises InputError for a seed that there is not."""
+        if not is_seed(i) or i >= self.seeds:
+            raise InputError(
+                f"seed {i!r} of an agent of {self.seeds} was asked for; it must be from 0 to {self.seeds - 1}"
+            )
         settings, arrays = self.state()
         own = {key: x[i : i + 1] if x.ndim else x for key, x in arrays.items()}  # the first axis is of seeds
         return self.from_state({**settings, "seeds": 1}, own)

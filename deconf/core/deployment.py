@@ -7,7 +7,9 @@ mode: the likeliest value. mean: the belief's mean. An agent's attribute `way` i
 import copy
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar, get_args
+
+from deconfounded.envs.support.errors import InputError
 
 Way = Literal["step", "episode", "mode", "mean"]
 Belief = TypeVar("Belief")
@@ -28,7 +30,11 @@ def acted_on(latents: Latents[Belief, Rng], way: Way, belief: Belief, rng: Rng, 
         return before
     if way == "mode":
         return latents.mode(belief)
-    return latents.mean(belief) if way == "mean" else latents.sample(belief, rng)
+    if way == "mean":
+        return latents.mean(belief)
+    if way not in ("step", "episode"):
+        raise InputError(f"an agent's way was {way!r}; it must be {', '.join(get_args(Way)[:-1])} or mean")
+    return latents.sample(belief, rng)
 
 
 def deployments(*ways: Way) -> dict[str, Callable[[Any], Any]]:

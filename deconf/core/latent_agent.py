@@ -96,7 +96,7 @@ class DeconfoundedAgent(LearnedAgent):
         return self.loss(batch, final_belief(self.model, batch), None, self._draws)
 
     @torch.no_grad()
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         latents, belief = self.belief()
         mean = latents.mean(belief)
         return mean.flatten(0, 1).cpu().numpy()

@@ -39,6 +39,12 @@ PASSING = (
 )
 
 
+SHOWN_ACTIONS = (
+    "Or your columns show past actions, as stacked frames or a filter of actions do, and a clone without a memory reads"
+    " them too: leave them out (--obs), and diagnose again."
+)
+
+
 class Next(NamedTuple):
     """What to do, and a line of Python that does it with `trials`; explore and query are the user's functions."""
 

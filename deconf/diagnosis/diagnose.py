@@ -19,7 +19,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials, check_trials
 
-VERSION = 15  # raised when figures or verdicts of the same trials change
+VERSION = 16  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,16 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
         if data is None:
             continue
         check_trials("diagnose", data)
-        if len(data) < config.least:
+        count = int(data.mask.any((1, 2)).sum())
+        if count < config.least:
             raise InputError(
-                f"{len(data)} trial{'s' * (len(data) > 1)}{kind} given; at least {config.least} are needed, each"
+                f"{count} trial{'s' * (count != 1)}{kind} given; at least {config.least} are needed, each"
                 " under a theta of its own, so that some can be held out"
             )
         copied = sum(len(same) - 1 for same in fits.copies(data)[0])
-        if len(data) - copied < config.least:
+        if count - copied < config.least:
             raise InputError(
-                f"{len(data)} trials{kind} given, of which {copied} repeat{'s' * (copied == 1)} another; at least"
+                f"{count} trials{kind} given, of which {copied} repeat{'s' * (copied == 1)} another; at least"
                 f" {config.least} different ones are needed"
             )
         if (np.diff(data.mask.astype(int), axis=2) > 0).any():
@@ -82,6 +83,8 @@ def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> Non
         actions = data.action[data.mask]
         if (actions == actions[0]).all():
             raise InputError(f"every action{kind} is the same; there is nothing to learn, and nothing to judge")
+        if not np.diff(data.obs, axis=2)[data.mask].any():
+            raise InputError(f"no observation{kind} ever changes within an episode; there are no dynamics to learn")
         if data.mask.sum(-1).max() < 2:
             raise InputError(f"every episode{kind} is of one step; no dynamics can be learned from it")
     if explore is not None and (explore.obs.shape[-1], explore.action.shape[-1], explore.actions) != (

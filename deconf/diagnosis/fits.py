@@ -82,10 +82,10 @@ def mended(name: str, x: Array) -> tuple[str, float]:
 def copies(trials: Trials) -> tuple[list[list[int]], ...]:
     """Groups of trials that are the same; whose actions are; and the trials of episodes that are the same.
 
-    Actions count where they are continuous, of ten steps or more, and not constant.
+    Trials without a step are of none. Actions count where they are continuous, of ten steps or more, and not constant.
     """
     groups: tuple[dict[bytes, list[int]], ...] = {}, {}, {}
-    for b, mask in enumerate(trials.mask):
+    for b, mask in ((b, mask) for b, mask in enumerate(trials.mask) if mask.any()):
         whole, acted = trials.obs[b].tobytes(), trials.action[b].tobytes()
         groups[0].setdefault(hashlib.sha256(whole + acted).digest(), []).append(b)
         if not trials.actions and mask.sum() >= 10 and np.ptp(trials.action[b][mask], 0).any():

@@ -14,6 +14,7 @@ from deconfounded.deconf.diagnosis.advice import (
     MORE_TRIALS,
     PASSING,
     QUERY,
+    SHOWN_ACTIONS,
     VARY_LATENT,
     Next,
     Verdict,
@@ -23,6 +24,7 @@ from deconfounded.deconf.diagnosis.measures import Findings
 from deconfounded.deconf.diagnosis.thresholds import (
     DIFFERS,
     GOOD,
+    HALVES,
     MAX_MODEL_DEVIATION,
     MIN_MODEL_LENGTH,
     MISFIT,
@@ -122,14 +124,14 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
     if memory.low <= NEGLIGIBLE and not unused:
         if memory.high > NEGLIGIBLE:
             return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
+        loses = at_stake and max(gap.low, by_actions.low) > SMALL_GAP and model.value < MAX_MODEL_DEVIATION
         seen = in_exploration is not None and min(in_exploration.low, figures["expert_evidence"].low) > DIFFERS
         if seen and not alike:
             reasons.append(_rollouts(figures))
-            loses = at_stake and max(gap.low, by_actions.low) > SMALL_GAP and model.value < MAX_MODEL_DEVIATION
             if loses and figures["latent_gain"].low > 0:
                 conclusion = (
                     "Your system differs from trial to trial, and the expert seems to act on it: the clone with a"
-                    " memory found nothing of that in the logs, and would lose by it."
+                    f" memory found nothing of that in the logs, and would lose by it. {SHOWN_ACTIONS}"
                 )
                 return conclude("cannot tell", None, conclusion, MORE_TRIALS)
             conclusion = (
@@ -144,6 +146,13 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
                 " another matter: leave it out of --obs, and diagnose again."
             )
             return conclude("not confounded", 1, conclusion, CLONE)
+        if loses and in_exploration is None:
+            reasons.append(_rollouts(figures))
+            conclusion = (
+                "Past actions tell a clone nothing of the expert's next one that the present observation does not, and"
+                f" yet a clone loses in the learned model of your system. {SHOWN_ACTIONS}"
+            )
+            return conclude("cannot tell", None, conclusion, MORE_TRIALS)
         conclusion = (
             "The expert acts alike in all trials: nothing is hidden, or it was the same in all of them. Under these"
             " conditions a clone misses nothing; about others the trials say nothing."
@@ -199,11 +208,21 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
     if unused:
         conclusion = (
             "The world tells more of the expert's actions than the clone's memory makes use of: it did not learn what"
-            " it could."
+            f" it could. {SHOWN_ACTIONS}"
         )
         return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
         conclusion = "Something is hidden; whether a clone loses by it is not clear."
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
+    if (agree := figures.get("halves_agree")) is not None and agree.low < HALVES:
+        reasons.append(
+            "But what a policy does given the latent of one half of a trial of exploration, and of the other, agrees"
+            f" only by {agree} (1 for what is in the system): much of the latent is where a trial went."
+        )
+        conclusion = (
+            "Your system differs from trial to trial, and the expert acts on something that your columns do not show;"
+            " whether that is the same, or something that the world does not tell, is not clear."
+        )
         return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     conclusion = (
         "The expert acts on something that your columns do not show. A clone with a memory takes its own past actions"

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,7 +22,7 @@ from deconfounded.deconf.core.models import new_model
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
 from deconfounded.deconf.diagnosis.held_out import Best, typical
-from deconfounded.deconf.diagnosis.learned_env import valid_range
+from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, valid_range
 from deconfounded.deconf.equations import masked_mean
 from deconfounded.deconf.methods import deconfounded_offline
 from deconfounded.deconf.methods.deconfounded import DeconfoundedConfig
@@ -30,6 +31,7 @@ from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials
 
+REFERENCE = 256  # observations at which a policy's actions are compared
 MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
 
 LogProb = Callable[[Batch, Tensor], Tensor]
@@ -43,6 +45,7 @@ class Explanation(NamedTuple):
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
     much to overfit, each at its best. action_evidence: the former less that given another trial's latent;
     exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
+    halves_agree: see `agreement`.
     """
 
     dynamics: DynamicsHead
@@ -52,6 +55,7 @@ class Explanation(NamedTuple):
     action_evidence: float | None = None
     exploration_evidence: float | None = None
     expert_evidence: float | None = None
+    halves_agree: float | None = None
 
 
 def from_expert_trials(trials: Trials, config: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
@@ -79,7 +83,7 @@ def from_dynamics(
     """
     train, held_out, explored, explored_held_out = (Batch.of(x, 1) for x in (*expert, *exploration))
     explored, explored_held_out = (in_range(train, x) for x in (explored, explored_held_out))
-    scales = Scales(Signature.of(expert[0]), explored, train.action, train.mask)
+    scales = Scales(Signature.of(expert[0], exploration[0]), explored, train.action, train.mask)
     model = _train_dynamics(explored, scales, exploring, draws, monitor)
 
     def log_next(head: DynamicsHead) -> LogProb:
@@ -95,7 +99,35 @@ def from_dynamics(
     gain = typical(own - other, odd)
     in_actions = _evidence(_log_action(model, policy), odd, latents, per_theta)
     in_trials = _evidence(log_next(dynamics), odd, latents, per_theta)
-    return Explanation(dynamics, policy, model.for_cloning(belief, draws), gain, in_actions, evidence, in_trials)
+    latents = model.for_cloning(belief, draws)
+    agree = agreement(model, LatentPolicy(dynamics, policy, latents), train, explored.joined(explored_held_out))
+    return Explanation(dynamics, policy, latents, gain, in_actions, evidence, in_trials, agree)
+
+
+@torch.no_grad()
+def agreement(model: LatentModel, policy: LatentPolicy, expert: Batch, explored: Batch) -> float:
+    """Correlation, over trials of exploration, of what the policy does given latents of the two halves of a trial.
+
+    At observations of the expert. A latent that is in the system is the same in both halves. What of a latent is only
+    where a trial went, by a misfit of the model, differs in them: a behaviour that is blind to theta goes elsewhere.
+    """
+    draws = Draws([np.random.default_rng(0)], "cpu")  # of its own: other figures do not depend on it
+    obs = expert.steps(expert.draw_steps(REFERENCE, draws)).obs[:, None]
+    acted = []
+    for half in halves(explored):
+        latents = model.for_cloning(final_belief(model, half), draws)[:, :, None]
+        shape = (1, latents.shape[1], REFERENCE, -1)
+        action = policy.point(obs.expand(*shape), latents.expand(*shape))
+        acted.append(action - action.mean(1, keepdim=True))
+    first, second = acted
+    size = first.square().sum() * second.square().sum()
+    return float((first * second).sum() / size.sqrt().clamp(min=1e-12))
+
+
+def halves(data: Batch) -> tuple[Batch, Batch]:
+    """The first half of the steps of each trial, and the second."""
+    early = data.mask.cumsum(-1) <= data.mask.sum(-1, keepdim=True) / 2
+    return tuple(replace(data, mask=data.mask * part) for part in (early, ~early))  # type: ignore[return-value]
 
 
 def odd_steps(batch: Batch) -> Batch:

@@ -16,8 +16,9 @@ Array = NDArray[np.float64]
 OUTLYING, SEVERAL = 8.0, 0.05  # times the usual spread of trials; share of trials
 FEW = 8  # values of a column that does not move, but jumps
 STILL, PAUSE = 0.02, 5  # of the motion's 90th percentile; steps
-LATEST = 4  # lags that are tried; of the last one, as of slow noise, nothing follows
+LATEST, USUAL = 8, 4  # lags that are tried, in short episodes; of the last one, as of slow noise, nothing follows
 BETTER = 0.95  # of the variance that another row leaves
+EQUAL = 1e-5  # of the spread: the rounding of float32
 REPEATED, LASTING = 0.95, 0.7  # shares of variance; correlation from step to step
 ALIKE = 0.5  # of that correlation, which a poor fit has at alike observations too
 
@@ -121,7 +122,7 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
             text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {listed(named)}."
-            apart = "A diagnosis never holds one out without its copies; still, they count as often as they are there."
+            apart = "A diagnosis takes one of each; a clone counts them as often as they are there."
             betrays = "Where one is held out, its copy betrays it; keep one of each."
             yield Remark("duplicate", f"{text} {betrays if kind else apart}", True)
     if repeated := [group for group in episodes if group not in whole]:
@@ -132,6 +133,9 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     """Stretches in which nothing moves, at the start of episodes and later."""
+    if not np.diff(log.obs.astype(float), axis=2)[log.mask].any():
+        yield Remark("pause", "No observation ever changes within an episode: nothing can be learned of it.", True)
+        return
     moving = [i for i, x in enumerate(steps.obs.T) if len(np.unique(x[: 1 << 16])) > FEW]
     if not moving:
         return
@@ -141,8 +145,7 @@ def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     moves = motion[log.mask]
     usual = np.quantile(moves, 0.9) or np.quantile(moves[moves > 0], 0.9) if moves.any() else 0.0
     still = (motion <= STILL * usual) & log.mask
-    if usual == 0:
-        yield Remark("pause", "No observation ever changes within an episode.", True)
+    if usual == 0:  # only what jumps between few values changes
         return
     at_start, later, longest, where = 0, 0, 0, (0, 0)
     for b, e in np.argwhere(log.mask.any(2)):
@@ -166,12 +169,13 @@ def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
 
 def _lag(trials: Trials) -> Iterator[Remark]:
     """The lag at which actions match observations, and the motion that follows, best."""
-    window = fits.Window.of(trials, LATEST + 2)
+    latest = min(LATEST, max(USUAL, trials.mask.shape[2] // 5))
+    window = fits.Window.of(trials, latest + 2)
     if len(window) < 200 or not window.action.std():
         return
-    left = [window.unexplained([lag]) for lag in range(-1, LATEST + 1)]
+    left = [window.unexplained([lag]) for lag in range(-1, latest + 1)]
     lag = int(np.argmin(left)) - 1
-    if not 0 < lag < LATEST or left[lag + 1] > BETTER * left[1]:
+    if not 0 < lag < latest or left[lag + 1] > BETTER * left[1]:
         if lag <= 0 and left[1] < BETTER:
             yield Remark(
                 "lag",
@@ -207,8 +211,13 @@ def _states(log: Log, steps: Steps) -> Iterator[Remark]:
             which = "the next" if then < present else "the present"
             column = log.units.obs[int(errors[then < present].argmin())]
             text = f"The action {name} is {which} {column}, to {min(present, then):.1%} of its spread: "
-            if then < present:
-                text += "the log has no commands, or a controller that follows them at once; the dynamics tell nothing."
+            if then < EQUAL:
+                text = (
+                    f"Observation {column} is the action {name} of the row before. A clone reads its own past actions"
+                    " there, with a memory or without; leave that column out (--obs)."
+                )
+            elif then < present:
+                text += "the log has no commands, or a controller that follows them at once; that column tells nothing."
             else:
                 text += "the log has no commands, but what was reached."
             yield Remark("state", text, True)

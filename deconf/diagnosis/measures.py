@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from deconfounded.deconf.core import termination
@@ -98,7 +99,8 @@ class Findings(NamedTuple):
     Eq. (7).
 
     Only where a memory gains and dynamics do not differ, others are not None: trait_gain, the gain by a trait of the
-    trial that is inferred from the actions of its other half (`trait.py`), and its stakes.
+    trial that is inferred from the actions of its other half (`trait.py`), and its stakes. halves_agree: of a latent
+    in the dynamics, in exploration (`latent.agreement`).
     """
 
     memory_gain: float
@@ -118,6 +120,7 @@ class Findings(NamedTuple):
     trait_gain: float | None = None
     trait_stakes: float | None = None
     paired_trait_stakes: float | None = None
+    halves_agree: float | None = None
 
 
 def measure(
@@ -129,6 +132,7 @@ def measure(
 ) -> Findings:
     """Figures of a random split of expert trials, and of exploration that is blind to theta, if there is any."""
     amounts = amounts.fitting(trials.obs.shape[-1])
+    trials, explore = distinct(trials), explore and distinct(explore)
     expert, rngs = split(trials, amounts.held_out, rng), [rng]
     train, held_out = expert[0], Batch.of(expert[1], 1)
     alone, remembering = (BestMonitor(report, begin, end, held_out) for begin, end in ((0, 0.1), (0.1, 0.25)))
@@ -152,7 +156,8 @@ def measure(
         rollouts = _rollouts(explanation, learned_env, recurrent, episodes, amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
-    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts)
+    agree = explanation.halves_agree
+    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts, halves_agree=agree)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, Signature.of(train), amounts.cloning, draws)
@@ -278,17 +283,16 @@ def _explain(
 
 
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
-    """Trials for training, and about that share of them that is held out: a trial and its copies are on one side."""
+    """Trials for training, and that share of them that is held out."""
     order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
-    first = np.arange(len(trials))  # of the trials that are the same
-    for same in copies(trials)[0]:
-        first[same] = same[0]
-    _, begins, group = np.unique(first[order], return_index=True, return_inverse=True)
-    order = order[np.argsort(begins[group], kind="stable")]  # copies follow each other
-    while count < len(order) - 1 and first[order[count]] == first[order[count - 1]]:
-        count += 1
-    train, held_out = (
-        Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions)
-        for index in (order[count:], order[:count])
-    )
-    return train, held_out
+    return _some(trials, order[count:]), _some(trials, order[:count])
+
+
+def distinct(trials: Trials) -> Trials:
+    """One of each trial with steps: a copy would be on both sides of a split, or the "other" trial of itself."""
+    left_out = [b for same in copies(trials)[0] for b in same[1:]] + np.flatnonzero(~trials.mask.any((1, 2))).tolist()
+    return _some(trials, np.delete(np.arange(len(trials)), left_out)) if left_out else trials
+
+
+def _some(trials: Trials, index: NDArray[np.int64]) -> Trials:
+    return Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions)

@@ -4,7 +4,6 @@ Where the dynamics tell nothing, it separates what a memory predicts of a trial 
 sees, or an operator's habits) from what passes: pauses, noise that lasts, an expert's own memory.
 """
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -16,7 +15,7 @@ from deconfounded.deconf.core.dynamics import DynamicsHead
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
 from deconfounded.deconf.diagnosis.held_out import typical
-from deconfounded.deconf.diagnosis.latent import each_step
+from deconfounded.deconf.diagnosis.latent import each_step, halves
 from deconfounded.deconf.diagnosis.learned_env import LatentPolicy
 from deconfounded.deconf.equations import imitation_loss
 from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
@@ -53,12 +52,6 @@ class Encoder(nn.Module):
         x = self.step(torch.cat([self.inputs.obs(steps.obs), self.inputs.action(steps.action)], -1))
         weight = steps.mask[..., None]
         return self.out((x * weight).sum(2) / weight.sum(2).clamp(min=1))
-
-
-def halves(data: Batch) -> tuple[Batch, Batch]:
-    """The first half of the steps of each trial, and the second."""
-    early = data.mask.cumsum(-1) <= data.mask.sum(-1, keepdim=True) / 2
-    return tuple(replace(data, mask=data.mask * part) for part in (early, ~early))  # type: ignore[return-value]
 
 
 def _draw(data: Batch, draws: Draws) -> Batch:

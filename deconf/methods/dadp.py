@@ -100,7 +100,7 @@ class DadpAgent(LearnedAgent):
         self._memory = self.encoder.update(self._memory, step)
 
     @torch.no_grad()
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         """The latent of all that was seen, on which the next episode is acted."""
         return self.latent(self._memory).flatten(0, 1).cpu().numpy()
 

@@ -111,7 +111,7 @@ class DaggerAgent(LearnedAgent):
         self._memory = self.memory.update(self._memory, step)
 
     @torch.no_grad()
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self.memory.posterior(self._memory)[0].flatten(0, 1).cpu().numpy()
 
     def loss(self, batch: Batch, label: Tensor, steps: int | None, draws: Draws) -> Tensor:

@@ -161,7 +161,7 @@ class DmlAgent(LearnedAgent):
         self._memories.append(self._memory)
 
     @torch.no_grad()
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self.history.memory.posterior(self._memory)[0].flatten(0, 1).cpu().numpy()
 
 

@@ -156,7 +156,7 @@ class FlowAgent(LearnedAgent):
         took_place = took_place[..., None].float()
         return torch.cat([self.scales.obs(obs), self.scales.encode(action), took_place], -1) * took_place
 
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self._past.flatten(0, 1).flatten(1).cpu().numpy()
 
     def choose(self, obs: Tensor) -> Tensor:

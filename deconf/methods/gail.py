@@ -131,7 +131,7 @@ class GailAgent(LearnedAgent):
         self._state = torch.where(alive, self._next, self._state)
         self._before = torch.where(alive, F.pad(action, (0, 1)), self._before)
 
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self._state[..., : self.width].flatten(0, 1).cpu().numpy()
 
     @torch.no_grad()

@@ -111,7 +111,7 @@ class TransformerAgent(LearnedAgent):
             cache.advance(mask)
         self._before = torch.where(step.mask[..., None] > 0, self.before(step), self._before)
 
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self._features.flatten(0, 1).cpu().numpy()
 
     def loss(self, batch: Batch, label: Tensor) -> Tensor:

@@ -105,7 +105,7 @@ class RmaAgent(LearnedAgent):
         self._state = self.adapter.update(self._state, step)
 
     @torch.no_grad()
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self.adapter.out(self._state).flatten(0, 1).cpu().numpy()
 
     def loss(self, batch: Batch, theta: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

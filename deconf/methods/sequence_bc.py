@@ -126,7 +126,7 @@ class RecurrentAgent(LearnedAgent):
     def remember(self, step: Batch) -> None:
         self._state = self.memory.update(self._state, step)
 
-    def features(self) -> NDArray[np.float32]:
+    def remembered(self) -> NDArray[np.float32]:
         return self._state.flatten(0, 1).cpu().numpy()
 
     def loss(self, batch: Batch, label: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:

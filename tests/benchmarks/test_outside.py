@@ -1119,6 +1119,37 @@ class TestSentences:
             agent.act(obs[0])
         assert agent.act(obs).shape == (1, 1)
 
+    def test_actions_that_an_agent_cannot_have_taken(self) -> None:
+        """In other units than its own, or between two numbers."""
+        for name, wrong, says in (
+            (CONTROL, 300.0, "an action was of size 300; agents act in"),
+            ("bandit", 0.97, "of 0"),
+        ):
+            agent = fit(Context(envs.get(name), tiny_preset(), [0]), "blind_bc")
+            obs, action = np.zeros((1, len(envs.get(name).observation)), np.float32), np.full((1, 1), wrong)
+            agent.begin(1)
+            agent.reset([np.random.default_rng(0)])
+            with pytest.raises(envs.InputError, match=says):
+                agent.observe(obs, action, obs, np.ones(1, bool))
+            agent.observe(obs, np.ones((1, 1)), obs, np.ones(1, bool))
+
+    def test_features_before_there_are_trials(self) -> None:
+        with pytest.raises(envs.InputError, match="features was called before begin"):
+            self.agent().features()
+
+    @pytest.mark.parametrize("seed", [1, -1, None, "0", 0.0])
+    def test_a_seed_that_there_is_not(self, seed: Any) -> None:
+        with pytest.raises(envs.InputError, match="of an agent of 1 was asked for; it must be from 0 to 0"):
+            self.agent().of_seed(seed)
+
+    def test_a_way_that_there_is_not(self) -> None:
+        agent = fit(Context(envs.get("bandit"), tiny_preset(), [0]), "deconfounded")
+        agent.begin(1)
+        agent.reset([np.random.default_rng(0)])
+        agent.way = "mod"  # type: ignore[attr-defined]
+        with pytest.raises(envs.InputError, match="way was 'mod'; it must be step, episode, mode or mean"):
+            agent.act(np.zeros((1, 1), np.float32))
+
     def test_generators(self) -> None:
         with pytest.raises(envs.InputError, match="random numbers were to come from 0; give"):
             naive_rnn.train(Context(envs.get(CONTROL), tiny_preset(), [0]).demonstrations, RecurrentConfig(), 0)  # type: ignore[arg-type]

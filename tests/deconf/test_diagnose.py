@@ -55,15 +55,23 @@ def repeated(data: Trials, index: list[int]) -> Trials:
 class TestSplit:
     """Trials for training and held-out ones."""
 
-    def test_a_trial_and_its_copies_are_on_one_side(self) -> None:
-        index = [*range(12), *range(12), 3, 3]
-        data = repeated(trials(12), index)
-        for seed in range(20):
-            parts = measures.split(data, 0.25, np.random.default_rng(seed))
-            train, held_out = ({obs.tobytes() for obs in part.obs} for part in parts)
-            assert not train & held_out
-            assert [len(part) for part in parts] == [26 - len(parts[1]), len(parts[1])]
-            assert 6 <= len(parts[1]) <= 9
+    def test_a_trial_is_there_once(self) -> None:
+        """In a split with copies, one held out would be known, and "another trial" the same."""
+        data = trials(12)
+        whole = measures.distinct(repeated(data, [*range(12), *range(12), 3, 3]))
+        np.testing.assert_array_equal(whole.obs, data.obs)
+        assert measures.distinct(data) is data
+        mask = data.mask.copy()
+        mask[4:6] = False
+        assert len(measures.distinct(Trials(data.obs, data.action, mask))) == 10
+
+    def test_figures_do_not_depend_on_copies(self) -> None:
+        data, other = trials(24), trials(24, seed=1)
+        twice = [repeated(of, [*range(24), *range(12)]) for of in (data, other)]
+        figures = [
+            measures.measure(*of, TINY, np.random.default_rng(0)) for of in ((data, other), (twice[0], twice[1]))
+        ]
+        assert figures[0] == figures[1]
 
     def test_without_copies_the_share_is_exact(self) -> None:
         data = trials(24)
@@ -90,6 +98,18 @@ class TestBadInput:
         data = trials(26)
         with pytest.raises(InputError, match="26 trials given, of which 3 repeat another; at least 24 different ones"):
             diagnose.check(repeated(data, [0, 0, 0, 1, 1, *range(5, 26)]), None, DiagnoseConfig())
+
+    def test_trials_without_a_step_do_not_count(self) -> None:
+        data = trials(26)
+        mask = data.mask.copy()
+        mask[:3] = False
+        with pytest.raises(InputError, match=r"^23 trials given; at least 24 are needed"):
+            diagnose.check(Trials(data.obs, data.action, mask), None, DiagnoseConfig())
+
+    def test_observations_that_never_change(self) -> None:
+        data = trials()
+        with pytest.raises(InputError, match=r"^no observation ever changes within an episode; there are no dynamics"):
+            diagnose.check(Trials(0 * data.obs + 3, data.action, data.mask), None, DiagnoseConfig())
 
     def test_constant_actions(self) -> None:
         data = trials()
@@ -166,6 +186,7 @@ CLEAR = Findings(
 )
 
 NO_FIGURES = ("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence")
+SMALL = {"naive_by_actions": 0.8}
 ALONE = dict.fromkeys((*NO_FIGURES, "dynamics_differ"))
 SILENT = {
     **{"exploration_evidence": 0.0, "dynamics_differ": 0.0},
@@ -198,6 +219,8 @@ class TestJudge:
             ({**SILENT, "trait_gain": 0.05}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({**SILENT, "trait_gain": 0.09}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({**SILENT, "paired_trait_stakes": 2.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"halves_agree": 0.9}, "confounded", 2, advice.EXPLORE),
+            ({"halves_agree": 0.4}, "cannot tell", None, advice.MORE_TRIALS),
             ({"expert_evidence": 0.05}, "confounded", 2, advice.EXPLORE),
             ({"latent_gain": -0.1}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
@@ -228,7 +251,8 @@ class TestJudge:
                 None,
                 advice.VARY_LATENT,
             ),
-            ({"memory_gain": 0.001, **ALONE}, "cannot tell", None, advice.VARY_LATENT),
+            ({"memory_gain": 0.001, **ALONE}, "cannot tell", None, advice.MORE_TRIALS),
+            ({**ALONE, "memory_gain": 0.001, "naive": 0.9, **SMALL}, "cannot tell", None, advice.VARY_LATENT),
             ({"latent": 0.1, "latent_by_actions": -0.2}, "cannot tell", None, advice.MORE_TRIALS),
         ],
     )

@@ -116,6 +116,40 @@ def said(remarks: list[Remark], kind: str) -> str:
     return " ".join(remark.text for remark in remarks if remark.kind == kind)
 
 
+@pytest.mark.parametrize("rows", [4, 5, 7])
+def test_actions_that_are_many_rows_late(rows: int) -> None:
+    trials = driven()
+    for _ in range(rows):
+        trials = late(trials)
+    assert f"they are probably logged late. Move actions up by {rows} rows." in said(look(trials), "late")
+
+
+def test_a_column_of_the_last_action_is_named() -> None:
+    """The log has commands, and the dynamics tell; but a clone reads its own past actions there."""
+    trials = driven()
+    last = np.concatenate([0 * trials.action[:, :, :1], trials.action], 2)
+    remarks = look(changed(trials, obs=np.concatenate([trials.obs, last], -1)))
+    says = (
+        "Observation observation 2 is the action action 0 of the row before. A clone reads its own past actions there"
+    )
+    assert said(remarks, "state").startswith(says)
+    assert "tell nothing" not in said(remarks, "state")
+
+
+def test_what_never_moves_is_said_to_be_so() -> None:
+    trials = driven()
+    remarks = look(changed(trials, obs=0 * trials.obs + 3))
+    assert said(remarks, "pause").startswith("No observation ever changes within an episode")
+
+
+def test_empty_trials_are_no_copies_of_each_other() -> None:
+    trials = driven()
+    mask, obs, action = trials.mask.copy(), trials.obs.copy(), trials.action.copy()
+    for array in (mask, obs, action):
+        array[[3, 5, 8]] = 0
+    assert not said(look(changed(trials, mask=mask, obs=obs, action=action)), "duplicate")
+
+
 def late(trials: Trials) -> Trials:
     action = np.concatenate([0 * trials.action[:, :, :1], trials.action[:, :, :-1]], 2)
     return changed(trials, action=action)

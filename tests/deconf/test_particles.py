@@ -258,6 +258,22 @@ def test_categories_are_drawn_anew_and_not_moved(boxes: Particles) -> None:
     assert not np.isin(boxes.theta[..., 1], before).any()
 
 
+def test_a_move_keeps_what_a_category_tells_of_other_latents(boxes: Particles) -> None:
+    """In each category a force of its own, with the spread that it has there; without new evidence that stays."""
+    boxes.begin(1)
+    boxes.reset(Streams([np.random.default_rng(0)]))
+    rng, shape = np.random.default_rng(1), boxes.theta.shape[:2]
+    box = rng.integers(5, size=shape)
+    u = np.stack([(box + 0.5) / 5, 0.2 + 0.15 * box + 0.02 * rng.standard_normal(shape)], -1)
+    boxes._set(np.arange(1), u)
+    for _ in range(10):
+        boxes._move(np.arange(1))
+    for value in range(5):
+        of = boxes._u[0, boxes.theta[0, :, 0] == value, 1]
+        assert of.mean() == pytest.approx(0.2 + 0.15 * value, abs=0.02)
+        assert of.std() == pytest.approx(0.02, rel=0.4)
+
+
 def test_the_mean_of_a_category_is_its_likeliest_value(boxes: Particles) -> None:
     """Of all particles of each value; of the latent beside it the mean."""
     for _ in range(2):
