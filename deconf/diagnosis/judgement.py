@@ -24,13 +24,13 @@ from deconfounded.deconf.diagnosis.measures import Findings
 from deconfounded.deconf.diagnosis.thresholds import (
     DIFFERS,
     GOOD,
-    HALVES,
     MAX_MODEL_DEVIATION,
     MIN_MODEL_LENGTH,
     MISFIT,
     NEGLIGIBLE,
     NO_EVIDENCE,
     NO_LOSS,
+    SHARED,
     SMALL_GAP,
     STAKES,
     TRAIT_SHARE,
@@ -214,16 +214,17 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
     if max(gap.low, by_actions.low) <= 0 or max(gap.high, by_actions.high) < SMALL_GAP:
         conclusion = "Something is hidden; whether a clone loses by it is not clear."
         return conclude("cannot tell", None, conclusion, MORE_TRIALS)
-    if (agree := figures.get("halves_agree")) is not None and agree.low < HALVES:
+    if (shared := figures.get("shared")) is not None and shared.value < SHARED:
         reasons.append(
-            "But what a policy does given the latent of one half of a trial of exploration, and of the other, agrees"
-            f" only by {agree} (1 for what is in the system): much of the latent is where a trial went."
+            f"But of what that latent makes a policy do, {shared:%} lasts through trials of exploration as it does"
+            " through the expert's. What is in the system lasts in both; where a trial went lasts where somebody goes"
+            " there on purpose."
         )
-        conclusion = (
+        return more_exploration(
             "Your system differs from trial to trial, and the expert acts on something that your columns do not show;"
-            " whether that is the same, or something that the world does not tell, is not clear."
+            " whether that is the same, or something that the world does not tell, is not clear. If more exploration"
+            " does not change this, only the expert, or a sensor, can tell."
         )
-        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     conclusion = (
         "The expert acts on something that your columns do not show. A clone with a memory takes its own past actions"
         " for evidence of it, though it chose them itself; what the world does would tell."

@@ -45,7 +45,7 @@ class Explanation(NamedTuple):
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
     much to overfit, each at its best. action_evidence: the former less that given another trial's latent;
     exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
-    halves_agree: see `agreement`.
+    shared: see `shared_with`.
     """
 
     dynamics: DynamicsHead
@@ -55,7 +55,7 @@ class Explanation(NamedTuple):
     action_evidence: float | None = None
     exploration_evidence: float | None = None
     expert_evidence: float | None = None
-    halves_agree: float | None = None
+    shared: float | None = None
 
 
 def from_expert_trials(trials: Trials, config: OfflineConfig, draws: Draws, monitor: Monitor) -> Explanation:
@@ -100,28 +100,31 @@ def from_dynamics(
     in_actions = _evidence(_log_action(model, policy), odd, latents, per_theta)
     in_trials = _evidence(log_next(dynamics), odd, latents, per_theta)
     latents = model.for_cloning(belief, draws)
-    agree = agreement(model, LatentPolicy(dynamics, policy, latents), train, explored.joined(explored_held_out))
-    return Explanation(dynamics, policy, latents, gain, in_actions, evidence, in_trials, agree)
+    shared = shared_with(explored.joined(explored_held_out), train, model, LatentPolicy(dynamics, policy, latents))
+    return Explanation(dynamics, policy, latents, gain, in_actions, evidence, in_trials, shared)
 
 
 @torch.no_grad()
-def agreement(model: LatentModel, policy: LatentPolicy, expert: Batch, explored: Batch) -> float:
-    """Correlation, over trials of exploration, of what the policy does given latents of the two halves of a trial.
+def shared_with(explored: Batch, expert: Batch, model: LatentModel, policy: LatentPolicy) -> float:
+    """The share, 0 to 1, of what a latent that lasts through expert trials makes a policy do that exploration has too.
 
-    At observations of the expert. A latent that is in the system is the same in both halves. What of a latent is only
-    where a trial went, by a misfit of the model, differs in them: a behaviour that is blind to theta goes elsewhere.
+    By covariances, over trials, of the policy's actions given latents of the two halves of a trial, at observations of
+    the expert. What is in the system lasts through both kinds of trials. Where a trial went, which a latent shows too
+    where the model fits poorly, lasts in those of the expert, which goes there on purpose.
     """
     draws = Draws([np.random.default_rng(0)], "cpu")  # of its own: other figures do not depend on it
     obs = expert.steps(expert.draw_steps(REFERENCE, draws)).obs[:, None]
-    acted = []
-    for half in halves(explored):
-        latents = model.for_cloning(final_belief(model, half), draws)[:, :, None]
-        shape = (1, latents.shape[1], REFERENCE, -1)
-        action = policy.point(obs.expand(*shape), latents.expand(*shape))
-        acted.append(action - action.mean(1, keepdim=True))
-    first, second = acted
-    size = first.square().sum() * second.square().sum()
-    return float((first * second).sum() / size.sqrt().clamp(min=1e-12))
+
+    def lasting(data: Batch) -> float:
+        acted = []
+        for half in halves(data):
+            latents = model.for_cloning(final_belief(model, half), draws)[:, :, None]
+            shape = (1, latents.shape[1], REFERENCE, -1)
+            action = policy.point(obs.expand(*shape), latents.expand(*shape))
+            acted.append(action - action.mean(1, keepdim=True))
+        return float((acted[0] * acted[1]).mean())
+
+    return min(max(lasting(explored) / max(lasting(expert), 1e-12), 0.0), 1.0)
 
 
 def halves(data: Batch) -> tuple[Batch, Batch]:

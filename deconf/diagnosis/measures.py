@@ -99,8 +99,8 @@ class Findings(NamedTuple):
     Eq. (7).
 
     Only where a memory gains and dynamics do not differ, others are not None: trait_gain, the gain by a trait of the
-    trial that is inferred from the actions of its other half (`trait.py`), and its stakes. halves_agree: of a latent
-    in the dynamics, in exploration (`latent.agreement`).
+    trial that is inferred from the actions of its other half (`trait.py`), and its stakes. shared: the share of what
+    the latent makes a policy do that lasts through exploration too (`latent.shared_with`).
     """
 
     memory_gain: float
@@ -120,7 +120,7 @@ class Findings(NamedTuple):
     trait_gain: float | None = None
     trait_stakes: float | None = None
     paired_trait_stakes: float | None = None
-    halves_agree: float | None = None
+    shared: float | None = None
 
 
 def measure(
@@ -156,8 +156,8 @@ def measure(
         rollouts = _rollouts(explanation, learned_env, recurrent, episodes, amounts, rngs)
     in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
-    agree = explanation.halves_agree
-    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts, halves_agree=agree)
+    shared = explanation.shared
+    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts, shared=shared)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, Signature.of(train), amounts.cloning, draws)

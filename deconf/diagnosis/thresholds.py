@@ -1,7 +1,7 @@
 """Thresholds of the diagnosis: everything that a verdict compares a figure with."""
 
 NEGLIGIBLE, NO_EVIDENCE = 0.1, 0.01  # nats a step: of memory and of latents, of the dynamics
-HALVES = 0.5  # correlation of what a policy does given latents of two halves of an exploration trial
+SHARED = 0.5  # of what a latent makes a policy do that is to last through exploration too
 DIFFERS = 0.03  # nats a step of evidence, in exploration too, from which on dynamics are said to differ
 UNUSED = 0.25  # share by which a latent from the dynamics may explain more than a memory, which could know as much
 MISFIT = 0.2  # nats a step by which a memory may make a clone worse
