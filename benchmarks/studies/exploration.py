@@ -83,7 +83,7 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
     tasks = dict.fromkeys(point["task"] for point in points)
     amounts = {task: {point["share"] for point in points if point["task"] == task} for task in tasks}
     drawn = [task for task in tasks if len(amounts[task]) >= ENOUGH] or list(tasks)
-    size = (4.6 * len(drawn), 7.0)
+    size = (4.6 * len(drawn) + 1.6, 7.0)
     with panels(file, 2, len(drawn), size=size, dpi=100, mark=mark, sharex="col", sharey=True) as grid:
         for task, column in zip(drawn, grid.T, strict=True):
             of_task = [point for point in points if point["task"] == task]
@@ -101,7 +101,10 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
             column[1].minorticks_off()
         for end, panel in zip(ENDS, grid[:, 0], strict=True):
             panel.set_ylabel(f"score, {end} episode")
-        grid[1, 0].legend(frameon=False, fontsize=8)
+        drawn_by = {
+            name: line for panel in grid[1] for line, name in zip(*panel.get_legend_handles_labels(), strict=True)
+        }
+        grid[1, 0].figure.legend(drawn_by.values(), drawn_by, loc="outside right center", frameon=False, fontsize=8)
 
 
 def recorded(task: envs.Task, settings: "Preset", method: str, seeds: int) -> "list[Record]":
