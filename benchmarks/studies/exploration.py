@@ -101,10 +101,9 @@ def picture(points: list[Point], file: Path, mark: str = "") -> None:
             column[1].minorticks_off()
         for end, panel in zip(ENDS, grid[:, 0], strict=True):
             panel.set_ylabel(f"score, {end} episode")
-        drawn_by = {
-            name: line for panel in grid[1] for line, name in zip(*panel.get_legend_handles_labels(), strict=True)
-        }
-        grid[1, 0].figure.legend(drawn_by.values(), drawn_by, loc="outside right center", frameon=False, fontsize=8)
+        entries = [entry for panel in grid[1] for entry in zip(*panel.get_legend_handles_labels(), strict=True)]
+        lines = {name: line for line, name in entries}
+        grid[1, 0].figure.legend(lines.values(), lines, loc="outside right center", frameon=False, fontsize=8)
 
 
 def recorded(task: envs.Task, settings: "Preset", method: str, seeds: int) -> "list[Record]":
