@@ -221,11 +221,12 @@ def test_an_agent_of_others_may_change_its_arrays() -> None:
             return super().act(obs)
 
         def observe(self, obs: Any, action: Any, next_obs: Any, alive: Any) -> None:
+            seen.append(obs.copy())
             for array in (obs, action, next_obs):
                 array += 3
             alive[:] = False
 
-    task = toys.Push()
+    task, seen = toys.Push(), list[Any]()
     played = []
     for of in (RandomAgent, Normalising):
         env = envs.BatchEnv(task, 6)
@@ -233,6 +234,9 @@ def test_an_agent_of_others_may_change_its_arrays() -> None:
     for one, other in zip(vars(played[0].trials).values(), vars(played[1].trials).values(), strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(played[0].returns, played[1].returns)
+    obs = played[1].trials.obs
+    np.testing.assert_array_equal(seen[0], obs[:, 0, 0])
+    np.testing.assert_array_equal(seen[1], obs[:, 0, 1])
 
 
 def test_the_first_five_seeds_of_a_table_come_first(tmp_path: Path) -> None:
