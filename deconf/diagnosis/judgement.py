@@ -150,7 +150,7 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
             reasons.append(_rollouts(figures))
             conclusion = (
                 "Past actions tell a clone nothing of the expert's next one that the present observation does not, and"
-                f" yet a clone loses in the learned model of your system. {SHOWN_ACTIONS}"
+                f" yet a clone loses in the learned model of your system: more trials may show why. {SHOWN_ACTIONS}"
             )
             return conclude("cannot tell", None, conclusion, MORE_TRIALS)
         conclusion = (
