@@ -1,5 +1,6 @@
 """What holds for every test: tasks that it registers are gone after it; those that need dm_control are skipped."""
 
+import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import Any
@@ -7,6 +8,7 @@ from typing import Any
 import pytest
 
 from deconfounded import envs
+from deconfounded.envs.support import outside
 
 
 @pytest.fixture(autouse=True)
@@ -16,6 +18,19 @@ def _forget_tasks() -> Iterator[None]:
     yield
     for name in envs.TASKS.keys() - before.keys():
         del envs.TASKS[name]
+
+
+@pytest.fixture(autouse=True)
+def _forget_helpers() -> Iterator[None]:
+    """Modules beside a plug-in file of a test: those of the same name beside another test's are others."""
+    yield
+    if folders := [folder for folder in outside.FOLDERS if "pytest-of-" in folder]:
+        for name, module in list(sys.modules.items()):
+            file = str(getattr(module, "__file__", None) or "")
+            if "pytest-of-" in file and not name.startswith(outside.PREFIX):
+                del sys.modules[name]
+        outside.FOLDERS.difference_update(folders)
+        sys.path[:] = [entry for entry in sys.path if entry not in folders]
 
 
 @pytest.fixture

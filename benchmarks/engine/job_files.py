@@ -37,11 +37,11 @@ def broken(data: dict[str, Any]) -> str:
         returns, objective, probe = (data.get(f"{name}/{key}", np.zeros(())) for key in OF_AGENT)
         if returns.ndim != 2 or objective.shape != returns.shape or probe.ndim != 1:
             return f"returns of {name} have shape {returns.shape}, Eq. (1) {objective.shape}, probes {probe.shape}"
-        if np.abs(returns).max(initial=0) > LARGEST:
-            return f"returns of {name} are up to {np.abs(returns).max():.2g}; they must be at most {LARGEST:g}"
     for key, value in data.items():
         if key != "meta" and value.dtype.kind == "f" and not np.isfinite(value).all():
             return f"{key} holds NaN or infinity"
+        if key.endswith("/returns") and np.abs(value).max(initial=0) > LARGEST:
+            return f"{key} are up to {np.abs(value).max():.2g}; they must be at most {LARGEST:g}"
     return ""
 
 

@@ -87,8 +87,7 @@ def _outliers(log: Log, steps: Steps) -> Iterator[Remark]:
     actions = (
         [f"{value} in {log.units.action[0]}" for value in log.units.values[1:]] if log.actions else log.units.action
     )
-    named = zip((*log.units.obs, *actions), np.concatenate([steps.obs, acted], 1).T, strict=True)
-    for name, column in named:
+    for name, column in zip((*log.units.obs, *actions), np.concatenate([steps.obs, acted], 1).T, strict=True):
         if len(values := np.unique(column)) == 2:  # quartiles of a flag, or of numbers of actions, say nothing
             share = f"share of {name}" if name in actions else f"share of {values[1]:g} in {name}"
             names, least = [*names, share], [*least, 0.05]
@@ -122,9 +121,11 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
             text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {listed(named)}."
-            apart = "A diagnosis takes one of each; a clone counts them as often as they are there."
             betrays = "Where one is held out, its copy betrays it; keep one of each."
-            yield Remark("duplicate", f"{text} {betrays if kind else apart}", True)
+            apart = (
+                betrays if kind else "A diagnosis takes one of each; a clone counts them as often as they are there."
+            )
+            yield Remark("duplicate", f"{text} {apart}", True)
     if repeated := [group for group in episodes if group not in whole]:
         names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
         again = sum(len(group) - 1 for group in repeated)
@@ -134,7 +135,7 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
 def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     """Stretches in which nothing moves, at the start of episodes and later."""
     if not np.diff(log.obs.astype(float), axis=2)[log.mask].any():
-        yield Remark("pause", "No observation ever changes within an episode: nothing can be learned of it.", True)
+        yield Remark("pause", "No observation ever changes within an episode.", True)
         return
     moving = [i for i, x in enumerate(steps.obs.T) if len(np.unique(x[: 1 << 16])) > FEW]
     if not moving:
@@ -145,7 +146,7 @@ def _pauses(log: Log, steps: Steps) -> Iterator[Remark]:
     moves = motion[log.mask]
     usual = np.quantile(moves, 0.9) or np.quantile(moves[moves > 0], 0.9) if moves.any() else 0.0
     still = (motion <= STILL * usual) & log.mask
-    if usual == 0:  # only what jumps between few values changes
+    if not usual:  # only what jumps between few values changes
         return
     at_start, later, longest, where = 0, 0, 0, (0, 0)
     for b, e in np.argwhere(log.mask.any(2)):
@@ -183,6 +184,8 @@ def _lag(trials: Trials) -> Iterator[Remark]:
             )
         return
     motion = [1 - window.unexplained([j, j + 1, j - 1]) / window.unexplained([j, j + 1]) for j in (0, lag)]
+    if lag >= USUAL and motion[1] <= motion[0] + 0.02:  # as of noise that lasts
+        return
     rows = f"{lag} row{'s' * (lag > 1)}"
     text = (
         f"Actions match the observation {rows} before theirs best ({1 - left[lag + 1]:.0%} of their variance, and"
@@ -212,9 +215,9 @@ def _states(log: Log, steps: Steps) -> Iterator[Remark]:
             column = log.units.obs[int(errors[then < present].argmin())]
             text = f"The action {name} is {which} {column}, to {min(present, then):.1%} of its spread: "
             if then < EQUAL:
-                text = (
-                    f"Observation {column} is the action {name} of the row before. A clone reads its own past actions"
-                    " there, with a memory or without; leave that column out (--obs)."
+                text += (
+                    "that column is the last action, which a clone takes for evidence with a memory or without (leave"
+                    " it out, --obs); or the log has no commands, or a controller that follows them at once."
                 )
             elif then < present:
                 text += "the log has no commands, or a controller that follows them at once; that column tells nothing."

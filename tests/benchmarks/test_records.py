@@ -228,7 +228,7 @@ class TestKeptFiles:
 
     def test_returns_that_no_record_could_hold(self, job: BenchmarkJob) -> None:
         """Their spread is no number any more."""
-        says = r"returns of blind_bc are up to 1e\+300; they must be at most 1e\+100"
+        says = r"blind_bc/returns are up to 1e\+300; they must be at most 1e\+100"
         returns = job_files.read(job.file(0))["blind_bc/returns"]  # type: ignore[index]
         assert re.search(says, self.spoilt(job, **{"blind_bc/returns": 0 * returns - 1e300}))
 

@@ -441,7 +441,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     first = capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "diagnosis.json").read_text())
     assert advice.HEADLINES[written["verdict"]].upper() in first
-    assert set(written["figures"]) >= {*Findings._fields[:-3], "gap", "gap_by_actions", "ratio"} - {"dynamics_differ"}
+    assert set(written["figures"]) >= {*Findings._fields[:14], "gap", "gap_by_actions", "ratio"} - {"dynamics_differ"}
     page = (tmp_path / "out" / "index.html").read_text()
     unfolded, _, folded = html.unescape(page).partition("<details>")
     for key in ("headline", "conclusion", "cost", "sure", "wrong"):

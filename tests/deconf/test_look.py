@@ -129,9 +129,7 @@ def test_a_column_of_the_last_action_is_named() -> None:
     trials = driven()
     last = np.concatenate([0 * trials.action[:, :, :1], trials.action], 2)
     remarks = look(changed(trials, obs=np.concatenate([trials.obs, last], -1)))
-    says = (
-        "Observation observation 2 is the action action 0 of the row before. A clone reads its own past actions there"
-    )
+    says = "The action action 0 is the next observation 2, to 0.0% of its spread: that column is the last action, which"
     assert said(remarks, "state").startswith(says)
     assert "tell nothing" not in said(remarks, "state")
 

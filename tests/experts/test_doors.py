@@ -243,12 +243,12 @@ class TestTasks:
     @pytest.mark.parametrize(
         ("name", "value", "says"),
         [
-            ("episodes", 0, "episodes of slippery_cartpole was 0; it must be a whole number from 1 up"),
+            ("episodes", 0, "episodes of slippery_cartpole was 0; it must be a whole number, an int, from 1 up"),
             ("episodes", -3, "episodes of slippery_cartpole was -3"),
             ("episodes", 2.5, "episodes of slippery_cartpole was 2.5"),
             ("horizon", True, "horizon of slippery_cartpole was True"),
             ("substeps", 0, "substeps of slippery_cartpole was 0"),
-            ("version", "one", "version of slippery_cartpole was 'one'; it must be a whole number from 0 up"),
+            ("version", "one", "version of slippery_cartpole was 'one'; it must be a whole number, an int, from 0 up"),
             ("tier", "x", "tier of slippery_cartpole was 'x'; it must be 1, 2, 3 or None"),
             ("tier", True, "tier of slippery_cartpole was True"),
         ],
