@@ -226,7 +226,9 @@ class Particles:
         level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
         index = (weight.cumsum(-1)[:, None] < level[..., None] * weight.sum(-1)[:, None, None]).sum(-1)
         index = index.clip(0, PARTICLES - 1)[..., None]
-        kept, mean = (np.take_along_axis(x, index[:, : x.shape[1]], 1) if x.shape[1] > 1 else x for x in (u, mean))
+        kept = np.take_along_axis(u, index, 1)
+        if mean.shape[1] > 1:
+            mean = np.take_along_axis(mean, index, 1)
         normal = draws.standard_normal((u[..., 0].size, u.shape[-1])).reshape(u.shape)
         noise = np.einsum("nlm,nkm->nkl", root, normal)
         moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise

@@ -31,9 +31,8 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     """
     check_trials("look", given)
     log = given if isinstance(given, Log) else Log.of(given, "Trials")
-    steps = Steps.of(log)
     part = fits.sample(given)
-    fitted = Steps.of(part)
+    steps, fitted = Steps.of(log), Steps.of(part)
     remarks = [Remark("size", note, isinstance(note, Odd)) for note in log.notes]
     for describe in (
         _ranges,
@@ -121,10 +120,9 @@ def _duplicates(log: Log, steps: Steps) -> Iterator[Remark]:
             named = [" = ".join(log.names[i] for i in group[:LISTED]) for group in groups]
             again = sum(len(group) - 1 for group in groups)
             text = f"{again} of {len(log)} trials repeat{'s' * (again == 1)} another{kind}: {listed(named)}."
-            betrays = "Where one is held out, its copy betrays it; keep one of each."
-            apart = (
-                betrays if kind else "A diagnosis takes one of each; a clone counts them as often as they are there."
-            )
+            apart = "Where one is held out, its copy betrays it; keep one of each."
+            if not kind:
+                apart = "A diagnosis takes one of each; a clone counts them as often as they are there."
             yield Remark("duplicate", f"{text} {apart}", True)
     if repeated := [group for group in episodes if group not in whole]:
         names = [log.names[i] for i in sorted({i for group in repeated for i in group})]
