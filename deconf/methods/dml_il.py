@@ -30,7 +30,7 @@ from torch.nn import functional as F
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, take
+from deconfounded.deconf.core.data import Batch, Draws, Rngs, Signature, as_generators, joined, take
 from deconfounded.deconf.core.layers import Mlp
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales, gaussian_log_prob, sample_index
@@ -165,13 +165,12 @@ class DmlAgent(LearnedAgent):
         return self.history.memory.posterior(self._memory)[0].flatten(0, 1).cpu().numpy()
 
 
-def sources(batch: Batch, lag: int) -> Tensor:
-    """The step [S, B, T] where h_{t-k} ends: `lag` steps before each, but not before its episode's first.
-
-    An episode begins where the observation is not the one that the step before led to.
-    """
-    steps = torch.arange(batch.mask.shape[2], device=batch.mask.device).expand_as(batch.mask)
-    first = (batch.obs[:, :, 1:] != batch.next_obs[:, :, :-1]).any(-1) * steps[:, :, 1:]
+def sources(trials: Trials, lag: int, seeds: int, device: str | torch.device = "cpu") -> Tensor:
+    """The step where h_{t-k} ends of each of `Batch.of` [S, B, T]: `lag` steps before, in the same episode."""
+    number = np.broadcast_to(np.arange(trials.mask.shape[1])[:, None], trials.mask.shape)
+    episode = joined(number[..., None], trials.mask, seeds, device)[..., 0]
+    steps = torch.arange(episode.shape[2], device=device).expand_as(episode)
+    first = (episode[:, :, 1:] != episode[:, :, :-1]) * steps[:, :, 1:]
     return torch.maximum(steps - lag, torch.cat([steps[:, :, :1], first], 2).cummax(2).values)
 
 
@@ -188,6 +187,7 @@ def train(trials: Trials, config: DmlConfig, rng: Rngs, monitor: Monitor | None 
     """Train two roll-out models, then the policy; trials are in as many equal groups as there are generators in rng."""
     rngs, monitor = as_generators(rng), monitor or Monitor()
     data, draws = Batch.of(trials, len(rngs), config.device), Draws(rngs, config.device)
+    source = sources(trials, config.lag, len(rngs), config.device)
     scales = Scales.of(Signature.of(trials), data)
     agent = DmlAgent.new(config.latent, config.width, config.lag, scales, draws)
     history, policy = agent.history, agent.policy
@@ -204,10 +204,10 @@ def train(trials: Trials, config: DmlConfig, rng: Rngs, monitor: Monitor | None 
     def drawn(update: int, half: Tensor, share: int) -> tuple[Batch, Tensor, Tensor]:
         """Trials of a half, a share of the usual number; so many of their steps [S, K], and where h_{t-k} ends."""
         index = half[draws.integers(len(half), -(-config.batch // share))]
-        batch = data.beginnings(update, config.shortest).trials(index)
+        batch, ends = data.beginnings(update, config.shortest).trials(index), take(source, index)
         index, length = batch.draw_steps(-(-config.steps // share), draws), batch.mask.shape[2]
-        source = sources(batch, config.lag) + length * torch.arange(len(batch), device=draws.device)[:, None]
-        return batch, index, source.flatten(1).gather(1, index)
+        flat = ends[..., :length] + length * torch.arange(len(batch), device=draws.device)[:, None]
+        return batch, index, flat.flatten(1).gather(1, index)
 
     def loss_of_model(update: int, i: int) -> Tensor:
         """Of the i-th roll-out model, on trials of the other half [S]."""

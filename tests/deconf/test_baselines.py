@@ -187,9 +187,10 @@ class TestDmlIl:
         """In training and in deployment the policy reads the memory of k steps ago, or of the episode's beginning."""
         draws, lag = streams(), 3
         batch = random_batch(draws, 3, 12)
-        batch.next_obs = batch.next_obs.clone()
-        batch.next_obs[:, 1, 6] += 1  # an episode of the second trial ends there
-        source = sources(batch, lag)
+        mask = np.ones((3, 2, 12), bool)
+        mask[1, 0, 7:] = mask[1, 1, 5:] = mask[[0, 2], 1] = False  # an episode of the second trial ends there
+        of_zeros = Trials(np.zeros((3, 2, 13, 1)), np.zeros((3, 2, 12, 1)), mask)  # none tells where one begins
+        source = sources(of_zeros, lag, 1)[..., :12]
         assert source[0, 0].tolist() == [0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8]
         assert source[0, 1].tolist() == [0, 0, 0, 0, 1, 2, 3, 7, 7, 7, 7, 8]
         agent = DmlAgent.new(2, 8, lag, scales(batch), draws)
