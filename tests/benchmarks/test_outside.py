@@ -1133,14 +1133,14 @@ class TestSentences:
                 agent.observe(obs, action, obs, np.ones(1, bool))
             agent.observe(obs, np.ones((1, 1)), obs, np.ones(1, bool))
 
-    def test_features_before_there_are_trials(self) -> None:
+    def test_what_there_is_not(self) -> None:
+        """A seed; and features before there are trials."""
+        agent = self.agent()
         with pytest.raises(envs.InputError, match="features was called before begin"):
-            self.agent().features()
-
-    @pytest.mark.parametrize("seed", [1, -1, None, "0", 0.0])
-    def test_a_seed_that_there_is_not(self, seed: Any) -> None:
-        with pytest.raises(envs.InputError, match="of an agent of 1 was asked for; it must be from 0 to 0"):
-            self.agent().of_seed(seed)
+            agent.features()
+        for seed in (1, -1, None, "0", 0.0):
+            with pytest.raises(envs.InputError, match="of an agent of 1 was asked for; it must be from 0 to 0"):
+                agent.of_seed(seed)  # type: ignore[arg-type]
 
     def test_a_way_that_there_is_not(self) -> None:
         agent = fit(Context(envs.get("bandit"), tiny_preset(), [0]), "deconfounded")

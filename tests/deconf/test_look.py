@@ -116,6 +116,7 @@ def said(remarks: list[Remark], kind: str) -> str:
     return " ".join(remark.text for remark in remarks if remark.kind == kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rows", [4, 5, 7])
 def test_actions_that_are_many_rows_late(rows: int) -> None:
     trials = driven()
