@@ -260,6 +260,7 @@ class TestScores:
         np.testing.assert_allclose(scores, [0.5] * episodes)
         assert random != expert
 
+    @pytest.mark.slow
     def test_coverage(self) -> None:
         """Of the interval that tables show, by an independent simulation."""
         rng = np.random.default_rng(1)

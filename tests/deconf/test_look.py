@@ -125,6 +125,7 @@ def test_actions_that_are_many_rows_late(rows: int) -> None:
     assert f"they are probably logged late. Move actions up by {rows} rows." in said(look(trials), "late")
 
 
+@pytest.mark.slow
 def test_a_column_of_the_last_action_is_named() -> None:
     """The log has commands, and the dynamics tell; but a clone reads its own past actions there."""
     trials = driven()
