@@ -113,8 +113,13 @@ class Job(ABC):
 
     def load(self, seed: int) -> dict[str, Any] | None:
         """What was written of a seed: arrays, and `meta` decoded. None if there is nothing that fits: see `unfit`."""
+        result, why = self.read(seed)
+        return None if why else result
+
+    def read(self, seed: int) -> tuple[dict[str, Any] | None, str]:
+        """What the file of a seed holds, and why that is not this job's result, see `unfit`; empty if it is."""
         result = job_files.read(self.file(seed))
-        return None if result is None or self.unfit(seed, result) else result
+        return result, job_files.DAMAGED if result is None else self.unfit(seed, result)
 
     def unfit(self, seed: int, result: dict[str, Any]) -> str:
         """Why what a file holds is not this job's result of that seed, as it would come out today; empty if it is."""

@@ -33,7 +33,7 @@ def tasks(asked: list[str]) -> list[envs.Task]:
     """Tasks by names, references and GROUPS, each once. Raises InputError for a name that is unknown."""
     groups = {"certified": certified, "suite": lambda: list(envs.SUITE), "hard": lambda: list(envs.HARD)}
     for each in asked:
-        if each not in (known := [*envs.names(), *groups]) and not outside.is_outside(each):
-            raise envs.closest("task", each, known, "; your own is path/file.py:Class")
+        if each not in (choices := [*envs.names(), *groups]) and not outside.is_outside(each):
+            raise envs.closest("task", each, choices, "; your own is path/file.py:Class")
     names = [name for each in asked for name in (groups[each]() if each in groups else [each])]
     return [envs.get(name) for name in dict.fromkeys(names)]

@@ -12,7 +12,7 @@ import numpy as np
 
 from deconfounded.benchmarks.engine import catalogue
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method
-from deconfounded.benchmarks.engine.job_files import DAMAGED, Finished, in_name, read
+from deconfounded.benchmarks.engine.job_files import Finished, in_name
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.errors import InputError, error_line
@@ -94,8 +94,7 @@ def run_all(
     folder, left = every[0].folder, [list[int]() for _ in every]
     for job, missing in zip(every, left, strict=True):
         for seed in job.seeds:
-            found = read(job.file(seed))
-            why = DAMAGED if found is None else job.unfit(seed, found)
+            _, why = job.read(seed)
             if why and job.file(seed).exists():
                 print(f"{job.file(seed).name} is made again: {why}")
             if why:
@@ -131,12 +130,11 @@ def results(done: Sequence[Job], say: bool = False) -> Finished:
     """What jobs of a seed each have written: method, seed and arrays of each file that fits. say: print of others."""
     finished: Finished = []
     for job in done:
-        found = read(file := job.file(seed := job.seeds[0]))
-        why = DAMAGED if found is None else job.unfit(seed, found)
-        if found is not None and not why:
-            finished.append((job.method, seed, found))
+        result, why = job.read(seed := job.seeds[0])
+        if result is not None and not why:
+            finished.append((job.method, seed, result))
         elif say:
-            print(f"{file.name} is left out: {why}; run it again with --resume")
+            print(f"{job.file(seed).name} is left out: {why}; run it again with --resume")
     return finished
 
 

@@ -103,10 +103,12 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
         if name not in scores:
             tasks = dict.fromkeys(record["task"] for record in every)
             package = [records.named(one) for task in tasks for one in records.of_task(RECORDS, task)]
-            known = [each for each in dict.fromkeys([*scores, *package]) if each not in REFERENCES]
-            near = difflib.get_close_matches(name, known, 1)
+            methods = [each for each in dict.fromkeys([*scores, *package]) if each not in REFERENCES]
+            near = difflib.get_close_matches(name, methods, 1)
             hint = f"did you mean {near[0]}? " if near else ""
-            raise InputError(f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(known)}")
+            raise InputError(
+                f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(methods)}"
+            )
     return scores
 
 
