@@ -36,9 +36,9 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
             raise envs.InputError(f"--range was {text!r}; it must be like {task.latents[0].name}=0.1:0.2") from None
         check_names("latent", [name], list(latents))
         latent = latents[name]
-        if not low <= high:
-            raise envs.InputError(f"--range was {text!r}; {low:g} must be at most {high:g}")
-        if latent.distribution == "categorical" and not latent.low <= low <= high <= latent.high:
+        if not low < high:
+            raise envs.InputError(f"--range was {text!r}; {low:g} must be less than {high:g}")
+        if latent.distribution == "categorical" and not latent.low <= low < high <= latent.high:
             raise envs.InputError(f"--range was {text!r}; {name} has {latent.low:g} to {latent.high:g} alone")
         latents[name] = replace(latent, low=low, high=high)
     other = type(task)()

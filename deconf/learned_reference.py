@@ -18,7 +18,8 @@ from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import Rollout, of_steps, run_trials
+from deconfounded.experts.rollout import Rollout, run_trials
+from deconfounded.experts.trials import of_steps
 
 HELD_OUT = 4  # every so many-th trial fits the noise, not the mean
 SHRINKAGE = 0.05  # of the residuals' covariance to its diagonal: what is nearly deterministic is what the fit misses

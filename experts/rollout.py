@@ -34,11 +34,6 @@ def thetas(task: Task, n: int, episodes: int, seed: Seeds) -> Array:
     return np.stack(hidden, 1)
 
 
-def of_steps(theta: Array, steps: int) -> Array:
-    """Theta of each step [B, E, T, L], from a roll-out's theta: of each episode [B, E, L], or of each step already."""
-    return np.repeat(theta[:, :, None], steps, 2) if theta.ndim == 3 else theta
-
-
 def _group_seeds(seed: Seeds) -> list[int]:
     """The seed of each group of trials. Raises InputError for anything else."""
     given: Any = seed.tolist() if isinstance(seed, np.ndarray) else seed

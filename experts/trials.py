@@ -11,10 +11,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from deconfounded.envs.streams import Mask
+from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
 from deconfounded.experts.arrays import LARGEST, check_rounding, numbers, padded, size
+
+
+def of_steps(theta: Array, steps: int) -> Array:
+    """Theta of each step [B, E, T, L], from a roll-out's theta: of each episode [B, E, L], or of each step already."""
+    return np.repeat(theta[:, :, None], steps, 2) if theta.ndim == 3 else theta
 
 
 @dataclass(frozen=True, eq=False)

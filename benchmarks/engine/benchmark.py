@@ -25,8 +25,8 @@ from deconfounded.envs.task import Array
 from deconfounded.experts import saved_agents
 from deconfounded.experts.agent import Agent, AgentWrapper
 from deconfounded.experts.policy import Expert
-from deconfounded.experts.rollout import of_steps, run_trials
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials, of_steps
 
 CLIPPED = ("expert", "naive_rnn", "deconfounded")  # recorded for the video, in the first seed
 FULL = (errno.ENOSPC, errno.EDQUOT)  # of a disk

@@ -15,8 +15,8 @@ from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
 from deconfounded.experts.agent import Agent, ExpertAgent, RandomAgent
-from deconfounded.experts.rollout import Rollout, of_steps, run_trials, thetas
-from deconfounded.experts.trials import Trials, joined
+from deconfounded.experts.rollout import Rollout, run_trials, thetas
+from deconfounded.experts.trials import Trials, joined, of_steps
 
 if TYPE_CHECKING:
     from deconfounded.benchmarks.engine.presets import Preset

@@ -13,8 +13,7 @@ from torch.nn import functional as F
 
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
-from deconfounded.experts.rollout import of_steps
-from deconfounded.experts.trials import Trials, check_trials
+from deconfounded.experts.trials import Trials, check_trials, of_steps
 
 Rngs = np.random.Generator | Sequence[np.random.Generator]
 """One generator for each seed; a single one stands for one seed."""

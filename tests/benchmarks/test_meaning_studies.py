@@ -34,8 +34,8 @@ from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.policy import CallableExpert
-from deconfounded.experts.rollout import of_steps, run_trials
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.rollout import run_trials
+from deconfounded.experts.trials import Trials, of_steps
 from tests import toys
 from tests.tools import deconf, tiny_preset
 
@@ -323,8 +323,10 @@ class TestCommands:
         assert scored["return"] != score_command.rescore(agent, PUSH, EXPERT, 16, 7, PUSH)["return"]
 
     def test_a_range_that_ends_before_it_begins(self) -> None:
-        with pytest.raises(envs.InputError, match=r"--range was 'best_arm=3:1'; 3 must be at most 1"):
+        with pytest.raises(envs.InputError, match=r"--range was 'best_arm=3:1'; 3 must be less than 1"):
             score_command.with_ranges(envs.get("bandit"), ["best_arm=3:1"])
+        with pytest.raises(envs.InputError, match=r"--range was 'force=\.5:\.5'; 0\.5 must be less than 0\.5"):
+            score_command.with_ranges(PUSH, ["force=.5:.5"])
 
     def test_salt_of_a_score(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         seeds: list[int] = []
