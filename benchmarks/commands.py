@@ -13,7 +13,7 @@ from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place
 from deconfounded.benchmarks.engine import catalogue, identity
 from deconfounded.benchmarks.engine.catalogue import METHODS, PRESETS
-from deconfounded.benchmarks.engine.protocols import STANDARD, amounts, check_methods
+from deconfounded.benchmarks.engine.protocols import STANDARD, amounts, check_methods, possible
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.files import check_folder
 
@@ -47,7 +47,8 @@ def parser(description: str | None, methods: str, seeds: int | None = None, resu
 
 def check(args: argparse.Namespace, allowed: Sequence[str], default: Sequence[str], guests: bool = False) -> list[str]:
     """The methods asked for; guests: from outside too. Raises InputError for anything that cannot be run."""
-    methods = [name for asked in args.methods or default for name in (allowed if asked == "all" else [asked])]
+    every = possible(args.protocol, allowed)
+    methods = [name for asked in args.methods or default for name in (every if asked == "all" else [asked])]
     if guests:
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
         allowed = [*allowed, *METHODS.outside]

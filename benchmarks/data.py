@@ -1,6 +1,7 @@
 """Write demonstrations or explorations as a Minari data set: `deconf data --task slippery_cartpole --out data`
 
-The expert's trials are those that seed 0 of a run imitates; --explore writes trials of uniformly random actions. The
+With as many trials as a preset has (256 on control tasks) the expert's are those that seed 0 of a run imitates, since
+its actions in a trial depend on how many trials there are; --explore writes trials of uniformly random actions. The
 sha256 is of the contents: with the same versions of libraries it is the same everywhere.
 """
 

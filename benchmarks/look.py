@@ -41,7 +41,9 @@ def read(data: list[Path], explore: list[Path] | None, chosen: dict[str, Any]) -
 
     logs = datasets.read_together([data] if explore is None else [data, explore], **chosen)
     if explore is not None and logs[0].sha256 == logs[1].sha256:
-        raise InputError("--data and --explore hold the same trials; --explore is for those of who does not see theta")
+        raise InputError(
+            "--data and --explore hold the same trials; --explore is for trials of a policy that does not see theta"
+        )
     return logs[0], logs[1] if len(logs) > 1 else None
 
 

@@ -13,6 +13,7 @@ trial, as a model of each particle of all trials would take gigabytes.
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from deconfounded.envs.latent import folded
 from deconfounded.envs.patches import PatchedTask
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
+from deconfounded.envs.task import Simulator
 from deconfounded.experts.agent import Agent
 from deconfounded.experts.policy import Expert, sample_rows
 
@@ -67,6 +69,11 @@ class Particles:
             self._start(rng)
         self._steps, self._started = 0, True
 
+    @cached_property
+    def _whole(self) -> Simulator:
+        """For transitions that the quadratic missed: a model for each particle of one trial."""
+        return self.task.simulator(PARTICLES)
+
     def _start(self, rng: Streams) -> None:
         seeds = (rng.random((self._n, 1))[:, 0] * 2**53).astype(np.int64)
         self._rngs = [np.random.default_rng(seed) for seed in seeds.tolist()]
@@ -80,7 +87,6 @@ class Particles:
         self._terms = np.zeros((*self._shape[:2], terms)) if smooth else None
         self._solver = np.zeros((self._n, terms, wanted))
         self.missed = 0  # transitions that the quadratic missed
-        self._whole = self.task.simulator(PARTICLES if moves else 0)
         self._flat = self._n * PARTICLES, self._shape[2]
         self.log_weight = np.full(self._shape[:2], -np.log(PARTICLES))
         self._u, self.theta = np.zeros(self._shape), np.full(self._shape, np.nan)
@@ -224,7 +230,8 @@ class Particles:
         draws = Streams([self._rngs[i] for i in rows.tolist()])
         start = draws.random((len(rows), 1))
         level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
-        index = (weight.cumsum(-1)[:, None] < level[..., None] * weight.sum(-1)[:, None, None]).sum(-1)
+        level = level * weight.sum(-1, keepdims=True)
+        index = np.stack([np.searchsorted(*each) for each in zip(weight.cumsum(-1), level, strict=True)])
         index = index.clip(0, PARTICLES - 1)[..., None]
         kept = np.take_along_axis(u, index, 1)
         if mean.shape[1] > 1:

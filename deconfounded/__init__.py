@@ -1,7 +1,7 @@
 """Deconfounded imitation learning: `envs`, `experts`, `deconf` and `benchmarks` under one name.
 
 Each of the four is a folder at the top of the repository; the links here are for type checkers and editors, and an
-install goes without. Importing this package imports none of them, so that who wants the environments alone needs no
+install goes without. Importing this package imports none of them, so that those who want only the environments need no
 more than these.
 """
 

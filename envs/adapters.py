@@ -109,9 +109,10 @@ class GymVectorEnv(VectorEnv[Any, Any, NDArray[Any]]):
     """n environments stepped natively; equal, bit for bit, to gymnasium's SyncVectorEnv over n GymEnv.
 
     A finished environment is reset by the next step, or with AutoresetMode.SAME_STEP by the step that finished it, and
-    info then has `final_obs`: under the same theta until its trial has had `episodes` episodes, then under a new theta.
-    `reset` does so too, if it is given neither seed nor options. It takes the options of GymEnv.reset; keep_theta may
-    be a mask [N]: where True, the next episode of the trial starts, elsewhere the first episode of a new trial.
+    info then has `final_obs`. The new episode is under the same theta until its trial has had `episodes` episodes, then
+    under a new theta. `reset` does so too, if it is given neither seed nor options. It takes the options of
+    GymEnv.reset; keep_theta may be a mask [N]: where True, the next episode of the trial starts, elsewhere the first
+    episode of a new trial.
     """
 
     def __init__(

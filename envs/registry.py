@@ -36,8 +36,9 @@ def register(cls: type[Task]) -> type[Task]:
     except TypeError as error:
         raise InputError(f"task {name} of {where}: {error_line(error)}; {cls.__name__}() must do") from None
     _check_latents(task)
-    if TASKS.get(name, cls) is not cls:
-        raise InputError(f"task name {name!r} of {where} is taken by {_where(TASKS[name])}; give it another name")
+    before = TASKS.get(name, cls)
+    if (before.__module__, before.__qualname__) != (cls.__module__, cls.__qualname__):  # not the same, defined again
+        raise InputError(f"task name {name!r} of {where} is taken by {_where(before)}; give it another name")
     if "reference" not in vars(cls):
         ours = cls.__module__.startswith(f"{__package__}.")
         cls.reference = name if ours else outside.reference(cls) or name
@@ -47,7 +48,8 @@ def register(cls: type[Task]) -> type[Task]:
     if twins := [each for each in TASKS if each != name and TASKS[each]().gym_id == gym_id]:
         raise InputError(f"task {name!r} of {where} would be {gym_id}, as {twins[0]} is; give it another name")
     TASKS[name] = cls
-    gymnasium.registry.pop(gym_id, None)
+    for stale in (before().gym_id, gym_id):
+        gymnasium.registry.pop(stale, None)
     one, many, arguments = f"{__name__}:make", f"{__name__}:make_registered_vec", {"name": cls.reference}
     gymnasium.register(gym_id, one, max_episode_steps=steps, vector_entry_point=many, kwargs=arguments)
     return cls

@@ -69,8 +69,8 @@ def run_trials(env: BatchEnv, agent: Agent, episodes: int, seed: Seeds, theta: A
 
     seed: of the environments and, independently, of the agent; or a seed for each of equal consecutive groups of
     trials, each of which is the same, bit for bit, as it is alone. Trial i of a group has the seed `seed + i`: groups
-    whose seeds are near each other share trials. theta [N, L]: None: drawn from p(theta). Raises InputError for an
-    agent that reads other environments than `env`.
+    whose seeds are near each other share trials. theta [N, L], or None: then it is drawn from p(theta). Raises
+    InputError for an agent that reads other environments than `env`.
     """
     task, n = env.task, env.n
     check_number("episodes", episodes)

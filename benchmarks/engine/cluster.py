@@ -31,7 +31,7 @@ TRIES = 5  # of a job, whose worker was lost each time
 
 @dataclass
 class Attempt:
-    """A job at work somewhere: for the how-manieth time, and how many ticks the progress has of it already."""
+    """A job at work somewhere. tries: how often it was started; ticks: of its progress, counted so far."""
 
     job: Job
     tries: int

@@ -54,7 +54,7 @@ class Context:
     ) -> None:
         """folder: where each seed's demonstrations are kept, for all methods; or nowhere. expert: see policy.load.
 
-        salt: of demonstrations and exploration, where their thetas are to be nobody's guess.
+        salt: of demonstrations and exploration, where nobody must be able to guess their thetas.
         """
         self.task, self.scored = (applied(protocol, task, evaluation) for evaluation in (False, True))
         self.preset, self.seeds, self.monitor = preset, list(seeds), monitor or Monitor()

@@ -139,7 +139,7 @@ class Job(ABC):
 
 
 class DemonstrationJob(Job):
-    """Makes what all methods imitate with a seed, so that no two of them do."""
+    """Makes a seed's demonstrations once, before the methods that share them."""
 
     @property
     def about(self) -> Method:

@@ -100,6 +100,11 @@ def _parsed(key: str, text: str, kinds: tuple[Any, ...], now: Any, own: bool) ->
         return value
     least = 0 if isinstance(now, float) or key.endswith(("updates", "fresh", "grid")) else 1
     least = FEWEST if key == "eval_trials" else least
-    if not fits(value, kinds, least, MOST):
-        raise envs.InputError(f"--set {key} was {text!r}; it must be like {json.dumps(now)}, and at least {least}")
-    return value
+    if fits(value, kinds, least, MOST):
+        return value
+    right = f"like {json.dumps(now)}"
+    if not any(isinstance(kind, type) for kind in kinds):
+        right = f"one of {', '.join(map(str, kinds))}"
+    elif {int, float} & {*kinds}:
+        right += f", and at least {least}"
+    raise envs.InputError(f"--set {key} was {text!r}; it must be {right}")

@@ -61,9 +61,14 @@ def check(protocol: str, task: envs.Task) -> None:
         raise envs.InputError(f"--protocol {protocol} is not for {task.name}: {why}")
 
 
+def possible(protocol: str, methods: Sequence[str]) -> list[str]:
+    """The methods to which a protocol's amounts of data apply."""
+    return [name for name in methods if protocol != "scarce" or name not in STEPWISE]
+
+
 def check_methods(protocol: str, methods: Sequence[str]) -> None:
     """Raises InputError for a method to which a protocol's amounts of data would not apply."""
-    if protocol == "scarce" and (strange := [name for name in methods if name in STEPWISE]):
+    if strange := sorted({*methods} - {*possible(protocol, methods)}):
         raise envs.InputError(f"--protocol scarce is not for {strange[0]}: its own settings say how much it explores")
 
 

@@ -18,6 +18,8 @@ from deconfounded.benchmarks.engine.progress import Progress
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import check_folder, write_atomically
 
+OUT_OF_MEMORY = re.compile("allocate memory|out of memory", re.IGNORECASE)  # of torch's RuntimeErrors
+
 
 class Work(Protocol):
     """A job, or anything that does its own work and says how it went."""
@@ -35,7 +37,7 @@ Some = TypeVar("Some", bound=Work)
 
 
 def run_job(job: Work) -> str:
-    """The job's line. Raises InputError for SystemExit, which would end the process.
+    """The job's line. Raises InputError for SystemExit, which would end the process, and where memory is exhausted.
 
     Of a task or method from outside, any other error is an InputError too, with the traceback as its note.
     """
@@ -46,6 +48,8 @@ def run_job(job: Work) -> str:
     except SystemExit as error:
         raise InputError(f"the job was ended by {error_line(error)}") from None
     except Exception as error:
+        if isinstance(error, MemoryError) or OUT_OF_MEMORY.search(str(error)):
+            raise InputError(f"memory was exhausted: {error_line(error)}") from None
         if not (theirs := job.from_outside if isinstance(job, Job) else []):
             raise
         failure = InputError(f"{' and '.join(theirs)}: {error_line(error)}")

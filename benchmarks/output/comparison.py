@@ -8,7 +8,7 @@ import difflib
 import io
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -172,13 +172,11 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
                     for task, seeds in pairs.items()
                 }
                 minus[measure][other] = statistics.mean_difference(differences)
-                both = [{task: np.array([*of[task].values()]) for task in pairs} for of in (own, theirs)]
-                improvement = statistics.over_tasks(statistics.improvement, *both)
-                if improvement is not None and measure == "last":
-                    lone = (
-                        min(len(runs) for of in both for runs in of.values()) == 1
-                    )  # which no bootstrap can draw anew
-                    better[other] = replace(improvement, interval=None) if lone else improvement
+                if measure == "last":
+                    both = [{task: np.array([*of[task].values()]) for task in pairs} for of in (own, theirs)]
+                    improvement = statistics.over_tasks(statistics.improvement, *both)
+                    assert improvement is not None
+                    better[other] = improvement
         made.append(Row(name, "", len(scores[name]), mean, minus, better))
     return made
 

@@ -166,7 +166,7 @@ def write(task: envs.Task, clips: Clips, file: Path) -> None:
 
 
 def record(env: envs.BatchEnv, agent: Agent, episodes: int, seed: int, theta: Array | None = None) -> dict[str, Any]:
-    """The clip of an agent, of the trial that `Recorder` films; theta [N, L]: None: drawn from p(theta)."""
+    """The clip of an agent, of the trial that `Recorder` films; theta [N, L], or None: then it is drawn."""
     from deconfounded.benchmarks.engine.benchmark import Recorder
 
     recorder = Recorder(agent, env, filmed=True)

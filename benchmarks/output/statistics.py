@@ -29,16 +29,13 @@ class Figure:
 def paired(one: Mapping[int, float], other: Mapping[int, float]) -> Figure | None:
     """Mean of one less the other over the seeds that both have, with Student's interval; None if they share none."""
     seeds = sorted(set(one) & set(other))
-    if not seeds:
-        return None
-    differences = np.array([one[seed] - other[seed] for seed in seeds])
-    interval = tuple(stats.ttest_1samp(differences, 0).confidence_interval()) if len(seeds) > 1 else None
-    return Figure(differences.mean(), interval, len(seeds))
+    return mean_difference({"": np.array([one[seed] - other[seed] for seed in seeds])}) if seeds else None
 
 
 def mean_difference(differences: Mapping[str, Array]) -> Figure:
     """The mean over tasks of mean differences by seed [S] of each task, with Welch's interval; None if a task has one.
 
+    Of a single task it is Student's.
     Its variance is that of a mean of independent means: the sum of s^2 / S over tasks, by their number squared, with
     Welch and Satterthwaite's degrees of freedom.
     """

@@ -80,7 +80,7 @@ def mended(name: str, x: Array) -> tuple[str, float]:
 
 
 def copies(trials: Trials) -> tuple[list[list[int]], ...]:
-    """Groups of trials that are the same; whose actions are; and the trials of episodes that are the same.
+    """Three lists of groups of trials: alike in all, alike in their actions, and with an episode in common.
 
     Trials without a step are of none. Actions count where they are continuous, of ten steps or more, and not constant.
     """

@@ -30,7 +30,7 @@ class PalrConfig(RecurrentConfig):
 
 
 def kernel(x: Tensor) -> Tensor:
-    """The Gaussian kernel matrix [n, n] of rows [n, F], with their root mean square distance for a width."""
+    """The Gaussian kernel matrix [n, n] of rows [n, F]: exp(-d^2 / m), where m is the mean of d^2 over all pairs."""
     squares = (x[:, None] - x[None]).square().sum(-1)
     return torch.exp(-squares / squares.detach().mean().clamp(min=1e-6))
 

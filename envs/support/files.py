@@ -31,11 +31,12 @@ def check_file(file: Path) -> None:
 
 
 def write_atomically(file: Path, data: str | bytes) -> None:
-    """Write a file in one step: it holds all of the data, or what it held before."""
-    partial = file.with_name(f".{file.name}.{os.getpid()}{PARTIAL}")
+    """Write a file in one step: it holds all of the data, or what it held before. A link is followed."""
+    target = file.resolve()
+    partial = target.with_name(f".{target.name}.{os.getpid()}{PARTIAL}")
     try:
         partial.write_bytes(data.encode("utf-8", "surrogateescape") if isinstance(data, str) else data)
-        os.replace(partial, file)
+        os.replace(partial, target)
     except BaseException as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

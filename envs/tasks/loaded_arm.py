@@ -10,7 +10,7 @@ mark, which theta does not touch.
 
 The MJCF is Gymnasium's own, from the installed package, with a cheaper integrator; inertia and damping of a joint are 1
 kg m^2 and 1 N m s. Action: both torques. Reward: .7 exp(-(d / .05)^2 / 2) + .3 exp(-d / .1), d m from the mark, which
-is anew in each episode, .06 to .19 m from the shoulder. An episode is 100 steps of .02 s; nothing ends it early.
+is drawn anew in each episode, .06 to .19 m from the shoulder. An episode is 100 steps of .02 s; nothing ends it early.
 """
 
 import mujoco

@@ -37,6 +37,8 @@ def _arrays(group: Any, prefix: str = "") -> dict[str, Any]:
     """Arrays of a group and of groups in it, by their path."""
     arrays: dict[str, Any] = {}
     for name, item in group.items():
+        if item is None:
+            raise InputError(f"{prefix}{name} of {group.file.filename} is a link to nothing")
         arrays |= _arrays(item, f"{prefix}{name}/") if isinstance(item, Mapping) else {f"{prefix}{name}": item}
     return arrays
 
@@ -72,7 +74,7 @@ def _robomimic(file: Path, data: Any) -> Table:
         raise InputError(f"{file} holds no demonstrations under `data`")
     demos, attributes = list[dict[str, Column]](), list[dict[str, Any]]()
     for name in names:
-        where, demo = f"{name} of {file}", data[name]
+        where, demo = f"{name} of {file}", data.get(name)  # None for a link to nothing
         if not isinstance(demo, Mapping) or not {"actions", "obs"} <= set(demo):
             raise InputError(f"{where} must hold `actions` and `obs`")
         arrays = {key: array for key, array in _arrays(demo).items() if array.ndim}

@@ -2,6 +2,7 @@
 
 import os
 import re
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -65,7 +66,7 @@ def write(
     if not re.fullmatch(r"[-\w]+", name, re.ASCII):
         raise InputError(f"name of the data set was {name!r}; it must be of letters, digits, - and _")
     folder = folder.resolve()  # Minari would join a relative path to itself
-    with _root(folder), warnings.catch_warnings():
+    with tempfile.TemporaryDirectory(prefix=".", dir=folder) as aside, _root(Path(aside)), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about authors and links, which are optional
         import minari
         from minari.data_collector import EpisodeBuffer
@@ -105,6 +106,11 @@ def write(
         )
         dataset.storage.update_metadata({HORIZON: trials.mask.shape[2]})
         dataset.storage.update_episode_metadata(metadata)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        for described in Path(aside).rglob("namespace_metadata.json"):
+            if not (there := folder / described.relative_to(aside)).exists():
+                described.rename(there)
+        (Path(aside) / identity).rename(place)  # whole, or not at all
     return place
 
 

@@ -361,8 +361,11 @@ def test_another_closed_pipe_is_an_error(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 class TestFiles:
-    def test_a_full_disk(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_full_disk(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         """It is told of which file, which holds what it held before; nothing half written stays."""
+        monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python would keep the first 100 bytes of it
         file, figure = tmp_path / "kept.json", pytest.importorskip("matplotlib.figure").Figure()
         file.write_text("{}")
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -386,6 +389,14 @@ class TestFiles:
         with pytest.raises(KeyboardInterrupt):
             write_json(tmp_path / "x.json", {})
         assert not list(tmp_path.iterdir())
+
+    def test_a_link_is_written_through(self, tmp_path: Path) -> None:
+        file, link = tmp_path / "there" / "x.json", tmp_path / "link.json"
+        file.parent.mkdir()
+        link.symlink_to(file)
+        write_json(link, [1])
+        assert link.is_symlink()
+        assert json.loads(file.read_text()) == [1]
 
     def test_what_is_no_plain_file_is_left_alone(self, tmp_path: Path) -> None:
         for file, says in ((tmp_path, "is a folder"), (Path("/dev/null"), "is no plain file")):

@@ -143,6 +143,8 @@ class TestStatistics:
         assert difference.interval == pytest.approx((0.5 - 1.242069, 0.5 + 1.242069), abs=1e-6)
         assert statistics.paired({0: 1.0}, {0: 0.25}) == statistics.Figure(np.float64(0.75), None, 1)
         assert statistics.paired({0: 1.0}, {1: 1.0}) is None
+        alike = statistics.paired({0: 1.5, 1: 1.5}, {0: 1.0, 1: 1.0})  # without a warning
+        assert alike == statistics.Figure(np.float64(0.5), (0.5, 0.5), 2)
 
     @pytest.mark.parametrize("seeds", [2, 5])
     def test_coverage(self, seeds: int) -> None:

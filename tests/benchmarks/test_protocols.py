@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.benchmarks import compare, report
+from deconfounded.benchmarks import commands, compare, report
 from deconfounded.benchmarks.engine import progress, protocols, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.catalogue import METHODS
@@ -69,6 +69,10 @@ def test_scarce_is_scarce_for_every_method() -> None:
     with pytest.raises(envs.InputError, match="--protocol scarce is not for gail: its own settings say how much"):
         protocols.check_methods("scarce", ["dagger", "gail"])
     protocols.check_methods("once", ["dagger", "gail"])
+    assert protocols.possible("once", ["dagger", "gail"]) == ["dagger", "gail"]
+    args = commands.parser("", "", 1).parse_args(["--methods", "all"])
+    args.protocol = "scarce"
+    assert "gail" not in commands.check(args, [*METHODS], [])
 
 
 class OwnThetas(toys.Push):

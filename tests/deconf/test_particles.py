@@ -184,15 +184,26 @@ def test_a_quadratic_stands_for_simulation() -> None:
 
 @pytest.mark.parametrize(("name", "models"), [("cheetah_speed", 0), ("forked_path", FEW)])
 def test_models_are_few_where_nothing_is_fitted(name: str, models: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None where theta moves no state; as many as particles where a latent is categorical, for 50 trials too."""
+    """None where theta moves no state; as many as particles where a latent is categorical, for 50 trials too.
+
+    In each trial anew, and only once a transition comes.
+    """
     task, made = envs.get(name), list[int]()
     simulator = type(task).simulator
     monkeypatch.setattr(type(task), "simulator", lambda self, n: made.append(n) or simulator(self, n))
-    belief = Particles(envs.BatchEnv(task, 1), policy.load(task), False)
+    env = envs.BatchEnv(task, 50)
+    belief = Particles(env, policy.load(task), False)
     made.clear()
-    belief.begin(50)
-    belief.reset(Streams([*np.random.default_rng(0).spawn(50)]))
-    assert sum(made) == models
+    for transitions in (0, 1, 2):
+        obs = env.reset(0)
+        belief.begin(50)
+        belief.reset(Streams([*np.random.default_rng(0).spawn(50)]))
+        for _ in range(transitions):
+            state, action = env.state, np.zeros((50, task.action_width), np.float32)
+            env.step(action)
+            belief.learn(state, obs, action, env.state, env.alive)
+            obs = env.observe()
+        assert sum(made) == (models if transitions else 0)
 
 
 def test_a_kink_does_not_mislead() -> None:

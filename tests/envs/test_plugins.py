@@ -3,7 +3,9 @@
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -51,6 +53,19 @@ def test_two_tasks_of_one_file_and_name_stay_refused(tmp_path: Path) -> None:
     envs.get(f"{tmp_path}/mine.py:Mine")
     with pytest.raises(envs.InputError, match=r"^task name 'own_push' of .* is taken by"):
         envs.get(f"{tmp_path}/mine.py:Other")
+
+
+def test_a_class_that_is_defined_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As when a cell of a notebook is executed twice: the last one counts, also under another version."""
+    monkeypatch.setattr(envs.registry, "TASKS", {**envs.TASKS})
+    for horizon, version in ((6, 0), (9, 0), (9, 1)):
+        cell: dict[str, Any] = {"__name__": "__main__"}
+        exec(TASK.format(name="Mine", horizon=horizon) + f"    version = {version}\n", cell)
+        envs.register(cell["Mine"])
+        assert (envs.get("own_push").horizon, envs.get("own_push").version) == (horizon, version)
+    assert "deconf/OwnPush-v1" in gymnasium.registry
+    assert "deconf/OwnPush-v0" not in gymnasium.registry
+    gymnasium.registry.pop("deconf/OwnPush-v1")
 
 
 def test_helpers_of_one_name_in_two_folders(tmp_path: Path) -> None:

@@ -121,6 +121,19 @@ def test_what_the_command_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (thetas[0] != thetas[1]).any()
 
 
+def test_half_a_data_set_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the metadata of its episodes each of these would be read as a trial of its own."""
+    monkeypatch.setattr("sys.argv", ["data", "--task", "bandit", "--trials", "4", "--out", str(tmp_path)])
+    with monkeypatch.context() as interrupted:
+        interrupted.setattr("minari.dataset._storages.hdf5_storage.HDF5Storage.update_episode_metadata", None)
+        with pytest.raises(TypeError):
+            data.main()
+    assert not list(tmp_path.iterdir())
+    data.main()
+    assert [file.name for file in tmp_path.iterdir()] == ["deconf"]
+    assert len(Trials.from_minari(tmp_path)) == 4
+
+
 def test_bad_input_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(envs.InputError, match="holds 0 Minari data sets"):
         Trials.from_minari(tmp_path)

@@ -337,6 +337,23 @@ class TestTasks:
         with pytest.raises(envs.InputError, match=r"ended by 0 \(SystemExit, test_doors.py"):
             run_job(Ending())  # type: ignore[arg-type]
 
+    def test_a_job_that_memory_is_too_small_for(self) -> None:
+        """It fails, and the others go on; any other error of a method of ours is one of the program."""
+
+        class Large:
+            def __init__(self, error: Exception) -> None:
+                self.error = error
+
+            def run(self) -> str:
+                raise self.error
+
+        torch_says = RuntimeError("DefaultCPUAllocator: can't allocate memory: ...")
+        for error in (MemoryError(), torch_says, RuntimeError("CUDA out of memory. Tried to allocate 2 GiB")):
+            with pytest.raises(envs.InputError, match=r"memory was exhausted: .*Error.*test_doors.py"):
+                run_job(Large(error))  # type: ignore[arg-type]
+        with pytest.raises(RuntimeError, match="shapes"):
+            run_job(Large(RuntimeError("shapes do not fit")))  # type: ignore[arg-type]
+
     def test_commands_may_end(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """As they do after --help, and where something failed."""
         monkeypatch.setattr(check, "CONTRACT", {"broken": lambda task: 1 / 0})

@@ -627,6 +627,22 @@ class TestBadInput:
         with pytest.raises(envs.InputError, match=r"there is no .*gone.csv; give"):
             datasets.read(tmp_path / "gone.csv")
 
+    def test_links_to_nothing(self, tmp_path: Path) -> None:
+        h5py = pytest.importorskip("h5py")
+        robomimic = {"data/demo_0/obs/x": np.zeros((4, 2)), "data/demo_0/actions": np.zeros((4, 1))}
+        flat = {"observations": np.zeros((4, 2)), "actions": np.zeros((4, 1)), "terminals": np.zeros(4)}
+        for content, link, says in (
+            (robomimic, "data/demo_0/obs/y", "obs/y of .* is a link to nothing"),
+            (robomimic, "data/demo_1", "demo_1 of .* must hold `actions` and `obs`"),
+            (flat, "extra", "extra of .* is a link to nothing"),
+        ):
+            with h5py.File(tmp_path / "links.hdf5", "w") as file:
+                for key, array in content.items():
+                    file[key] = array
+                file[link] = h5py.ExternalLink("gone.hdf5", "/x")
+            with pytest.raises(envs.InputError, match=says):
+                datasets.read(tmp_path / "links.hdf5")
+
     def test_hdf5_of_others(self, tmp_path: Path) -> None:
         h5py = pytest.importorskip("h5py")
         for name, content, says in (
