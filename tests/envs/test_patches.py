@@ -115,6 +115,7 @@ def test_the_expert_heeds_the_stream_within_the_lag() -> None:
     obs = raft.observe(state)
     stream = np.floor((raft.qpos(state, "x") + LAG * raft.qvel(state, "mark_x")) % 12 / 2).astype(int)
     np.testing.assert_array_equal(raft.heeded(obs), stream)
+    np.testing.assert_array_equal(raft.heeded(obs + 3 * (np.arange(14) == 2)), stream)  # whatever its own speed is
     assert len(np.unique(stream)) == 6
     currents = np.linspace(-1, 1, 6)
     wanted = (state[:, -2:] - [0, 1] * currents[stream, None]) / THRUST

@@ -501,18 +501,20 @@ class TestRunTrials:
         assert np.histogram(acted[1], 4, (-1, 1))[0] / 6000 == pytest.approx([1 / 4] * 4, abs=0.02)
 
     def test_random_numbers_of_an_agent_are_new_in_each_episode(self) -> None:
-        """And of each seed its own."""
-        drawn = list[float]()
+        """And of each seed its own, but they do not say which seed that is: thetas are drawn by it, too."""
+        drawn, sequences = list[float](), list[np.random.SeedSequence]()
 
         class Drawing(Agent):
             def reset(self, rngs: Any) -> None:
                 drawn.extend(rng.random() for rng in rngs)
+                sequences.extend(rng.bit_generator.seed_seq for rng in rngs)
 
             def act(self, obs: Any) -> Any:
                 return np.zeros((len(obs), 1))
 
         run_trials(envs.BatchEnv(envs.get("bandit"), 2), Drawing(), 3, [0, 5])
         assert len(set(drawn)) == len(drawn) == 6
+        assert len({repr(each.entropy) for each in sequences}) == 1
 
 
 class TestTraining:
