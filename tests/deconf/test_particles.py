@@ -184,22 +184,22 @@ def test_a_quadratic_stands_for_simulation() -> None:
 
 @pytest.mark.parametrize(("name", "models"), [("cheetah_speed", 0), ("forked_path", FEW)])
 def test_models_are_few_where_nothing_is_fitted(name: str, models: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """None where theta moves no state; as many as particles where a latent is categorical, for 50 trials too.
+    """None where theta moves no state; as many as particles where a latent is categorical, once a transition comes.
 
-    In each trial anew, and only once a transition comes.
+    However many trials there are.
     """
-    task, made = envs.get(name), list[int]()
+    task, made, n = envs.get(name), list[int](), 10
     simulator = type(task).simulator
     monkeypatch.setattr(type(task), "simulator", lambda self, n: made.append(n) or simulator(self, n))
-    env = envs.BatchEnv(task, 50)
+    env = envs.BatchEnv(task, n)
     belief = Particles(env, policy.load(task), False)
     made.clear()
-    for transitions in (0, 1, 2):
+    for transitions in (0, 1):
         obs = env.reset(0)
-        belief.begin(50)
-        belief.reset(Streams([*np.random.default_rng(0).spawn(50)]))
+        belief.begin(n)
+        belief.reset(Streams([*np.random.default_rng(0).spawn(n)]))
         for _ in range(transitions):
-            state, action = env.state, np.zeros((50, task.action_width), np.float32)
+            state, action = env.state, np.zeros((n, task.action_width), np.float32)
             env.step(action)
             belief.learn(state, obs, action, env.state, env.alive)
             obs = env.observe()
