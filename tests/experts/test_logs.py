@@ -523,6 +523,14 @@ class TestActions:
         np.testing.assert_array_equal(acted[0], log.units.unscaled(acted[2]))
         assert discrete is (acted[0][0, 0] in ("stop", "go"))
 
+    def test_units_are_those_of_trials_only_from_end_to_end(self) -> None:
+        """Of every action: -1 to 1; or discrete ones by their numbers."""
+        names = ("x",), ("y", "z")
+        for low, high in (((-1, 0), (1, 1)), ((-1, -1), (1, 2)), ((0, 0), (2, 2))):
+            assert Units(*names, low, high).raw
+        assert not Units(*names, (-1, -1), (1, 1)).raw
+        assert [Units(("x",), ("y",), (0,), (1,), values).raw for values in ((0, 1), (1, 2))] == [False, True]
+
     def test_what_is_no_action(self) -> None:
         units = Units(("x",), ("y",), (0.0,), (1.0,), ("go", "stop"))
         with pytest.raises(envs.InputError, match="an action was 'jump'; it must be one of go, stop"):
