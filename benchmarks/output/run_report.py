@@ -1,7 +1,7 @@
 """Pictures, video and a self-contained report.html from the files of a finished run."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from deconfounded import envs
-from deconfounded.benchmarks.engine import published, sources
+from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.engine.benchmark import CLIPPED
 from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS, REFERENCES
 from deconfounded.benchmarks.engine.job_files import Finished
 from deconfounded.benchmarks.output import aggregation, film, records, scoring
-from deconfounded.benchmarks.output.pictures import colour, colours, encoded, mark, panels
+from deconfounded.benchmarks.output.pictures import colour, colours, encoded, panels
 from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.support.files import write_atomically, write_json
@@ -77,20 +77,19 @@ def pictures(task: envs.Task, results: dict[str, Any], finished: Finished, folde
         print(f"no video: {error_line(error)}")
 
 
-def adaptation(results: dict[str, Any], file: Path) -> None:
+DEPLOYED: Mapping[str, Any] = {"episode": ":", "mode": "-.", "mean": (0, (1, 3))}  # lines of other ways to deploy
+
+
+def adaptation(results: dict[str, Any], file: Path, mark: str = "") -> None:
     """Score over the episodes of a trial, each method a line in its band; later episodes than trained on shaded."""
-    drawn = ("score", "score_beyond", "band")
-    data = {name: [entry.get(key) for key in drawn] for name, entry in results["methods"].items()}
-    made_of = mark(results["task"], data, sources.of_code(adaptation))
-    with panels(file, size=(7, 4.2), mark=made_of) as [[axes]]:
+    with panels(file, size=(7, 4.2), mark=mark) as [[axes]]:
         trained, longest = 0, 0
         hues = colours(entry["method"] for entry in results["methods"].values())
         for name, entry in results["methods"].items():
             values, hue = entry["score"] + entry.get("score_beyond", []), hues[entry["method"]]
             trained, longest, at = len(entry["score"]), max(longest, len(values)), range(1, len(values) + 1)
-            # Dotted: another way of deploying the same agent.
-            style = ":" if entry["deployment"] else "--" if name in (*EXACT, *REFERENCES) else "-"
-            axes.plot(at, values, style, marker="o", ms=4, color=hue, label=name)
+            style: Any = DEPLOYED.get(entry["deployment"], "--" if name in (*EXACT, *REFERENCES) else "-")
+            axes.plot(at, values, linestyle=style, marker="o", ms=4, color=hue, label=name)
             if entry["band"]:
                 axes.fill_between(at, *np.transpose(entry["band"]), color=hue, alpha=0.12, lw=0)
                 if len(values) == 1:
@@ -99,8 +98,9 @@ def adaptation(results: dict[str, Any], file: Path) -> None:
             axes.axvspan(trained + 0.5, longest + 0.5, color="0.95", zorder=0)
             axes.text(trained + 0.6, 0.02, "longer than trained on", color="0.45", fontsize=8)
         axes.set(xlabel="episode of one hidden theta", ylabel="score (0 random, 1 expert)", title=results["task"])
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+        axes.set_xlim(0.5, longest + 0.5)
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, handlelength=3.5)
 
 
 def learning(results: dict[str, Any], file: Path) -> None:

@@ -1,8 +1,8 @@
 """Keep a finished run in docs/, and write the pages anew: `deconf publish results/slippery_cartpole-default`
 
-Copies the run's records, the adaptation picture and, from `certificates` beside the run's folder, the task's
-certificate; makes a small animated picture of the video; and brings the pages up to date from what docs/ keeps. All of
-it is looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
+Copies the run's records and, from `certificates` beside the run's folder, the task's certificate; makes a small
+animated picture of the video; and brings the pages and their pictures up to date from what docs/ keeps. All of it is
+looked at before anything is changed. Without a run it writes the pages alone; with --still also docs/index.png,
 the picture of docs/index.html on docs/results.md, which takes Chromium.
 """
 
@@ -22,9 +22,10 @@ from PIL import Image
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser
 from deconfounded.benchmarks.engine import sources
-from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.output import aggregation, index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of, still
+from deconfounded.benchmarks.output.run_report import adaptation
 from deconfounded.benchmarks.studies import (
     cards,
     exploration,
@@ -76,11 +77,11 @@ def check_certificate(file: Path, task: envs.Task) -> None:
 
 def keep(run: Path) -> None:
     """Copy what is worth keeping of a finished run. Raises InputError, and changes nothing, if something is amiss."""
-    files, beside = sorted((run / "records").glob("*.jsonl")), [run / "adaptation.png", run / "video.mp4"]
-    if links := [file for file in (*files, *beside) if file.is_symlink()]:
+    files = sorted((run / "records").glob("*.jsonl"))
+    if links := [file for file in (*files, run / "video.mp4") if file.is_symlink()]:
         raise envs.InputError(f"{links[0]} is a link; give a run's folder as run.py left it")
-    if len(files) != 1 or not (run / "adaptation.png").is_file():
-        raise envs.InputError(f"{run} holds no records and adaptation.png of a finished run of run.py")
+    if len(files) != 1:
+        raise envs.InputError(f"{run} holds no records of a finished run of run.py")
     made = records.read(files[0])
     results = aggregation.gather(made, list(METHODS))
     if results["preset"] != "default" or {"set", "salt", records.NAME} & set(results):
@@ -106,7 +107,6 @@ def keep(run: Path) -> None:
                 raise envs.InputError(f"{run / 'video.mp4'} is no video ({type(error).__name__})") from None
         records.write(DOCS / "records", made)
         aggregation.forget()
-        copy(run / "adaptation.png", DOCS / f"{task.name}.png")
         if small.exists():
             copy(small, DOCS / f"{task.name}.webp")
         else:
@@ -171,6 +171,8 @@ def write() -> str:
     for file, text in texts(found, hard_tasks, by_protocol).items():
         if not file.exists() or file.read_text(encoding="utf-8") != text:
             write_atomically(file, text)
+    for task, of_task in found:
+        redraw(DOCS / f"{task.name}.png", adaptation, curves(of_task))
     redraw(DOCS / "gap.png", gap.picture, [(one.task.name, *one[1:]) for one in results.gaps(found)])
     redraw(DOCS / "headroom.png", headroom.picture, headroom.points(found, cards.certified()))
     under = protocol_scores.points([*found, *hard_tasks], by_protocol)
@@ -180,6 +182,14 @@ def write() -> str:
     redraw(DOCS / "spectrum.png", spectrum.picture, cards.kept("spectrum")["points"])
     redraw(DOCS / "exploration.png", exploration.picture, cards.kept("exploration"))
     return results.summary(found, cards.certified())
+
+
+def curves(results: dict[str, Any]) -> dict[str, Any]:
+    """What the picture of a task has: scores of a default run's methods, each deployed in every way."""
+    keys = ("method", "deployment", "score", "score_beyond", "band")
+    default = {name: entry for name, entry in results["methods"].items() if entry["method"] in DEFAULT}
+    methods = {name: {key: entry[key] for key in keys if key in entry} for name, entry in default.items()}
+    return {"task": results["task"], "methods": methods}
 
 
 def redraw(file: Path, draw: Callable[..., None], data: Any) -> None:

@@ -103,7 +103,7 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--seed", "1"), "unrecognized arguments: --seed 1"),
     (("run", "--task", "leaning_beam"), "your own is path/file.py:Class"),
     (("paper", "--methods", "oracle_bc"), "method 'oracle_bc' is unknown"),
-    (("publish", "nowhere"), "holds no records and adaptation.png"),
+    (("publish", "nowhere"), "holds no records of a finished run"),
     (("certify", "--task", "bandid"), "did you mean 'bandit'?"),
     (("train", "--task", "bandit"), "nothing to train"),
     (("performance", "--tasks", "bandit"), "no physics to time"),
@@ -475,7 +475,7 @@ def test_certificate_fails_what_deserves_it(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.slow
 def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Records, picture and certificate go to docs; a clip of an older run does not stay beside them.
+    """Records and certificate go to docs; a clip of an older run does not stay beside them.
 
     What is amiss is told in a line, and nothing is changed.
     """
@@ -486,7 +486,6 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     file = run / "records" / "bandit.jsonl"
     records.write(file.parent, shown)
     whole = file.read_text()
-    (run / "adaptation.png").write_bytes(b"a picture")
     certificate = run.parent / "certificates" / "bandit.json"
     certificate.write_text((ROOT / "docs" / "certificates" / "bandit.json").read_text())
     (docs / "bandit.webp").write_bytes(b"an old clip")
@@ -520,7 +519,7 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     file.write_text(whole)
     assert kept() == ["bandit.webp"]
     publish.keep(run)
-    assert kept() == ["bandit.png", "certificates/bandit.json", "records/.lock", "records/bandit.jsonl"]
+    assert kept() == ["certificates/bandit.json", "records/.lock", "records/bandit.jsonl"]
     assert (docs / "records" / "bandit.jsonl").read_text() == whole
     with pytest.raises(envs.InputError, match="holds no records"):
         publish.keep(tmp_path)
@@ -536,7 +535,6 @@ def test_publish_refuses_what_pages_do_not_show(
     run, docs = tmp_path / "run", tmp_path / "docs"
     published = records.of_task(ROOT / "docs" / "records", "bandit")
     records.write(run / "records", [{**record, **change} for record in published if record["method"] in REFERENCES])
-    (run / "adaptation.png").write_bytes(b"a picture")
     monkeypatch.setattr(publish, "DOCS", docs)
     with pytest.raises(envs.InputError, match="pages show the default preset and the standard protocol alone"):
         publish.keep(run)

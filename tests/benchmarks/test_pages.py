@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 from unittest.mock import Mock
 
 import imageio.v3 as imageio
@@ -32,6 +32,7 @@ from deconfounded.benchmarks.studies import (
     results,
     tune,
 )
+from deconfounded.deconf.core.deployment import Way
 from tests.tools import bars, dots
 from tests.toys import Push
 
@@ -841,7 +842,7 @@ def test_thetas_that_a_probe_reads() -> None:
 
 
 def test_scores_by_episode(figures: list[Any], tmp_path: Path) -> None:
-    """Of a way of deploying an agent a dotted line in its method's colour; what is beyond training is shaded."""
+    """Of a way of deploying an agent another line in its method's colour; what is beyond training is shaded."""
     about = {"method": "naive_rnn", "score": [0.1, 0.2], "score_beyond": [0.3]}
     band = [[0.0, 0.2], [0.1, 0.3], [0.2, 0.4]]
     methods = {
@@ -853,7 +854,8 @@ def test_scores_by_episode(figures: list[Any], tmp_path: Path) -> None:
     axes = figures[0].axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     assert lines["naive_rnn"].get_xydata().tolist() == [[1, 0.1], [2, 0.2], [3, 0.3]]
-    assert [lines[name].get_linestyle() for name in methods] == ["-", ":", "--"]
+    assert [lines[name].get_linestyle() for name in methods] == ["-", "-.", "--"]
+    assert {"step", *run_report.DEPLOYED} == {*get_args(Way)}
     assert lines["naive_rnn"].get_color() == lines["naive_rnn_mode"].get_color() != lines["expert"].get_color()
     shaded = {(round(y, 9), int(x)) for x, y in axes.collections[0].get_paths()[0].vertices}
     assert {(y, i + 1) for i, ends in enumerate(band) for y in ends} <= shaded
