@@ -25,12 +25,12 @@ from deconfounded import envs
 from deconfounded.__main__ import COMMANDS
 from deconfounded.benchmarks import certify, data
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import jobs, scheduler
+from deconfounded.benchmarks.engine import jobs, scheduler, sources
 from deconfounded.benchmarks.engine.catalogue import REFERENCES
 from deconfounded.benchmarks.engine.local import Local
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS
-from deconfounded.benchmarks.output import film, records, scoring
-from deconfounded.benchmarks.output.pictures import save_figure
+from deconfounded.benchmarks.output import film, records, run_report, scoring
+from deconfounded.benchmarks.output.pictures import mark, mark_of, save_figure
 from deconfounded.benchmarks.studies import publish, results
 from deconfounded.benchmarks.studies.unconfounded import NoStakes, feedback
 from deconfounded.deconf.methods import memoryless_bc
@@ -567,6 +567,9 @@ def test_pages_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     for file, text in publish.texts(*kept).items():
         assert file.read_text() == text, f"{file}: run `deconf publish`"
     docs = ROOT / "docs"
+    for task, of_task in kept[0]:
+        made_of = mark(publish.curves(of_task), sources.of_code(run_report.adaptation))
+        assert mark_of(docs / f"{task.name}.png") == made_of, f"{task.name}.png: run `deconf publish`"
     of_results = re.findall(r"^\| \[(\w+)\]\(#", (docs / "results.md").read_text(), re.M)
     of_results += re.findall(r"^## (\w+)", (docs / "hard.md").read_text(), re.M)
     assert sorted(of_results) == sorted(file.stem for file in (docs / "records").glob("*.jsonl"))

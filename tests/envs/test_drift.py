@@ -9,6 +9,7 @@ from deconfounded import envs
 from deconfounded.deconf.core import models
 from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.drift import SHARES, choose_kept
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, Grid
@@ -194,6 +195,21 @@ def test_forgetting(kind: str) -> None:
         torch.testing.assert_close(half.sum(-1), torch.ones(1, 4))
         torch.testing.assert_close(half, (whole := model.belief(memory).sqrt()) / whole.sum(-1, keepdim=True))
     assert not torch.allclose(half, model.belief(memory))
+
+
+def test_agents_forget_between_episodes() -> None:
+    """The share that the model says, once an episode has ended and not before."""
+    agent = DeconfoundedAgent.new(
+        "linear", 3, 16, Scales.plain(Signature(2, 1, 0, False), 1), Draws([np.random.default_rng(0)], "cpu")
+    )
+    agent.model.kept.fill_(0.5)
+    agent.begin(4)
+    agent.reset([rng := np.random.default_rng(0)])
+    agent.observe(*(rng.uniform(-1, 1, (4, n)).astype(np.float32) for n in (2, 1, 2)), np.ones(4, bool))
+    memory = agent._memory.clone()
+    agent.reset([rng])
+    torch.testing.assert_close(agent.belief()[1], agent.model.belief(agent.model.forget(memory)))
+    assert not torch.allclose(agent.belief()[1], agent.model.belief(memory))
 
 
 @pytest.mark.slow
