@@ -187,12 +187,18 @@ class TestHalves:
         assert self.alike(Trials(obs, action, mask)) == self.alike(two)
 
     def test_chance_is_that_of_all_columns_together(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Of eight columns of noise, and their products with observations and actions, none is alike."""
+        """Of eight columns of noise, and their products with observations and actions, none is alike in .95 of logs.
+
+        In fewer than three of twelve, with probability .98.
+        """
         monkeypatch.setattr(trial_dynamics, "FINE", 4)
         monkeypatch.setattr(trial_dynamics, "CHANCE", 0.05)
-        rng = np.random.default_rng(0)
-        obs, action = rng.normal(size=(24, 1, 21, 8)), rng.uniform(-1, 1, (24, 1, 20, 1))
-        assert self.alike(Trials(obs, action, np.ones((24, 1, 20), bool))) == 0
+        said = 0
+        for seed in range(12):
+            rng = np.random.default_rng(seed)
+            obs, action = rng.normal(size=(24, 1, 21, 8)), rng.uniform(-1, 1, (24, 1, 20, 1))
+            said += self.alike(Trials(obs, action, np.ones((24, 1, 20), bool))) != 0
+        assert said < 3
 
 
 class TestStatesThatTell:
