@@ -2,8 +2,10 @@
 
 import argparse
 import contextlib
+import difflib
 import io
 import os
+import re
 import select
 import signal
 import sys
@@ -60,7 +62,9 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         from deconfounded.envs.support.errors import InputError
 
-        raise InputError(f"{message}; see --help")
+        unknown = re.match(r"unrecognized arguments: (--[^ =]+)", message)
+        near = difflib.get_close_matches(unknown[1], self._option_string_actions, 1) if unknown else []
+        raise InputError(f"{message}; {f'did you mean {near[0]}? ' if near else ''}see --help")
 
 
 class Stopped(KeyboardInterrupt):

@@ -132,7 +132,9 @@ def main() -> None:
     parser = Parser(__doc__)
     look.add_data(parser)
     parser.add_argument("--seed", type=whole(0), default=0, help="of the splits and of training")
-    parser.add_argument("--out", type=place, default=Path("results") / "diagnosis", help="output folder")
+    parser.add_argument(
+        "--out", type=place, default=Path("results") / "diagnosis", help="output folder; default: results/diagnosis"
+    )
     args = parser.parse_args()
     asked = shlex.join(["deconf", "diagnose", *sys.argv[1:]])
     print(run(args.data, args.explore, look.columns(args), args.seed, args.out, asked)[1])

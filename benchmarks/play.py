@@ -18,7 +18,8 @@ from deconfounded.experts.agent import Agent
 
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
-    theirs = saved_agents.describe(folder).get("spaces")
+    about = saved_agents.describe(folder)
+    theirs, trained = about.get("spaces"), about.get("task", task.name)
     from deconfounded.benchmarks.engine.benchmark import (
         spaces,
     )  # torch takes seconds; bad input is refused at once
@@ -31,6 +32,8 @@ def ready(folder: Path, task: envs.Task) -> Agent:
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
+    if trained.rpartition(":")[2] != (task.reference or task.name).rpartition(":")[2]:
+        print(f"note: the agent in {folder} was trained on {trained}")
     return agent if isinstance(agent, LearnedAgent) else ReseededAgent(agent)
 
 

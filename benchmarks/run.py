@@ -106,6 +106,8 @@ def run_tasks(tasks: list[envs.Task], args: argparse.Namespace, methods: list[st
                 if not errors or {name for name, *_ in finished} >= set(REFERENCES):
                     text = run_report.write(task, about, finished, folder)
                     print(text if args.debug else f"{text} -> {folder / 'report.html'}")  # --debug keeps none
+                if len(errors) > 1:
+                    raise envs.InputError(f"{len(errors)} jobs failed, as said above; the last: {errors[-1]}")
                 if errors:
                     raise errors[0]
             except envs.InputError as error:

@@ -73,11 +73,13 @@ def main() -> None:
     parser.add_argument("--seed", type=whole(0), default=0, help="draws thetas; 0 without --salt: as a run's seed 0")
     parser.add_argument("--salt", default="", help="any text: draw other thetas by it")
     parser.add_argument("--range", nargs="+", default=[], metavar="LATENT=LOW:HIGH", help="draw thetas from this range")
-    parser.add_argument("--out", type=place, help="a .json file to write")
+    parser.add_argument("--out", type=place, help="a .json file to write; one that is there is replaced")
     args = parser.parse_args()
     task = envs.get(args.task)
     expert, where = policy.load(task, args.expert), with_ranges(task, args.range)
     if args.out is not None:
+        if args.out.suffix != ".json":
+            raise envs.InputError(f"--out was {args.out}; it must end in .json")
         check_file(args.out)
     agent = ready(args.agent, task)
     from deconfounded.benchmarks.engine.context import EVALUATION, stream  # torch takes seconds
@@ -91,3 +93,4 @@ def main() -> None:
         asked = {name: getattr(args, name) for name in ("trials", "seed", "salt", "range")}
         about = {"task": task.name, "task_version": task.version, "agent": str(args.agent)}
         write_json(args.out, {**about, **asked, **scored})
+        print(f"-> {args.out}")

@@ -72,7 +72,8 @@ def main() -> None:
     write_json(file.with_suffix(".json"), card)
     if returns.mean() - random.mean() < 2 * random.std():
         remedy = "more --steps, or another reward"
-        print(f"warning: the expert of {task.name} is hardly better than random actions: {remedy}")
+        better = "hardly" if returns.mean() > random.mean() else "not"
+        print(f"warning: the expert of {task.name} is {better} better than random actions: {remedy}")
     print(f"{task.name}: expert {card['return_mean']}, random {card['return_random']}, in {card['wall_s']} s -> {file}")
     if file.resolve() != policy.path(task).resolve():
         print(f"commands use it if given --expert {file}; their default is {policy.path(task)}")

@@ -56,8 +56,11 @@ def main(*first: str) -> None:
     name, *arguments = [*first, *sys.argv[1:]] or ["--help"]
     if name in ("-h", "--help"):
         return run_command(print_help)
+    name = "version" if name == "--version" else name
     if name not in COMMANDS:
-        end(f"error: command {name!r} is unknown; there are {', '.join(COMMANDS)}")
+        from deconfounded.envs import closest
+
+        end(f"error: {closest('command', name, list(COMMANDS))}")
     module, _, interrupted = COMMANDS[name]
     if module.startswith(STUDIES) and not ((ROOT / "pyproject.toml").is_file() and (ROOT / "docs").is_dir()):
         end(f"error: {name} makes the pages of a checkout, and {ROOT} is none; clone the repository, and run it there")

@@ -96,6 +96,8 @@ def get(name: str) -> Task:
         return TASKS[name]()
     name = {point.name: point.value for point in entry_points(group=GROUP)}.get(name, name)
     if not outside.is_outside(name):
+        if name.endswith(".py"):
+            raise InputError(f"task was {name!r}; it must name a class of that file: {name}:CLASS")
         raise closest("task", name, names(), "; your own is path/file.py:Class")
     reference = outside.absolute(name)
     before = next((task for task in TASKS.values() if task.reference == reference), None)

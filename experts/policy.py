@@ -160,9 +160,9 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
         return expert
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")
-    given = "" if source is None else f" --out {source}"
-    remedy = f"`deconf train --task {task.reference or task.name}{given}` makes such a file"
-    return NetworkExpert(task, _weights(task, path(task) if source is None else Path(source), remedy))
+    file = path(task) if source is None else Path(source)
+    remedy = f"`deconf train --task {task.reference or task.name} --out {file}` makes such a file"
+    return NetworkExpert(task, _weights(task, file, remedy))
 
 
 def _weights(task: Task, file: Path, remedy: str) -> dict[str, NDArray[np.float32]]:

@@ -89,6 +89,9 @@ def check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None
     """Raises InputError for a name that is not among those allowed."""
     for name in names:
         if name not in allowed:
+            base = name.rpartition("_")[0]
+            if kind == "method" and base in METHODS and name in labels([base]):
+                raise envs.InputError(f"method {name!r} is a way to deploy {base}, and scored with it; give {base}")
             own = f"; one of your own is {name}:FUNCTION" if name.endswith(".py") else ""
             raise envs.closest(kind, name, list(allowed), own)
 

@@ -147,7 +147,10 @@ def differing(key: str, before: Any, now: Any) -> str:
         if isinstance(one, dict) and isinstance(other, dict):
             inner = [(f"{name}.{each}".lstrip("."), one.get(each), other.get(each)) for each in {**one, **other}]
             return [part for each in inner if each[1] != each[2] for part in parts(*each)]
-        was, now = ("none" if each is None else str(each)[:60] or "empty" for each in (one, other))
+        was, now = (
+            "none" if each is None else "given" if isinstance(each, dict) else str(each)[:60] or "empty"
+            for each in (one, other)
+        )
         return [f"{name} was {was}, is {now}".lstrip()]
 
     found = parts("", before, now)

@@ -129,7 +129,7 @@ class Job(ABC):
         made = meta["identity"]
         if differ := [key for key in {**expected, **made} if expected.get(key) != made.get(key)]:
             which = job_files.differing(differ[0], made.get(differ[0]), expected.get(differ[0]))
-            return f"it was made with another {which}"
+            return f"it differs in its {which}"
         if meta["seed"] != seed:
             return f"it is of seed {meta['seed']}"
         for key, value in result.items():

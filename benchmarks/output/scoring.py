@@ -258,7 +258,8 @@ def rows(methods: dict[str, Any]) -> list[tuple[str, ...]]:
     lines: list[tuple[str, ...]] = []
     for name, entry in sorted(methods.items(), key=lambda item: -item[1]["score_last"]):
         scores, r2 = (" ".join(map(two_decimals, entry[key])) for key in ("score", "theta_r2"))
-        returned = f"{np.mean(entry['return'], 0)[-1]:.1f}"
+        returned = np.mean(entry["return"], 0)[-1]
+        returned = f"{returned:.1f}" if abs(returned) >= 10 else two_decimals(returned)
         costs = (budget(entry["budget"]), cpu_seconds(entry))
         first = (two_decimals(entry["score_first"]), interval(entry["ci95_first"]))
         last = (two_decimals(entry["score_last"]), interval(entry["ci95"], len(entry["seeds"])))

@@ -103,15 +103,21 @@ def test_interrupted_training_goes_on(
     assert not list(broken.folder.glob(".*.pt"))
 
 
-def test_cpu_seconds_are_those_before_an_interruption_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven until the checkpoint and two in the process that went on are nine; and when each was at work is known."""
+def test_costs_are_those_before_an_interruption_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seven CPU seconds until the checkpoint and two in the process that went on are nine; the data used count, too.
+
+    And when each was at work is known.
+    """
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     monkeypatch.setattr(jobs, "SAVE_EVERY_S", 0.0)
     monkeypatch.setattr(jobs.time, "process_time", iter([100.0, 107.0, 0.0, 2.0]).__next__)
     job = BenchmarkJob("bandit", settings("bandit", False), "naive_rnn", (0,), tmp_path)
-    (before := CurveMonitor(job, 0.8)).save(lambda: {"done": 3})
+    before = CurveMonitor(job, 0.8)
+    before.budget["queries"] = [7]
+    before.save(lambda: {"done": 3})
     resumed = CurveMonitor(job, 0.8)
     assert resumed.load() == {"done": 3}
+    assert resumed.budget == before.budget
     assert resumed.cpu() == 9
     assert [start for start, _ in resumed.spans()] == [before.start, resumed.start]
 

@@ -203,6 +203,17 @@ def test_an_agent_of_another_class_gets_numbers_as_in_its_run(monkeypatch: pytes
     np.testing.assert_array_equal(ready.act(obs), agent.act(obs))
 
 
+@pytest.mark.parametrize(("trained", "noted"), [("push", False), ("elsewhere/toys.py:Push", True), ("curling", True)])
+def test_an_agent_on_another_task_than_it_was_trained_on(
+    trained: str, noted: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is played, if its spaces fit, but not without a word."""
+    monkeypatch.setattr(play.saved_agents, "describe", lambda folder: {"task": trained})
+    monkeypatch.setattr(play.deconfounded, "load", lambda folder: RandomAgent(toys.Push.action_space))
+    play.ready(Path("mine"), toys.Push())
+    assert capsys.readouterr().out == f"note: the agent in mine was trained on {trained}\n" * noted
+
+
 def test_what_a_guest_hears_at_a_reset_does_not_tell_the_seed_of_theta() -> None:
     """Environments have one of 2^31 seeds, which a guest could try one by one, were it not for the salt."""
     numbers = [guest_host.fresh([np.random.default_rng([7, 1, 0])], salt)[0] for salt in ("", "a", "b", "a")]

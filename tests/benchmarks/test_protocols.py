@@ -157,9 +157,7 @@ def test_a_job_s_record_names_its_protocol(tmp_path: Path, monkeypatch: pytest.M
     records.write(tmp_path / "records", [made])
     assert records.read(tmp_path / "records" / "weak_thruster.jsonl") == [json.loads(json.dumps(made))]
     assert "protocol_name" not in identity(replace(job, protocol="standard"))
-    assert (
-        replace(job, protocol="standard").unfit(0, data) == "it was made with another protocol_name (was once, is none)"
-    )
+    assert replace(job, protocol="standard").unfit(0, data) == "it differs in its protocol_name (was once, is none)"
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -163,7 +163,7 @@ class TestKeptFiles:
         shutil.copy(other.file(0), job.file(0))
         result = job_files.read(job.file(0))
         assert result is not None
-        assert job.unfit(0, result).startswith("it was made with another method (was ")
+        assert job.unfit(0, result).startswith("it differs in its method (was ")
 
     @pytest.mark.slow
     def test_contents(self, job: BenchmarkJob) -> None:
@@ -222,7 +222,7 @@ class TestKeptFiles:
         monkeypatch.setattr(methods.load("blind_bc"), "method", replace(method, version=method.version + 1))
         assert scheduler.results(scheduler.written(job, job.folder), say=True) == []
         lines = capsys.readouterr().out.splitlines()
-        assert [line.partition(": it was made with another method_version")[0] for line in lines] == [
+        assert [line.partition(": it differs in its method_version")[0] for line in lines] == [
             f"blind_bc-{seed}.npz is left out" for seed in (0, 1)
         ]
 

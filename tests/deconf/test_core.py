@@ -483,6 +483,12 @@ class TestExact:
         assert benchmark.probe(agent.features(), theta)[0] > 0.95
         assert benchmark.probe(np.random.default_rng(0).standard_normal((64, 1)), theta)[0] < 0.3
 
+    def test_a_probe_is_judged_by_the_other_half(self) -> None:
+        """Where features have the other sign R^2 is 1 - 4, though in the first half they are theta itself."""
+        theta = np.random.default_rng(0).standard_normal((200, 1))
+        features = np.where(np.arange(200)[:, None] < 100, theta, -theta)
+        assert benchmark.probe(features, theta)[0] == pytest.approx(-3, abs=0.5)
+
     def test_probe_of_many_features(self) -> None:
         """With as many features as trials: R^2 is near 0 for noise, and near 1 for a few good features among noise."""
         rng = np.random.default_rng(0)
