@@ -269,11 +269,12 @@ def test_tables_are_best_first_and_of_the_last_episode(tmp_path: Path) -> None:
     assert [row[0] for row in rows] == ["best", "middle", "bad"]
     best = dict(zip(scoring.COLUMNS, rows[0], strict=True))
     assert (best["return"], best["last"], best["interval"], best["Eq. (1)"]) == (
-        "8.0",
+        "8.00",
         "0.80",
         "0.70 to 0.90 (51%)",
         "-5",
     )
+    assert scoring.rows({"far": entry(0.2, 8.0)})[0][scoring.COLUMNS.index("return")] == "80.0"
     beside = ("first", "interval of first", "regret", "interval of regret")
     assert [best[key] for key in beside] == ["0.20", "0.10 to 0.20", "1.00", "-"]
     about = {"task": "bandit", "task_version": 0, "preset": "default", "seeds": [0, 1], "wall_s": 1.0, "machine": "x"}
