@@ -11,6 +11,7 @@ import numpy as np
 from deconfounded.deconf.core.data import Batch
 from deconfounded.deconf.core.sizes import Configuration
 from deconfounded.deconf.diagnosis import fits, labels, state
+from deconfounded.deconf.diagnosis.doubts import doubts
 from deconfounded.deconf.diagnosis.held_out import Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import in_range
@@ -19,7 +20,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials, check_trials
 
-VERSION = 16  # raised when figures or verdicts of the same trials change
+VERSION = 17  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)
@@ -54,8 +55,10 @@ def diagnose(
 
 def conclude(refits: Sequence[Findings], trials: Trials, explore: Trials | None) -> Diagnosis:
     """The verdict on the figures of splits of these trials, with what their columns show."""
-    explored = None if explore is None else len(explore)
-    return judge(refits, explored, labels.named(trials, explore), state.named(explore))
+    if explore is None:
+        return judge(refits, None, labels.named(trials, None), state.named(None))
+    doubted = doubts(trials, explore) if any(refit.dynamics_differ == 0 for refit in refits) else ()
+    return judge(refits, len(explore), labels.named(trials, explore), state.named(explore), doubted)
 
 
 def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> None:

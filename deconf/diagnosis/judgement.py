@@ -46,16 +46,17 @@ def judge(
     explored: int | None = None,
     labels: Sequence[str] = (),
     incomplete: Sequence[str] = (),
+    doubts: Sequence[str] = (),
 ) -> Diagnosis:
     """The verdict, and why. It cannot tell where less than half of the refits, judged alone, lead to the same tier.
 
     That is, both "not confounded" and "nothing at stake" say that a clone loses nothing. explored: trials of
     exploration. labels: observations that show how trials differ in their dynamics, see `labels.py`. incomplete: those
-    that depend on more than columns show, see `state.py`; they decide what to clone with, and no verdict. Raises
-    InputError if a figure is not finite.
+    that depend on more than columns show, see `state.py`; they decide what to clone with, and no verdict. doubts: about
+    exploration, see `doubts.py`. Raises InputError if a figure is not finite.
     """
-    diagnosis = _judge(refits, explored, labels)
-    alone = [_judge([refit], explored, labels) for refit in refits]
+    diagnosis = _judge(refits, explored, labels, doubts)
+    alone = [_judge([refit], explored, labels, doubts) for refit in refits]
     if diagnosis.tier is not None and 2 * sum(split.tier == diagnosis.tier for split in alone) < len(refits):
         reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
         diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
@@ -96,7 +97,7 @@ def _alike(figures: dict[str, Figure]) -> bool:
     return differ is not None and differ.high == 0
 
 
-def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[str]) -> Diagnosis:
+def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[str], doubts: Sequence[str]) -> Diagnosis:
     figures = _figures(refits)
     names = ("memory_gain", "stakes", "paired_stakes", "model_deviation", "naive", "latent", "gap", "gap_by_actions")
     memory, stakes, paired, model, naive, latent, gap, by_actions = (figures[name] for name in names)
@@ -173,7 +174,8 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
             "But trials of exploration do not differ in their dynamics: what one half of a trial does beyond a fit of"
             " all trials, the other does not. The evidence is then of where a trial went, and of nothing hidden."
         )
-        return _goal_or_habit(figures, conclude)
+        reasons += doubts
+        return _goal_or_habit(figures, doubts, conclude)
     if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
         return more_exploration(
             "Whether trials differ in what actions do, and what that tells of the expert's actions, is not clear from"
@@ -233,7 +235,7 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
 
 
 def _goal_or_habit(
-    figures: dict[str, Figure], conclude: Callable[[Verdict, int | None, str, Next], Diagnosis]
+    figures: dict[str, Figure], doubts: Sequence[str], conclude: Callable[[Verdict, int | None, str, Next], Diagnosis]
 ) -> Diagnosis:
     """The verdict where past actions predict, and trials do not differ in their dynamics: see `trait.py`."""
     memory, gain = figures["memory_gain"], figures.get("trait_gain")
@@ -241,6 +243,12 @@ def _goal_or_habit(
         return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
     if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
+    if doubts:
+        conclusion = (
+            "The expert acts on something that lasts for a trial, and your columns do not show it. Whether the world"
+            f" tells it is not clear. {doubts[0]}"
+        )
+        return conclude("cannot tell", None, conclusion, EXPLORE_MORE)
     if max(figures["trait_stakes"].high, figures["paired_trait_stakes"].high) < TRAIT_STAKES:
         conclusion = (
             "Experts act in ways of their own, which last for a trial, but where trials go hardly depends on them, and"
@@ -251,9 +259,9 @@ def _goal_or_habit(
         conclusion = "Whether experts differ by goals that only they see, or by habits, is not clear."
         return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     conclusion = (
-        "The expert goes elsewhere in different trials, by something that only it sees, and the world tells nothing of"
-        " it, with or without exploration. If where it goes is a matter of taste, nothing is lost: any clone's way is"
-        " right. Otherwise only the expert, or a sensor, can tell."
+        "The expert goes elsewhere in different trials, by something that only it sees, and nothing in your exploration"
+        " tells of it. If where it goes is a matter of taste, nothing is lost: any clone's way is right. Otherwise only"
+        " the expert, or a sensor, can tell."
     )
     return conclude("confounded", 3, conclusion, QUERY)
 
