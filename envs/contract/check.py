@@ -8,13 +8,14 @@ from gymnasium import spaces
 
 from deconfounded.envs.batch import BatchEnv
 from deconfounded.envs.blackbox import BlackBox
-from deconfounded.envs.contract.probe import actions, beyond_bounds, streams
+from deconfounded.envs.contract.probe import actions, beyond_bounds, observations, streams
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.task import Task
 
 TIERS = (1, 2, 3, None)
+ALONE = 20  # steps of an environment alone, and beside another
 
 
 def sentence(error: BaseException) -> str:
@@ -75,17 +76,31 @@ def _check_world(task: BlackBox) -> None:
     if (task.sample_theta(streams(0)) != task.sample_theta(streams(0))).any():
         right = "it must draw from `rng` alone, or methods that see theta get another one than the environments have"
         raise InputError(f"sample_theta of {task.name} gave two thetas for one state of its generator; {right}")
-    env = BatchEnv(task, 2)
-    obs = env.reset(0)
+    _check_independence(task)
     acted = task.expert_probs if task.n_actions else task.expert_mean
-    for action in actions(task, env.n, task.horizon):
-        once, again = (acted(obs, env.theta) for _ in range(2))  # after an episode's end too, as in runs
-        if not np.allclose(once, again, atol=1e-4):
-            right = "it must give the action without noise, and `noise` is added to it"
-            raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
-        obs = env.step(action)[0]
-        if not env.alive.any():
-            return
+    for by_expert in (False, True):  # it may have a memory that shows where it goes itself alone
+        env = BatchEnv(task, 2)
+        obs = env.reset(0)
+        for action in actions(task, env.n, task.horizon):
+            once, again = (acted(obs, env.theta) for _ in range(2))  # after an episode's end too, as in runs
+            turned = acted(obs[::-1], env.theta[::-1])[::-1]
+            if not np.allclose(once, again, atol=1e-4) or not np.allclose(once, turned, atol=1e-4):
+                right = "it must give the action without noise, to which `noise` is added, by its arguments alone"
+                raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
+            own = once.argmax(-1)[:, None].astype(float) if task.n_actions else once
+            obs = env.step(own if by_expert else action)[0]
+            if not env.alive.any():
+                break
+        env.close()
+
+
+def _check_independence(task: BlackBox) -> None:
+    """An environment has the same trial alone and beside another one, which is under another theta."""
+    acts = actions(task, 2, min(task.horizon, ALONE))
+    beside, alone = observations(task, acts, 0)[:, 0], observations(task, acts[:, :1], 0)[:, 0]
+    if not np.array_equal(beside, alone, equal_nan=True):
+        right = "`make` must give a new one each time, which shares nothing with others and draws from its np_random"
+        raise InputError(f"an environment of {task.name} has another trial alone than beside another one; {right}")
 
 
 def _check_numbers(task: Task) -> None:

@@ -136,16 +136,19 @@ def episodes_repeat(task: Task) -> None:
     simulator, row, acts = task.simulator(1), np.arange(1), actions(task, 1, task.horizon)
     simulator.set_theta(0, task.sample_theta(streams(5))[0])
 
-    def episode() -> list[Array]:
+    def episode() -> tuple[list[Array], list[Array]]:
         start, noise = task.init_state(streams(6)), task.sample_noise(streams(7))
         states = [simulator.start(row, start, noise)]
         for action, drawn in zip(acts, noise[0], strict=True):
             states.append(task.apply_noise(simulator.outcome(states[-1], action, row), drawn[None]))
             if task.terminated(states[-1])[0] or task.truncated(states[-1])[0]:
                 break
-        return [task.observe(state) for state in states]
+        moves = zip(states[:-1], acts, states[1:], strict=False)
+        rewards = [task.reward(before, action, after, simulator.theta) for before, action, after in moves]
+        return [task.observe(state) for state in states], rewards
 
-    same(episode(), episode(), "two episodes of an environment with the same seeds")
+    for what, first, again in zip(("observations", "rewards"), episode(), episode(), strict=True):
+        same(first, again, f"{what} of two episodes of an environment with the same seeds")
     simulator.close()
 
 

@@ -1,5 +1,6 @@
 """Episodes of a table: which rows they are, and what is wrong with them, in one line each."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,6 +16,8 @@ CLOCKS = (  # in lower case
     *("step", "t", "time", "timestamp", "time_s", "frame", "frame_index", "seconds", "clock"),
     *("date", "datetime", "minutes", "minute", "ms", "tick", "ticks", "index"),
 )
+IN_CLOCKS = {"ts", "time", "timestamp", "timestep", "frame", "stamp", "sec", "elapsed", "tick"}  # words of other names
+DOWN = {"left", "remaining", "until", "to"}  # words in names of time that runs down
 NO_LABEL = EMPTY - {"none"}  # of a trial: "none" may be a condition
 GAP = 1.5  # times the usual time between rows
 
@@ -237,12 +240,22 @@ def _notes(
     inside = _inside(len(table), first)
     rows = np.stack([table.columns[name] for name in (*obs, *action)], 1)
     same = (rows[1:] == rows[:-1]).all(1) & inside
-    clock = next((name for name in table.columns if name.lower() in CLOCKS and name not in (*obs, *action)), None)
+    unused = [name for name in table.columns if name not in (*obs, *action)]
+    clock = next((name for like in (_is_clock, _may_be_clock) for name in unused if like(name)), None)
     if clock is not None and (times := _times(table.columns[clock])) is not None:
         notes += _of_time(table, clock, np.diff(times), inside)
     elif same.any():
         notes.append(f"{same.sum():,} rows repeat the row before them (the first: row {np.flatnonzero(same)[0] + 2}).")
     return notes
+
+
+def _is_clock(name: str) -> bool:
+    return name.lower() in CLOCKS
+
+
+def _may_be_clock(name: str) -> bool:
+    words = {*re.findall("[a-z]+", name.lower())}
+    return bool(words & IN_CLOCKS) and not words & DOWN
 
 
 def _times(column: Column) -> NDArray[np.float64] | None:

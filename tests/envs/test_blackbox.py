@@ -277,7 +277,9 @@ def test_the_contract_catches_a_generator_of_one_s_own() -> None:
             return obs + self.rng.normal(size=1).astype("f4"), *rest
 
     task = task_with(make=lambda self, theta: Own(theta[0]))
-    with pytest.raises(AssertionError, match=r"^two episodes of an environment with the same seeds differ"):
+    with pytest.raises(
+        AssertionError, match=r"^observations of two episodes of an environment with the same seeds differ"
+    ):
         CONTRACT["episodes_repeat"](task)
     CONTRACT["episodes_repeat"](task_with())
 
@@ -573,6 +575,72 @@ class TestErrors:
         (tmp_path / "mine.py").write_text("class Mine:\n    steps = 3\n    def make(self, theta): pass\n")
         with pytest.raises(envs.InputError, match="world Mine lacks sample_theta, expert, episodes; a world has make"):
             envs.get(f"{tmp_path}/mine.py:Mine")
+
+
+class Remembering(Sliding):
+    """An expert with a threshold, between whose sides it keeps its last action."""
+
+    last = 2.0
+
+    def expert(self, obs: Any, theta: Any) -> Any:
+        self.last = self.last if abs(obs[0]) < 0.5 else float(obs[0] < 0) * 4
+        return np.array([self.last])
+
+
+class Alike(Sliding):
+    """All environments have the theta that was made last."""
+
+    class Now(Slide):
+        now = 0.0
+
+        def step(self, action: Any) -> Any:
+            self.theta = type(self).now
+            return super().step(action)
+
+    def make(self, theta: Any) -> Any:
+        self.Now.now = float(theta[0])
+        return self.Now(theta[0])
+
+
+class Same(Sliding):
+    """The same environment each time."""
+
+    made: Slide | None = None
+
+    def make(self, theta: Any) -> Any:
+        type(self).made = type(self).made or Slide(theta[0])
+        self.made.theta = float(theta[0])  # type: ignore[union-attr]
+        return self.made
+
+
+@pytest.mark.parametrize(
+    ("world", "says"),
+    [
+        (Remembering, "expert of remembering gave two actions for one observation"),
+        (Alike, "an environment of alike has another trial alone than beside another one; `make` must give a new one"),
+        (Same, "an environment of same has another trial alone than beside another one"),
+    ],
+)
+def test_parts_that_trials_share(world: type[Sliding], says: str) -> None:
+    """A memory of the expert's, a theta, or all: scores would be of other trials than they say."""
+    with pytest.raises(envs.InputError, match=says):
+        envs.check_task(task_of(world)())
+
+
+class Running(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Rewards divided by how many there were, as by a running scale."""
+
+    count = 0
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        obs, reward, *rest = self.env.step(action)
+        return obs, float(reward) / self.count, *rest
+
+
+def test_the_contract_catches_rewards_that_depend_on_earlier_episodes() -> None:
+    with pytest.raises(AssertionError, match=r"^rewards of two episodes of an environment with the same seeds differ"):
+        CONTRACT["episodes_repeat"](task_with(make=lambda self, theta: Running(Slide(theta[0]))))
 
 
 def test_noise_is_of_trials_that_the_mean_was_not_fitted_to(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -351,7 +351,7 @@ class UnnamedGeom(SlipperyCartpole):
         (OwnRandomness, "gymnasium_env", "gymnasium's checker: "),
         (OwnRandomness, "adapters_agree", "first observations of GymVectorEnv and SyncVectorEnv differ"),
         (OwnRandomness, "any_batch_size", "runs of seed 11 among five and alone differ"),
-        (LeftoverState, "episodes_repeat", "two episodes of an environment with the same seeds differ"),
+        (LeftoverState, "episodes_repeat", "observations of two episodes of an environment with the same seeds differ"),
         (OwnRandomness, "seed_streams", "the start and what the seed's second stream draws differ"),
         (OwnRandomness, "seed_kinds", "first observations of seed 3 and .* differ"),
         (OwnRandomness, "privileged_view", "observations with and without the privileged view differ"),

@@ -299,7 +299,14 @@ class TestNotes:
         )
         assert "runs backwards" not in " ".join(of_csv(tmp_path).notes)
 
-    @pytest.mark.parametrize("name", ["date", "minute", "Index"])
+    def test_time_that_is_left(self, tmp_path: Path) -> None:
+        """It runs down; and of several columns the one that is surely time counts."""
+        made = [{**row, "time_left": -row["time"], "lap_time": 1, "when": row["time"]} for row in rows()]
+        assert not [
+            note for note in datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES).notes if "time" in note
+        ]
+
+    @pytest.mark.parametrize("name", ["date", "minute", "Index", "ts", "Time [s]", "sim_time", "stamp_ns"])
     def test_columns_of_time(self, name: str, tmp_path: Path) -> None:
         """Also texts as ISO 8601 has them; of other texts nothing is known."""
         times = [f"2026-11-29T10:00:{second:02}Z" for second in (1, 2, 4, 3, 5)]
