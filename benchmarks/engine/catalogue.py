@@ -4,9 +4,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from deconfounded import envs
 from deconfounded.deconf import methods
+from deconfounded.deconf.core.deployment import Way
 from deconfounded.deconf.method import ENVIRONMENT, USES, Method
 from deconfounded.envs.support import outside
 
@@ -89,9 +91,10 @@ def check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None
     """Raises InputError for a name that is not among those allowed."""
     for name in names:
         if name not in allowed:
-            base = name.rpartition("_")[0]
-            if kind == "method" and base in METHODS and name in labels([base]):
-                raise envs.InputError(f"method {name!r} is a way to deploy {base}, and scored with it; give {base}")
+            base, _, way = name.rpartition("_")
+            if kind == "method" and base in METHODS and way in get_args(Way):
+                right = f"give {base}, which is scored in every way that it can be deployed"
+                raise envs.InputError(f"method {name!r} is none of its own; {right}")
             own = f"; one of your own is {name}:FUNCTION" if name.endswith(".py") else ""
             raise envs.closest(kind, name, list(allowed), own)
 

@@ -25,7 +25,6 @@ from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS
 from deconfounded.benchmarks.output import aggregation, index, records
 from deconfounded.benchmarks.output.pictures import mark, mark_of, still
-from deconfounded.benchmarks.output.run_report import adaptation
 from deconfounded.benchmarks.studies import (
     cards,
     exploration,
@@ -162,6 +161,8 @@ def write() -> str:
 
     Returns README's table of results.
     """
+    from deconfounded.benchmarks.output.run_report import adaptation  # torch takes seconds
+
     found, hard_tasks, by_protocol = results.published(), results.published(names=envs.HARD), results.other_protocols()
     small = index.stills(DOCS)
     for name, file in small.items():

@@ -66,6 +66,7 @@ def write(
     if not re.fullmatch(r"[-\w]+", name, re.ASCII):
         raise InputError(f"name of the data set was {name!r}; it must be of letters, digits, - and _")
     folder = folder.resolve()  # Minari would join a relative path to itself
+    folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".", dir=folder) as aside, _root(Path(aside)), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # about authors and links, which are optional
         import minari

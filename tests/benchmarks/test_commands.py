@@ -62,7 +62,7 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--methods", "naive"), "did you mean 'naive_rnn'?"),
     (("run", "--task", "bandit", "--preset", "smok"), "did you mean 'smoke'?"),
     (("run", "--task", "bandit", "--preste", "smoke"), "--preste smoke; did you mean --preset? see --help"),
-    (("run", "--task", "bandit", "--methods", "deconfounded_mode"), "a way to deploy deconfounded, and scored with it"),
+    (("run", "--task", "bandit", "--methods", "deconfounded_mode"), "give deconfounded, which is scored in every way"),
     (("check", "--task", "mine.py"), "it must name a class of that file: mine.py:CLASS"),
     (("score", "--agent", "nowhere", "--task", "bandit", "--out", "x.txt"), "--out was x.txt; it must end in .json"),
     (("run", "--task", "bandit", "--seeds", "0"), "must be at least 1"),

@@ -217,7 +217,10 @@ def test_task_from_outside(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert task.reference == f"{folder}/{BENT}"
     assert policy.path(task) == folder / "bent_cartpole.safetensors"
     assert type(envs.get("bent_cartpole")) is type(task)
-    with pytest.raises(envs.InputError, match=r"`deconf train --task .*bent_cartpole.py:BentCartpole` makes such"):
+    with pytest.raises(
+        envs.InputError,
+        match=r"`deconf train --task .*bent_cartpole.py:BentCartpole --out .*` makes such",
+    ):
         policy.load(task)
     expert = policy.load(task, f"{folder}/linear.py:control")
     result = certify.certify(task, expert, trials=4, grid=3)

@@ -172,7 +172,7 @@ class TestKeptFiles:
         job.run()
         assert "NaN or infinity" in self.spoilt(job, **{"blind_bc/objective": np.full((4, 1), np.nan)})
         job.run()
-        assert "another versions" in self.spoilt(job, identity={**identity.identity(job), "versions": {}})
+        assert "its versions" in self.spoilt(job, identity={**identity.identity(job), "versions": {}})
         job.run()
         assert "Eq. (1) (4,)" in self.spoilt(job, **{"blind_bc/objective": np.ones(4)})
         for key, value, says in (
