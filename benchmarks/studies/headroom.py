@@ -75,8 +75,8 @@ def page(found: index.Found, certified: dict[str, Any], others: Mapping[str, ind
 What is left to gain on the tasks of the suite. Made by `deconf publish` from the [records](records)
 alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
 deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
-best method without theta in training (its tier in brackets), chosen after the fact, task by task; the *fifth* tells
-how far the five best lie apart, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
+best method without theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the
+score of the fifth best method, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
 the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief. Nor can it always be reached:
 exact policies read the state, of which observations may hide a part that tells of theta
 ([concepts](concepts.md#exact-policies)).
