@@ -79,19 +79,20 @@ def _check_world(task: BlackBox) -> None:
     _check_independence(task)
     acted = task.expert_probs if task.n_actions else task.expert_mean
     for by_expert in (False, True):  # it may have a memory that shows where it goes itself alone
-        env = BatchEnv(task, 2)
+        env, asked = BatchEnv(task, 2), list[tuple[Array, Array, Array]]()
         obs = env.reset(0)
         for action in actions(task, env.n, task.horizon):
-            once, again = (acted(obs, env.theta) for _ in range(2))  # after an episode's end too, as in runs
-            turned = acted(obs[::-1], env.theta[::-1])[::-1]
-            if not np.allclose(once, again, atol=1e-4) or not np.allclose(once, turned, atol=1e-4):
-                right = "it must give the action without noise, to which `noise` is added, by its arguments alone"
-                raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
+            asked.append((obs, env.theta, once := acted(obs, env.theta)))  # after an episode's end too, as in runs
             own = once.argmax(-1)[:, None].astype(float) if task.n_actions else once
             obs = env.step(own if by_expert else action)[0]
             if not env.alive.any():
                 break
         env.close()
+        obs, theta, once = (np.concatenate(each) for each in zip(*asked, strict=True))
+        order = np.random.default_rng(0).permutation(len(obs))
+        if not np.allclose(acted(obs[order], theta[order]), once[order], atol=1e-4):
+            right = "it must give the action without noise, to which `noise` is added, by its arguments alone"
+            raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
 
 
 def _check_independence(task: BlackBox) -> None:

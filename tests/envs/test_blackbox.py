@@ -587,6 +587,17 @@ class Remembering(Sliding):
         return np.array([self.last])
 
 
+class Tiring(Sliding):
+    """An expert that is weaker once it has seen six observations."""
+
+    def __init__(self) -> None:
+        self.seen = set[float]()
+
+    def expert(self, obs: Any, theta: Any) -> Any:
+        self.seen.add(float(obs[0]))
+        return super().expert(obs, theta) / (1 + (len(self.seen) > 6))
+
+
 class Alike(Sliding):
     """All environments have the theta that was made last."""
 
@@ -617,6 +628,7 @@ class Same(Sliding):
     ("world", "says"),
     [
         (Remembering, "expert of remembering gave two actions for one observation"),
+        (Tiring, "expert of tiring gave two actions for one observation"),
         (Alike, "an environment of alike has another trial alone than beside another one; `make` must give a new one"),
         (Same, "an environment of same has another trial alone than beside another one"),
     ],
