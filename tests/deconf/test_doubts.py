@@ -50,6 +50,7 @@ def doubted(kind: Kind, explored: Trials | None = None) -> tuple[str, ...]:
     return doubts.doubts(roll(kind, thetas(kind, 160, 0), True, 0), explore)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "says"),
     [("spread", "how much a step varies"), ("cliff", "where their episodes end")],
@@ -64,6 +65,7 @@ def test_exploration_under_one_condition() -> None:
     assert "under one condition alone" in doubt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 0.5])
 def test_exploration_that_sees_what_is_hidden(share: float) -> None:
     """Also if only half of its trials do."""
@@ -73,17 +75,20 @@ def test_exploration_that_sees_what_is_hidden(share: float) -> None:
     assert "seems to see what is hidden" in doubted("drift", Trials(*parts))[0]
 
 
+@pytest.mark.slow
 def test_nothing_to_doubt() -> None:
     """Of a goal that nothing tells."""
     assert not doubted("goal")
 
 
+@pytest.mark.slow
 def test_a_difference_that_is_small() -> None:
     """As misfits leave: a quarter of the noise of a step."""
     trials = roll("drift", 0.1 * thetas("drift", 160, 0), True, 0)
     assert not doubts.doubts(trials, roll("drift", np.zeros(96), False, 1))
 
 
+@pytest.mark.slow
 def test_misfits_of_places_are_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where each trial of the expert stays at a place of its own, and the world is not linear."""
     monkeypatch.setattr(doubts, "LARGE", 0.1)
@@ -92,6 +97,7 @@ def test_misfits_of_places_are_no_difference(monkeypatch: pytest.MonkeyPatch) ->
     assert not doubts.doubts(*bent)
 
 
+@pytest.mark.slow
 def test_episodes_that_begin_as_they_end() -> None:
     """A column that is constant in each trial is alike at the ends, and everywhere."""
     both = [roll("cliff", np.full(n, 0.7), n == 160, i) for i, n in enumerate((160, 96))]
@@ -103,6 +109,7 @@ def test_episodes_that_begin_as_they_end() -> None:
     assert not doubts.doubts(*named)
 
 
+@pytest.mark.slow
 def test_a_policy_that_infers_what_is_hidden_is_blind() -> None:
     """It acts as the expert does from the second episode on; its first action tells nothing of that."""
     late, first = roll("drift", thetas("drift", 96, 1), True, 1), roll("drift", thetas("drift", 96, 5), True, 2)
