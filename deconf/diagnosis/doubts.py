@@ -17,6 +17,7 @@ from deconfounded.deconf.diagnosis.fits import (
     by_trial,
     clipped,
     fitted,
+    halves,
     one_hot,
     random_features,
     sample,
@@ -54,16 +55,6 @@ def doubts(trials: Trials, explore: Trials) -> tuple[str, ...]:
             " diagnosis."
         )
     return tuple(made)
-
-
-def _halves(trials: Trials, steps: Steps) -> Numbers:
-    """The half, 0 or 1, of each step's trial: every other episode; of a trial's only one, its second half."""
-    _, episode, step = np.nonzero(trials.mask)
-    took_place = trials.mask.any(2)
-    number = (took_place.cumsum(1) - 1)[steps.trial, episode]
-    taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)
-    halfway = taken >= trials.mask.sum((1, 2))[steps.trial] / 2
-    return np.where(took_place.sum(1)[steps.trial] > 1, number % 2, halfway).astype(int)
 
 
 def _alike(one: Array, other: Array, tests: int) -> float:
@@ -105,10 +96,10 @@ def _acts_on_it(explore: Trials, steps: Steps, trials: Trials, of_expert: Steps)
     rest = action - basis @ fitted(basis[:n], action[:n])
     own, others = rest[:n], rest[n:]
     (spread, noise), (_, noises) = _by_trial(own, of_expert.trial, len(trials)), _by_trial(others, steps.trial, count)
-    like = noises <= 2 * np.median(noise)
+    like = (noises <= 2 * np.median(noise)) & (np.bincount(steps.trial, minlength=count) > 0)
     if like.sum() < 16:
         return False
-    begins, half = np.searchsorted(steps.trial, np.arange(count)), _halves(explore, steps)
+    begins, half = np.searchsorted(steps.trial, np.arange(count)), halves(explore, steps)
     later, _ = _by_trial(others[half == 1], steps.trial[half == 1], count)
     return any(
         float(later[like, i].std()) > float(spread[:, i].std()) / 2
@@ -138,9 +129,9 @@ def _expert_differs(explore: Trials, steps: Steps, trials: Trials, of_expert: St
         return False
     rest = (left[n:, kept] / unit[kept]).clip(-CLIP, CLIP)
     rest = _rest(rest, obs[n:])
-    halves = [*_means(rest, of_expert, _halves(trials, of_expert), len(trials))]
-    large = (min(float(x.std()) for x in pair) > LARGE for pair in halves)
-    return any(big and _alike(*pair, len(halves)) > 0 for big, pair in zip(large, halves, strict=True))
+    pairs = [*_means(rest, of_expert, halves(trials, of_expert), len(trials))]
+    large = (min(float(x.std()) for x in pair) > LARGE for pair in pairs)
+    return any(big and _alike(*pair, len(pairs)) > 0 for big, pair in zip(large, pairs, strict=True))
 
 
 def _sizes_differ(explore: Trials, steps: Steps) -> bool:
@@ -153,8 +144,8 @@ def _sizes_differ(explore: Trials, steps: Steps) -> bool:
     if not kept.any():
         return False
     size = _rest(np.log(np.abs(left[:, kept] / unit[kept]).clip(0.01, CLIP)), inputs)
-    halves = [*_means(size, steps, _halves(explore, steps), len(explore))]
-    return any(_alike(*pair, len(halves)) > 0 for pair in halves)
+    pairs = [*_means(size, steps, halves(explore, steps), len(explore))]
+    return any(_alike(*pair, len(pairs)) > 0 for pair in pairs)
 
 
 def _ends_differ(explore: Trials) -> bool:

@@ -57,6 +57,16 @@ def by_trial(x: Array, trial: Numbers, count: int) -> Array:
     return np.bincount(trial, x, count) / np.maximum(np.bincount(trial, minlength=count), 1)
 
 
+def halves(trials: Trials, steps: Steps) -> Numbers:
+    """The half, 0 or 1, of each step's trial: every other episode; of a trial's only one, its second half."""
+    _, episode, step = np.nonzero(trials.mask)
+    took_place = trials.mask.any(2)
+    number = (took_place.cumsum(1) - 1)[steps.trial, episode]  # of the episode, among those that took place
+    taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
+    halfway = taken >= trials.mask.sum((1, 2))[steps.trial] / 2
+    return np.where(took_place.sum(1)[steps.trial] > 1, number % 2, halfway).astype(int)
+
+
 def kurtosis(x: Array) -> float:
     """Excess kurtosis; 0 of what does not vary."""
     centred = x - x.mean()

@@ -16,6 +16,7 @@ from deconfounded.deconf.diagnosis.fits import (
     by_trial,
     clipped,
     fitted,
+    halves,
     one_hot,
     random_features,
     usual_size,
@@ -47,12 +48,7 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     unit = usual_size(left, change)
     kept = np.flatnonzero(np.isfinite(unit))
     _, episode, step = np.nonzero(trials.mask)
-    taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
-    took_place = trials.mask.any(2)
-    number = (took_place.cumsum(1) - 1)[steps.trial, episode]  # of the episode, among those that took place
-    halfway = taken >= trials.mask.sum((1, 2))[steps.trial] / 2
-    second = np.where(took_place.sum(1)[steps.trial] > 1, number % 2, halfway)
-    group = 2 * steps.trial + second
+    group = 2 * steps.trial + halves(trials, steps)
     both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
     if not len(kept) or both.sum() < 16:
         return None
