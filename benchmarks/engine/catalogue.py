@@ -91,8 +91,8 @@ def check_names(kind: str, names: Sequence[str], allowed: Sequence[str]) -> None
     """Raises InputError for a name that is not among those allowed."""
     for name in names:
         if name not in allowed:
-            base, _, way = name.rpartition("_")
-            if kind == "method" and base in METHODS and way in get_args(Way):
+            base, _, deployment = name.rpartition("_")
+            if kind == "method" and base in METHODS and deployment in get_args(Way):
                 right = f"give {base}, which is scored in every way that it can be deployed"
                 raise envs.InputError(f"method {name!r} is none of its own; {right}")
             own = f"; one of your own is {name}:FUNCTION" if name.endswith(".py") else ""

@@ -94,16 +94,16 @@ def _acts_on_it(explore: Trials, steps: Steps, trials: Trials, of_expert: Steps)
     action = np.concatenate([one_hot(each.action, trials.actions) for each in (of_expert, steps)])
     basis = random_features(clipped(obs), FINE)
     rest = action - basis @ fitted(basis[:n], action[:n])
-    own, others = rest[:n], rest[n:]
-    (spread, noise), (_, noises) = _by_trial(own, of_expert.trial, len(trials)), _by_trial(others, steps.trial, count)
+    own, explored = rest[:n], rest[n:]
+    (spread, noise), (_, noises) = _by_trial(own, of_expert.trial, len(trials)), _by_trial(explored, steps.trial, count)
     like = (noises <= 2 * np.median(noise)) & (np.bincount(steps.trial, minlength=count) > 0)
     if like.sum() < 16:
         return False
     begins, half = np.searchsorted(steps.trial, np.arange(count)), halves(explore, steps)
-    later, _ = _by_trial(others[half == 1], steps.trial[half == 1], count)
+    later, _ = _by_trial(explored[half == 1], steps.trial[half == 1], count)
     return any(
         float(later[like, i].std()) > float(spread[:, i].std()) / 2
-        and _alike(others[begins[like], i], later[like, i], rest.shape[1]) > 0
+        and _alike(explored[begins[like], i], later[like, i], rest.shape[1]) > 0
         for i in range(rest.shape[1])
     )
 

@@ -69,8 +69,8 @@ def test_exploration_under_one_condition() -> None:
 @pytest.mark.parametrize("share", [0.9, 0.5])
 def test_exploration_that_sees_what_is_hidden(share: float) -> None:
     """Also if only half of its trials do."""
-    theta, some = thetas("drift", 96, 1), int(96 * share)
-    seeing, blind = roll("drift", theta[:some], True, 1), roll("drift", theta[some:], False, 2)
+    theta, n_seeing = thetas("drift", 96, 1), int(96 * share)
+    seeing, blind = roll("drift", theta[:n_seeing], True, 1), roll("drift", theta[n_seeing:], False, 2)
     parts = [np.concatenate([getattr(each, name) for each in (seeing, blind)]) for name in ("obs", "action", "mask")]
     assert "seems to see what is hidden" in doubted("drift", Trials(*parts))[0]
 
