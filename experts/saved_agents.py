@@ -3,10 +3,12 @@
 import hashlib
 import inspect
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors.numpy import load as from_bytes
 from safetensors.numpy import save as to_bytes
 
@@ -26,6 +28,8 @@ def _sha256(content: bytes) -> str:
 
 def save(agent: Agent, folder: Path, **about: Any) -> None:
     """Save an agent: its class by name, its settings, its arrays; about: further entries of agent.json.
+
+    With the sizes of `spaces` among these, an agent is tried: it must act as what is loaded in its place.
 
     The file of a class from outside is copied into the folder; what that file imports must be importable when the agent
     is loaded. Raises InputError for an agent that cannot be saved, and writes nothing.
@@ -51,6 +55,10 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
         right = "its state() must return a dictionary for json and one of arrays"
         raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
     _check_loadable(cls, json.dumps(about["settings"]), content)
+    if "spaces" in about:
+        _check_alike(
+            agent, cls.from_state(json.loads(json.dumps(about["settings"])), from_bytes(content)), about["spaces"]
+        )
     check_folder(folder)
     if code is not None:
         write_atomically(folder / CODE, code)
@@ -71,6 +79,38 @@ def _check_loadable(cls: type[Agent], settings: str, content: bytes) -> None:
     if why:
         right = "it must undo what state() gives"
         raise InputError(f"{cls.__qualname__} cannot be saved: from_state() fails ({why}); {right}")
+
+
+def _check_alike(agent: Agent, loaded: Agent, sizes: dict[str, int]) -> None:
+    """Raises InputError if an agent acts differently from what is loaded in its place, on observations of noise.
+
+    Nothing is said of an agent that cannot act on them, or that acts differently itself when it is asked again.
+    """
+    try:
+        acted, again = (_actions(agent, sizes["observations"]) for _ in range(2))
+    except Exception:  # any error of the class's own methods
+        return
+    if np.array_equal(acted, again, equal_nan=True):
+        try:
+            same = np.array_equal(acted, _actions(loaded, sizes["observations"]), equal_nan=True)
+            why = "acts differently" * (not same)
+        except Exception as error:
+            why = f"fails ({error_line(error)})"
+        if why:
+            right = "state() must give all that its actions depend on"
+            raise InputError(f"{type(agent).__qualname__} cannot be saved: what from_state() makes {why}; {right}")
+
+
+def _actions(agent: Agent, width: int) -> NDArray[np.float64]:
+    """Actions [10, 2, A] in two episodes of five steps of two trials, on observations of this width."""
+    noise, actions = np.random.default_rng(0), []
+    agent.begin(2)
+    for _ in range(2):
+        agent.reset([np.random.default_rng(0)])
+        for obs, next_obs in pairwise(noise.standard_normal((6, 2, width), dtype=np.float32)):
+            actions.append(np.array(agent.act(obs.copy()), np.float64))
+            agent.observe(obs, actions[-1].copy(), next_obs, np.ones(2, bool))
+    return np.array(actions)
 
 
 def describe(folder: Path) -> dict[str, Any]:

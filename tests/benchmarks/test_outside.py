@@ -1029,6 +1029,45 @@ class Odd(Still):
             saved_agents.save(agent, tmp_path / "kept")
         assert (tmp_path / "kept").exists() == (not says)
 
+    @pytest.mark.parametrize(
+        ("acts", "says"),
+        [
+            ("self.size * np.ones((len(obs), 1))", ""),
+            (
+                "self.gain * np.ones((len(obs), 1))",
+                r"what from_state\(\) makes acts differently; state\(\) must give all",
+            ),
+            ("self.gain[0] * np.ones((len(obs), 1))", r"what from_state\(\) makes fails \(.*TypeError"),
+            ("np.random.random((len(obs), 1))", ""),
+            ("obs[:, [99]]", ""),
+            ("self.rng.random((len(obs), 1))", ""),
+            ("np.full((len(obs), 1), self.seen)", ""),
+        ],
+    )
+    def test_an_agent_whose_state_forgets(self, acts: str, says: str, tmp_path: Path) -> None:
+        """What acts differently from what was scored is not kept. What cannot be tried is."""
+        text = f"""
+class Odd(Still):
+    gain, seen = 1.0, 0
+    def __init__(self, size): self.size = size
+    def reset(self, rngs): self.rng = rngs[0]
+    def observe(self, obs, action, next_obs, alive): self.seen += 1
+    def act(self, obs): return {acts}
+    def state(self): return {{}}, {{"size": np.array(self.size)}}
+    @classmethod
+    def from_state(cls, settings, arrays): return cls(arrays["size"])
+"""
+        (tmp_path / "odd.py").write_text(HEAD + text)
+        agent = outside.find("agent", f"{tmp_path / 'odd.py'}:Odd")(0.25)
+        agent.gain = [2.0] if "[0]" in acts else 2.0
+        sizes = {"observations": 3, "action": 1, "actions": 0}
+        if says:
+            with pytest.raises(envs.InputError, match=says):
+                saved_agents.save(agent, tmp_path / "kept", spaces=sizes)
+        else:
+            saved_agents.save(agent, tmp_path / "kept", spaces=sizes)
+        assert (tmp_path / "kept").exists() == (not says)
+
     def test_an_agent_whose_file_imports_another(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """That one is not kept; where it is missing, the message says what to do."""
         (tmp_path / "beside_odd.py").write_text("VALUE = 0.25")
