@@ -33,20 +33,3 @@ def padded(obs: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
     taken = np.concatenate([mask, never], -1) | np.concatenate([never, mask], -1)
     last = np.maximum.accumulate(np.where(taken, np.arange(taken.shape[-1]), -1), -1)[..., None]
     return np.where(last < 0, 0, np.take_along_axis(obs, last.clip(0), 2))
-
-
-def check_rounding(obs: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-    """Raises InputError for a column whose spread, or change in a step, is no more than ten times what float32 rounds.
-
-    Of an offset that is large beside them, or of Unix times. Columns that hardly vary count as constant: see Scaler.
-    """
-    wide = obs.astype(float)
-    lost = np.abs(wide - wide.astype(np.float32)).max((0, 1, 2))
-    change = np.diff(wide, axis=2)[mask]
-    for what, extent in (("spread", wide.std((0, 1, 2))), ("change in a step", np.sqrt((change**2).mean(0)))):
-        if (bad := (extent > 1e-6) & (extent < 10 * lost)).any():
-            i = int(np.flatnonzero(bad)[0])
-            raise InputError(
-                f"observation {i} of Trials is about {wide[..., i].mean():.9g}, and its {what} {extent[i]:.3g}: float32"
-                f" rounds it by up to {lost[i]:.2g}; subtract its mean"
-            )

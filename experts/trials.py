@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from deconfounded.envs.streams import Array, Mask
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.files import write_atomically
-from deconfounded.experts.arrays import LARGEST, check_rounding, numbers, padded, size
+from deconfounded.envs.support.numbers import check_rounding
+from deconfounded.experts.arrays import LARGEST, numbers, padded, size
 
 
 def of_steps(theta: Array, steps: int) -> Array:
@@ -69,7 +70,7 @@ class Trials:
             right = "actions must be in [-1, 1]; discrete ones need `actions`, their number"
             raise InputError(f"Trials held an action of size {far:.9g}; {right}")
         if not np.can_cast(obs.dtype, np.float32):
-            check_rounding(obs, mask)
+            check_rounding("Trials", obs, mask)
         for name, array, dtype in (("obs", obs, np.float32), ("action", action, np.float32), ("mask", mask, bool)):
             kept = np.array(array, dtype)
             kept.setflags(write=False)

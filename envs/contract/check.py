@@ -12,6 +12,7 @@ from deconfounded.envs.contract.probe import actions, beyond_bounds, observation
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
 from deconfounded.envs.support.errors import InputError, error_line
+from deconfounded.envs.support.numbers import check_rounding
 from deconfounded.envs.task import Task
 
 TIERS = (1, 2, 3, None)
@@ -80,14 +81,17 @@ def _check_world(task: BlackBox) -> None:
     acted = task.expert_probs if task.n_actions else task.expert_mean
     for by_expert in (False, True):  # it may have a memory that shows where it goes itself alone
         env, asked = BatchEnv(task, 2), list[tuple[Array, Array, Array]]()
-        obs = env.reset(0)
+        obs, states, masks = env.reset(0), [env.state], []
         for action in actions(task, env.n, task.horizon):
+            masks.append(env.alive)
             asked.append((obs, env.theta, once := acted(obs, env.theta)))  # after an episode's end too, as in runs
             own = once.argmax(-1)[:, None].astype(float) if task.n_actions else once
             obs = env.step(own if by_expert else action)[0]
+            states.append(env.state)
             if not env.alive.any():
                 break
         env.close()
+        check_rounding(task.name, np.stack([task.observe(state) for state in states], 1), np.stack(masks, 1))
         obs, theta, once = (np.concatenate(each) for each in zip(*asked, strict=True))
         order = np.random.default_rng(0).permutation(len(obs))
         if not np.allclose(acted(obs[order], theta[order]), once[order], atol=1e-4):

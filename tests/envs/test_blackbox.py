@@ -639,6 +639,37 @@ def test_parts_that_trials_share(world: type[Sliding], says: str) -> None:
         envs.check_task(task_of(world)())
 
 
+class Far(Slide):
+    """Its x is given in a frame whose origin is `away`, in float64."""
+
+    away, observation_space = 0.0, spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, **given: Any) -> Any:
+        super().reset(**given)
+        return self.x + self.away, {}
+
+    def step(self, action: Any) -> Any:
+        return super().step(action)[0].astype(float) * 0 + self.x + self.away, 0.0, False, False, {}
+
+
+@pytest.mark.parametrize(("away", "says"), [(0.0, ""), (1e4, ""), (5e6, "observation 0 of far is about")])
+def test_coordinates_that_float32_loses(away: float, says: str) -> None:
+    """As of logs: agents read float32."""
+
+    def expert(self: Any, obs: Any, theta: Any) -> Any:
+        return 2 - (obs - away) - theta
+
+    own = type("Own", (Far,), {"away": away})
+    task = task_of(type("Far", (Sliding,), {"make": lambda self, theta: own(theta[0]), "expert": expert}))()
+    if says:
+        with pytest.raises(
+            envs.InputError, match=rf"{says} .*: float32 rounds it by up to 0\.2\d*; subtract its mean$"
+        ):
+            envs.check_task(task)
+    else:
+        envs.check_task(task)
+
+
 class Running(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Rewards divided by how many there were, as by a running scale."""
 
