@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
 from deconfounded.envs.contract.core import CONTRACT
+from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks import slippery_walker
@@ -432,6 +433,15 @@ def test_the_contract_catches_a_wrong_time_limit(late: bool, says: str, monkeypa
     monkeypatch.setattr(envs.BatchEnv, "step", off)
     with pytest.raises(AssertionError, match=f"^{says}"):
         CONTRACT["time_limit"](SlipperyCartpole())
+
+
+def test_episodes_of_one_step() -> None:
+    """They are no error; gymnasium's checker, which would call them one, is not asked."""
+    task = type("Short", (SlipperyCartpole,), {"horizon": 1})()
+    with pytest.raises(Skipped, match=r"^gymnasium's checker takes an episode that is cut off after one step"):
+        CONTRACT["gymnasium_env"](task)
+    for name in ("stable_baselines", "dm_env_tests", "adapters_agree", "time_limit", "keep_theta"):
+        CONTRACT[name](task)
 
 
 def test_the_contract_is_whole() -> None:
