@@ -93,12 +93,16 @@ def versions() -> dict[str, str]:
     import mujoco  # not before envs, which sets MUJOCO_GL aside
 
     installed = {"python": platform.python_version(), "mujoco": mujoco.__version__}
-    for name in LIBRARIES:
-        try:
-            installed[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return installed
+    return installed | {name: number for name in LIBRARIES if (number := _version(name))}
+
+
+@cache
+def _version(name: str) -> str | None:
+    """Of a package that is installed; None if it is not."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def machine(device: str) -> str:

@@ -7,7 +7,6 @@ import re
 import shutil
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -33,14 +32,28 @@ from deconfounded.experts.trials import Trials
 from tests.tools import tiny_preset
 
 
+def blind(folder: Path) -> BenchmarkJob:
+    """Blind BC on the bandit, seeds 0 and 1."""
+    return BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0, 1), folder / "jobs")
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which it has run."""
+    folder = tmp_path_factory.mktemp("finished")
+    (folder / "jobs").mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        blind(folder).run()
+    return folder
+
+
 @pytest.fixture
-def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkJob:
-    """Finished: blind BC on the bandit, seeds 0 and 1."""
+def job(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> BenchmarkJob:
+    """Finished, in a folder of the test's own."""
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
-    (tmp_path / "jobs").mkdir()
-    made = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0, 1), tmp_path / "jobs")
-    made.run()
-    return made
+    shutil.copytree(finished, tmp_path, dirs_exist_ok=True)
+    return blind(tmp_path)
 
 
 class TestIdentity:
@@ -88,11 +101,7 @@ class TestIdentity:
 
     def test_the_version_of_mujoco_is_that_of_what_steps(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Since 4 the package `mujoco` may be of another version than `mujoco-core`, or not there."""
-
-        def version(name: str) -> str:
-            raise PackageNotFoundError(name)
-
-        monkeypatch.setattr(identity, "version", version)
+        monkeypatch.setattr(identity, "LIBRARIES", ("no_such_package",))
         monkeypatch.setattr("mujoco.__version__", "4.5.6")
         assert identity.versions() == {"python": platform.python_version(), "mujoco": "4.5.6"}
 
