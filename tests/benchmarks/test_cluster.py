@@ -219,6 +219,7 @@ def test_what_a_job_needs_travels(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert identity.expert(envs.get("slippery_cartpole"), expert) == before
 
 
+@pytest.mark.slow
 def test_another_version_over_there_is_told() -> None:
     job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), Path("jobs"))
     here = {**identity.identity(job), "code": sources.package()}

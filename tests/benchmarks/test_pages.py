@@ -480,6 +480,7 @@ def made() -> dict[str, Any]:
 
 
 class TestIndex:
+    @pytest.mark.slow
     def test_rows_are_the_records(self, made: dict[str, Any]) -> None:
         """Each cell has as many seeds as records, and the last episode's score; differences are of these scores."""
         lines = {file.stem: records.of_task(DOCS / "records", file.stem) for file in (DOCS / "records").glob("*.jsonl")}

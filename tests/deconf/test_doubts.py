@@ -60,6 +60,7 @@ def test_what_the_world_tells_beyond_its_mean_motion(kind: Kind, says: str) -> N
     assert says in doubt
 
 
+@pytest.mark.slow
 def test_exploration_under_one_condition() -> None:
     (doubt,) = doubted("drift", roll("drift", np.full(96, 0.3), False, 1))
     assert "under one condition alone" in doubt
