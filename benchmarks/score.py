@@ -58,10 +58,10 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
     returns = {name: run_trials(env, each, task.episodes, seed).returns for name, each in agents.items()}
     references = (returns["random"].mean(), returns["expert"].mean())
     scoring.check_expert(task.name, *references)
-    by_trial = scoring.normalise(returns["agent"], *references)
-    interval = scoring.bootstrap(by_trial[:, -1])
+    each = [returns["agent"][:, -1], *(returns[name].mean(1) for name in ("random", "expert"))]
+    interval = scoring.bootstrap_score(*each)
     return {
-        "score": by_trial.mean(0).round(4).tolist(),
+        "score": scoring.normalise(returns["agent"], *references).mean(0).round(4).tolist(),
         "ci95_last": None if interval is None else interval.tolist(),
         "return": {name: of.mean(0).round(4).tolist() for name, of in returns.items()},
     }

@@ -173,8 +173,7 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
                 }
                 minus[measure][other] = statistics.mean_difference(differences)
                 if measure == "last":
-                    both = [{task: np.array([*of[task].values()]) for task in pairs} for of in (own, theirs)]
-                    improvement = statistics.over_tasks(statistics.improvement, *both)
+                    improvement = statistics.over_tasks(statistics.improvement, *statistics.matched(own, theirs))
                     assert improvement is not None
                     better[other] = improvement
         made.append(Row(name, "", len(scores[name]), mean, minus, better))
@@ -208,20 +207,15 @@ def tables(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str]) 
     return {"tasks": first, "over_tasks": second}
 
 
-def notes(scores: Scores) -> str:
+def notes() -> str:
     """What the figures are, and what their intervals hold."""
-    fewest = min(len(seeds) for of in scores.values() for seeds in of.values())
-    share = (
-        f"; with {fewest} seeds of many tasks it contains the true value in {statistics.coverage(fewest):.0%} of cases"
-    )
-    held = f"{share}, with few tasks in fewer" if fewest > 1 else ""
     return (
         "Scores of the first and the last episode of a trial: 0 is random actions and 1 the expert, of the records that"
         " come with the package, or of the runs on a task that these do not have. Regret is the expert's score less the"
         " method's, summed over the episodes; less is better. Differences are paired by seed; their 95% intervals are"
         " Student's, over tasks Welch's. Over tasks they are of means, not of interquartile means."
-        f" IQM is the interquartile mean of all runs; its interval is a stratified bootstrap{held}. The interval of P"
-        " is a stratified bootstrap too."
+        " IQM is the interquartile mean of all runs, P is of the seeds that both have; their intervals are stratified"
+        " bootstraps, and of few seeds of a few tasks too narrow. The references, 0 and 1, are taken to be exact."
     )
 
 
@@ -284,7 +278,7 @@ def picture(by_task: Sequence[Row], over: Sequence[Row], against: Sequence[str],
 def write(scores: Scores, methods: Sequence[str], against: Sequence[str], folder: Path) -> str:
     """All tables and pictures of a comparison into a folder; returns what a terminal shows."""
     by_task, over = of_tasks(scores, methods, against), over_tasks(scores, methods, against)
-    made, said = tables(by_task, over, against), notes(scores)
+    made, said = tables(by_task, over, against), notes()
     check_folder(folder)
     shown = []
     for name, table in made.items():

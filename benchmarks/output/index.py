@@ -97,16 +97,17 @@ def _runs(scores: Scores, tasks: Sequence[str]) -> dict[str, dict[str, Array]]:
 
 def over_tasks(scores: Scores, tasks: Sequence[str]) -> dict[str, Any]:
     """What scores by task, method and seed come to over tasks: of each method, on those where it was run."""
-    methods, runs = {}, _runs(scores, tasks)
-    for name, by_task in runs.items():
+    methods = {}
+    for name, by_task in _runs(scores, tasks).items():
         methods[name] = {
             "tasks": len(by_task),
             "iqm": as_json(statistics.over_tasks(statistics.iqm, by_task)),
             "profile": as_json(statistics.over_tasks(lambda x: statistics.profile(x, THRESHOLDS), by_task)),
         }
-        if name != PEER and (shared := set(by_task) & set(runs.get(PEER, ()))):
-            improvement = as_json(statistics.over_tasks(statistics.improvement, runs[PEER], by_task))
-            methods[name]["improvement"] = {**(improvement or {}), "tasks": len(shared)}
+        both = statistics.matched(*({task: scores[task].get(each, {}) for task in tasks} for each in (PEER, name)))
+        if name != PEER and both[0]:
+            improvement = as_json(statistics.over_tasks(statistics.improvement, *both))
+            methods[name]["improvement"] = {**(improvement or {}), "tasks": len(both[0])}
     return {"tasks": tasks, "methods": methods}
 
 
@@ -210,24 +211,37 @@ def answers(scores: Scores) -> list[str]:
 
 
 def _answer(scores: Scores, method: str, question: str) -> str | None:
-    """Whether a method's 95% interval ends less than NEAR below that of PEER, and whether it exceeds that of NAIVE."""
+    """Whether a method is better than NAIVE, and no more than NEAR behind PEER, by 95% intervals of differences.
+
+    Of interquartile means, over the tasks and seeds that all three have.
+    """
     names = (method, NAIVE, PEER)
-    tasks = [task for task, of in scores.items() if all(len(of.get(name, ())) > 1 for name in names)]
+    own, naive, peer = statistics.matched(*({task: of.get(name, {}) for task, of in scores.items()} for name in names))
+    tasks = [task for task, of in own.items() if len(of) > 1]
     if not tasks:
         return None
-    runs = {name: {task: np.array(list(scores[task][name].values())) for task in tasks} for name in names}
-    means = {name: _figure(statistics.iqm, runs[name]) for name in names}
-    (_, low, high), (_, _, naive), (_, peer, _) = means.values()
-    helps, enough = low > naive, high >= peer - scoring.NEAR
-    if peer <= naive or (enough and not helps):
+    runs = {name: {task: of[task] for task in tasks} for name, of in zip(names, (own, naive, peer), strict=True)}
+    means = {name: _figure(statistics.iqm, of) for name, of in runs.items()}
+
+    def ahead(one: str, other: str) -> tuple[float, float]:
+        """From where to where the interval of the difference reaches."""
+        return _figure(lambda x, y: statistics.iqm(x) - statistics.iqm(y), runs[one], runs[other])[1:]
+
+    helps, (behind, near) = ahead(method, NAIVE)[0] > 0, ahead(method, PEER)
+    if ahead(PEER, NAIVE)[0] <= 0 or (near >= -scoring.NEAR and not helps):
         word = "It cannot be decided yet"
+    elif behind >= -scoring.NEAR:
+        word = "Yes"
+    elif near >= -scoring.NEAR:
+        word = "It helps; whether it is enough cannot be decided yet"
     else:
-        word = "Yes" if enough else "It helps, but it is not enough" if helps else "No"
+        word = "It helps, but it is not enough" if helps else "No"
     ranges = ("{} {} ({} to {})".format(name, *map(scoring.two_decimals, mean)) for name, mean in means.items())
     better = scoring.two_decimals(_figure(statistics.improvement, runs[PEER], runs[method])[0])
     return (
         f"{question} {word}: {', '.join(ranges)}, interquartile means over {len(tasks)} task{'s' * (len(tasks) > 1)}"
-        f" and their 95% intervals. A run of {PEER} is better than one of {method} with probability {better}."
+        f" and their 95% intervals. A run of {PEER} is better than one of {method} in the same trials with"
+        f" probability {better}."
     )
 
 

