@@ -8,7 +8,7 @@ and the dynamics of a task without a likelihood. The exit status is 1 if the tas
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 from deconfounded import envs
 from deconfounded.benchmarks.console import Parser, place, whole
 from deconfounded.benchmarks.engine import identity, sources
+from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.output.pictures import panels
+from deconfounded.benchmarks.output.certificate import picture
 from deconfounded.benchmarks.output.scoring import check_expert, normalise
+from deconfounded.benchmarks.output.trial_scores import standard_error
 from deconfounded.deconf.exact import GRID, Grid, grid_of, grid_size
 from deconfounded.deconf.particles import PARTICLES, Particles, exact_agent, needs_particles
 from deconfounded.envs.streams import Array
@@ -32,6 +34,7 @@ from deconfounded.experts.rollout import run_trials
 EPISODES, SEED, TRIALS = 5, 0, 64
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
+PARTS = 8  # of trials, whose scatter gives a standard error
 MOST = 16  # levels of many latents, drawn from all combinations
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
@@ -44,8 +47,7 @@ THRESHOLDS = {
 class EvidenceRecorder(ExpertAgent):
     """The expert; beside it the evidence of each step, and the posterior that dynamics alone would give.
 
-    Evidence is for the true theta over those of the grid, where a category is itself among them; the posterior is of
-    particles where they are given.
+    Evidence is for the true theta over the others of the grid; the posterior is of particles where they are given.
     """
 
     def __init__(self, env: envs.BatchEnv, expert: Expert, grid: Grid, particles: Particles | None = None) -> None:
@@ -57,7 +59,7 @@ class EvidenceRecorder(ExpertAgent):
         if self.particles:
             self.particles.begin(n)
         self.log_belief, self._steps = self.grid.prior(n), 0
-        self.dynamics: list[Array] = []  # nats for the true theta over one drawn from the grid, a step
+        self.dynamics: list[Array] = []  # nats for the true theta over another one of the grid, a step
         self.actions: list[Array] = []
         self.estimates: list[Array] = []  # of theta [N, L], at the end of each episode
         self.truths: list[Array] = []  # theta [N, L] then
@@ -82,14 +84,19 @@ class EvidenceRecorder(ExpertAgent):
         self._state, self._theta = self.env.state, self.env.theta.copy()
         return super().act(obs)
 
+    def _others(self) -> Callable[[Array], Array]:
+        """The mean of values [N, K] over the thetas of the grid that are not the true one, [N]."""
+        other = (self.grid.theta != self._theta[:, None]).any(-1)  # a category is in the grid itself
+        return lambda values: np.where(other, values, 0).sum(-1) / other.sum(-1)
+
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
         true = self.grid.log_true(self._state, action, self.env.state, self._theta)
-        self.dynamics.append((true[:, None] - log_dynamics)[alive].mean(-1))
-        acted = self.expert.log_prob(obs, action, self._theta)
-        self.actions.append((acted[:, None] - self.grid.log_policy(obs, action))[alive].mean(-1))
+        acted, others = self.expert.log_prob(obs, action, self._theta), self._others()
+        self.dynamics.append(others(true[:, None] - log_dynamics)[alive])
+        self.actions.append(others(acted[:, None] - self.grid.log_policy(obs, action))[alive])
         if self.particles:
             self.particles.learn(self._state, obs, action, self.env.state, alive)
         updated = self.grid.updated(self.log_belief, self._state, obs, log_dynamics)
@@ -98,8 +105,21 @@ class EvidenceRecorder(ExpertAgent):
         self._steps += 1
 
 
-def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, Array]:
-    """Levels [J, L]; scores [J, J] of the expert under the row's theta, given the column's; mean returns [J, J].
+class Stakes(NamedTuple):
+    """levels [J, L]; scores and mean returns [J, J] of an expert under the row's theta that is given the column's.
+
+    wrong: the mean score where these are far from each other; error: its standard error.
+    """
+
+    levels: Array
+    scores: Array
+    returns: Array
+    wrong: float
+    error: float
+
+
+def stakes(task: envs.Task, expert: Expert, trials: int) -> Stakes:
+    """What it costs to assume a wrong theta, in so many trials, at least PARTS, of each pair.
 
     Each row is scored by its own expert and its own random actions, and is NaN where these are as good: nothing is at
     stake under that theta. Theta does not switch meanwhile.
@@ -113,11 +133,19 @@ def stakes(task: envs.Task, expert: Expert, trials: int) -> tuple[Array, Array, 
     env = envs.BatchEnv(task, j * j * trials)
     returns = run_trials(env, ExpertAgent(env, expert, assumed), 1, SEED, true).returns
     random = run_trials(env, RandomAgent(task.action_space), 1, SEED, true).returns
-    matrix = returns.reshape(j, j, trials).mean(-1)
-    zero = random.reshape(j, j * trials).mean(-1, keepdims=True)
-    one = np.diag(matrix)[:, None]
-    scores = np.full((j, j), np.nan)
-    return levels, np.divide(matrix - zero, one - zero, out=scores, where=one > zero), matrix
+    matrix = returns.reshape(j, j, trials)
+    parts = zip(*(np.array_split(x, PARTS, -1) for x in (matrix, random.reshape(j, j, trials))), strict=True)
+    far, scored = far_pairs(task, levels), scores(matrix, random.reshape(j, j, trials))
+    wrong = [float(np.nanmean(scores(*part)[far])) for part in parts]
+    about = float(np.nanmean(scored[far])), float(np.std(wrong, ddof=1) / PARTS**0.5)
+    return Stakes(levels, scored, matrix.mean(-1), *about)
+
+
+def scores(returns: Array, random: Array) -> Array:
+    """Scores [J, J] of returns [J, J, N] under a row's theta, given a column's; random: those of random actions."""
+    matrix = returns.mean(-1)
+    zero, one = random.mean((1, 2))[:, None], np.diag(matrix)[:, None]
+    return np.divide(matrix - zero, one - zero, out=np.full(matrix.shape, np.nan), where=one > zero)
 
 
 def far_pairs(task: envs.Task, levels: Array) -> NDArray[np.bool_]:
@@ -157,7 +185,7 @@ def certify(
         thetas, learned = LearnedGrid(env, expert, grid or GRID, model), {"r2": model.r2, "exponent": model.exponent}
 
     def returns(agent: Agent) -> Array:
-        return run_trials(env, agent, EPISODES, SEED).returns.mean(0)
+        return run_trials(env, agent, EPISODES, SEED).returns
 
     many = needs_particles(task) and not learned
     particles = Particles(env, expert, conditional=False) if many else None
@@ -165,7 +193,8 @@ def certify(
     recorder = EvidenceRecorder(env, expert, known, particles)
     best = run_trials(env, recorder, EPISODES, SEED).returns  # thetas are the same in every run: seeds are shared
     recorder.note()
-    one, zero = float(best.mean()), float(returns(RandomAgent(task.action_space)).mean())
+    random = returns(RandomAgent(task.action_space))
+    zero, one = float(random.mean()), float(best.mean())
     check_expert(task.name, zero, one)
     done(STAGES[0])
     policies = {"interventional": returns(exact_agent(env, expert, False, thetas))}
@@ -175,7 +204,7 @@ def certify(
     done(STAGES[1])
     policies |= {"conditional": returns(exact_agent(env, expert, True, thetas)), **static}
     done(STAGES[2])
-    levels, matrix, raw = stakes(task, expert, max(trials // 2, 8))
+    staked = stakes(task, expert, max(trials // 2, PARTS))
     done(STAGES[3])
 
     demo_env = envs.BatchEnv(task, 2 * trials)
@@ -185,20 +214,24 @@ def certify(
     blind = returns(memoryless_bc.train(demos, memoryless_bc.MemorylessConfig(), np.random.default_rng(SEED)))
     done(STAGES[4])
 
-    curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in policies.items()}
+    means = {name: x.mean(0) for name, x in policies.items()}
+    curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in means.items()}
+    scored = {"blind_bc": blind.mean(1)} | {f"{name}_last": policies[name][:, -1] for name in EXACT}
     measured = {
-        "blind_bc": float(normalise(blind, zero, one).mean()),
-        "wrong_theta": float(np.nanmean(matrix[far_pairs(task, levels)])),
-        **{f"{name}_last": curves[name]["score"][-1] for name in ("conditional", "interventional")},
+        name: (float(normalise(x.mean(), zero, one)), standard_error(x, random.mean(1), best.mean(1)))
+        for name, x in scored.items()
     }
+    measured["wrong_theta"] = staked.wrong, staked.error
     checks = {}
     for name, (relation, bound) in THRESHOLDS.items():
-        holds = measured[name] <= bound if relation == "<=" else measured[name] >= bound
-        checks[name] = {"measured": round(measured[name], 4), "required": f"{relation} {bound}", "passed": holds}
+        value, error = measured[name]
+        holds = value <= bound if relation == "<=" else value >= bound
+        required = {"required": f"{relation} {bound}", "passed": holds, "sure": abs(value - bound) > 2 * error}
+        checks[name] = {"measured": round(value, 4), "error": round(error, 4), **required}
     pairs = zip(recorder.estimates, recorder.truths, strict=True)
     dynamics, actions = (float(np.concatenate(x).mean()) for x in (recorder.dynamics, recorder.actions))
     ratio = actions / dynamics if dynamics else None  # None where expert trials hold no evidence of theta
-    score = [[None if np.isnan(value) else value for value in row] for row in matrix.tolist()]
+    score = [[None if np.isnan(value) else value for value in row] for row in staked.scores.tolist()]
     return {
         "task": task.name,
         "task_version": task.version,
@@ -211,7 +244,7 @@ def certify(
         **curves,
         "evidence_nats_per_step": {"dynamics": dynamics, "actions": actions, "delusion_ratio": ratio},
         "inferability": [inferability(task, *pair) for pair in pairs],
-        "stakes": {"levels": levels.tolist(), "score": score, "return": raw.tolist()},
+        "stakes": {"levels": staked.levels.tolist(), "score": score, "return": staked.returns.tolist()},
         "trials": trials,
         "grid": len(recorder.grid.theta),
         **({"particles": PARTICLES} if many else {}),
@@ -232,40 +265,6 @@ def inferability(task: envs.Task, estimate: Array, truth: Array) -> dict[str, fl
     return inferable
 
 
-def picture(result: dict[str, Any], file: Path) -> None:
-    """Stakes, exact policies and evidence on one page."""
-    with panels(file, 1, 3, size=(13, 3.9)) as [[left, middle, right]]:
-        score, levels = np.array(result["stakes"]["score"], float), result["stakes"]["levels"]
-        size, legible = (8, levels) if len(levels) < 9 else (4, [])
-        for (i, j), value in np.ndenumerate(score):
-            hue = "white" if value < 0.6 else "black"
-            number = "" if np.isnan(value) else f"{value:.2f}"
-            left.text(j, i, number, ha="center", va="center", color=hue, fontsize=size)
-        alike = len(levels[0]) > 1 and all(len(set(level)) == 1 for level in levels)  # of patches
-        ticks = ["\n".join(f"{x:.3g}" for x in (level[:1] if alike else level)) for level in legible]
-        each = ", of each patch" * alike
-        left.set(
-            xlabel=f"theta given{each}", ylabel=f"true theta{each}", title="score of an expert given a wrong theta"
-        )
-        left.set_xticks(range(len(ticks)), ticks)
-        left.set_yticks(range(len(ticks)), ticks)
-        left.figure.colorbar(left.imshow(score, vmin=0, vmax=1, cmap="viridis"), ax=left)
-        kind = "learned" if "learned_dynamics" in result else "exact"
-        lines = {"interventional": "tab:green", "conditional": "tab:red", "static": "tab:olive"}
-        for name in (name for name in lines if name in result):
-            label = "interventional, theta taken to stand still" if name == "static" else f"{kind} {name}"
-            middle.plot(range(1, EPISODES + 1), result[name]["score"], "o--", color=lines[name], label=label)
-        middle.axhline(result["checks"]["blind_bc"]["measured"], color="tab:brown", label="blind BC")
-        middle.set(xlabel="episode of one theta", ylabel="score", ylim=(-0.1, 1.1), title=f"{kind} policies")
-        middle.legend(frameon=False)
-        evidence = result["evidence_nats_per_step"]
-        right.bar(["dynamics", "actions"], [evidence["dynamics"], evidence["actions"]], color=["tab:green", "tab:red"])
-        ratio = evidence["delusion_ratio"]
-        title = "no evidence from dynamics" if ratio is None else f"evidence of theta, ratio {ratio:.3g}"
-        right.set(yscale="symlog", ylabel="nats a step", title=title)
-        left.figure.suptitle(f"{result['task']}: certificate {result['verdict']}")
-
-
 def main() -> None:
     parser = Parser(__doc__, "--task", "--expert")
     folder = Path("results") / "certificates"
@@ -283,7 +282,9 @@ def main() -> None:
     write_json(folder / f"{task.name}.json", result)
     picture(result, folder / f"{task.name}.png")
     for name, check in result["checks"].items():
-        print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {check['measured']:.3f} (required {check['required']})")
+        value = f"{check['measured']:.3f} +- {check['error']:.3f} (required {check['required']})"
+        doubt = "" if check["sure"] else ": within two standard errors; --trials says more"
+        print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {value}{doubt}")
     if learned := result.get("learned_dynamics"):
         fit = "R2 {r2:.3f} on held-out trials, likelihood to the power {exponent:g}".format(**learned)
         print(f"conditional, interventional and evidence are of learned dynamics, not exact: {fit}")

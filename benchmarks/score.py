@@ -52,6 +52,7 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
     Raises InputError if the expert is no better than random actions.
     """
     from deconfounded.benchmarks.output import scoring
+    from deconfounded.benchmarks.output.trial_scores import bootstrap_score
 
     env = envs.BatchEnv(where, trials)
     agents = {"agent": agent, "expert": ExpertAgent(env, expert), "random": RandomAgent(task.action_space)}
@@ -59,7 +60,7 @@ def rescore(agent: Agent, task: envs.Task, expert: Expert, trials: int, seed: in
     references = (returns["random"].mean(), returns["expert"].mean())
     scoring.check_expert(task.name, *references)
     each = [returns["agent"][:, -1], *(returns[name].mean(1) for name in ("random", "expert"))]
-    interval = scoring.bootstrap_score(*each)
+    interval = bootstrap_score(*each)
     return {
         "score": scoring.normalise(returns["agent"], *references).mean(0).round(4).tolist(),
         "ci95_last": None if interval is None else interval.tolist(),

@@ -58,20 +58,6 @@ def bootstrap(values: Array) -> Array | None:
     return np.stack([made.confidence_interval.low, made.confidence_interval.high], -1)
 
 
-def bootstrap_score(returns: Array, random: Array, expert: Array) -> Array | None:
-    """The percentile-bootstrap interval [2] of the score of mean returns [N]; None for a single trial.
-
-    Of trials under the same thetas, which are drawn together: random and expert are no less uncertain, and often vary
-    with theta as the agent does. A draw of trials in which the expert is no better than random actions counts as none.
-    """
-    if len(returns) < 2:
-        return None
-    rng, of = np.random.default_rng(0), np.stack([returns, random, expert])
-    mean, zero, one = np.array([of[:, rng.integers(len(returns), size=len(returns))].mean(1) for _ in range(2000)]).T
-    better = one > zero
-    return np.percentile(normalise(mean[better], zero[better], one[better]), [2.5, 97.5])
-
-
 @cache
 def coverage(seeds: int) -> float:
     """The share of cases in which such an interval holds the mean, if scores are normal: .75 of 3 seeds. Simulated."""

@@ -18,7 +18,15 @@ from deconfounded.benchmarks.engine import benchmark
 from deconfounded.benchmarks.engine.benchmark import evaluate, objective
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
-from deconfounded.benchmarks.output import aggregation, records, run_report, scoring, statistics
+from deconfounded.benchmarks.output import (
+    aggregation,
+    certificate,
+    records,
+    run_report,
+    scoring,
+    statistics,
+    trial_scores,
+)
 from deconfounded.benchmarks.output.index import Found
 from deconfounded.benchmarks.studies import results
 from deconfounded.deconf import learned_reference
@@ -87,12 +95,12 @@ def test_an_interval_over_trials_holds_that_of_the_references() -> None:
     """An agent that does as the expert does has 1 for sure; one whose returns are another's does not."""
     rng = np.random.default_rng(0)
     random, expert, other = rng.normal(0, 1, 200), rng.normal(9, 3, 200), rng.normal(9, 3, 200)
-    assert scoring.bootstrap_score(expert, random, expert) == pytest.approx([1, 1])
+    assert trial_scores.bootstrap_score(expert, random, expert) == pytest.approx([1, 1])
     error = 3 * (2 / 200) ** 0.5 / 9  # of the difference of two means
-    interval = scoring.bootstrap_score(other, random, expert)
+    interval = trial_scores.bootstrap_score(other, random, expert)
     assert interval is not None
     assert np.ptp(interval) == pytest.approx(2 * 1.96 * error, rel=0.15)
-    assert scoring.bootstrap_score(np.ones(1), np.zeros(1), np.ones(1)) is None
+    assert trial_scores.bootstrap_score(np.ones(1), np.zeros(1), np.ones(1)) is None
 
 
 class Lower(toys.Push):
@@ -434,7 +442,7 @@ def test_levels_of_many_latents_are_from_all_combinations() -> None:
     """Some of 32: each latent is at both of its values."""
     task = Many()
     expert = CallableExpert(task, lambda obs, theta: toys.control(obs, theta[:, :1]), "control")
-    levels, *_ = certify.stakes(task, expert, 1)
+    levels = certify.stakes(task, expert, certify.PARTS).levels
     assert levels.shape == (certify.MOST, 5)
     assert (np.ptp(levels, 0) > 0).all()
 
@@ -464,7 +472,7 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
 
     Where there is no force, random actions are as good as the expert's none, and there is no score.
     """
-    levels, scores, returns = certify.stakes(PUSH, EXPERT, 32)
+    levels, scores, returns, *_ = certify.stakes(PUSH, EXPERT, 32)
     assert np.diag(scores) == pytest.approx([1, 1, np.nan, 1, 1], nan_ok=True)
     assert np.isnan(scores[2]).all()
     assert levels[2] == 0
@@ -482,7 +490,7 @@ def test_a_picture_of_stakes_has_the_true_theta_in_its_rows(figures: list[Any], 
         **{"stakes": {"score": [[1.0, 0.1], [0.2, 0.9]], "levels": [[-1.0], [1.0]]}},
         **{"evidence_nats_per_step": {"dynamics": 0.5, "actions": 2.0, "delusion_ratio": 4.0}},
     }
-    certify.picture(result, tmp_path / "push.png")
+    certificate.picture(result, tmp_path / "push.png")
     left, middle, right = figures[0].axes[:3]
     assert (left.get_xlabel(), left.get_ylabel()) == ("theta given", "true theta")
     assert {text.get_position(): text.get_text() for text in left.texts} == {
