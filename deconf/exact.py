@@ -78,8 +78,8 @@ class Grid:
         the two heaviest; each has the likelihood of the nearest simulated value instead. So a pruned value gains mass
         when its neighbours do, and is then simulated again. If theta is on the grid, it is ever pruned in at most a
         share K PRUNE_BELOW of trials (.2% for 21 values): by Ville's inequality, since the odds of all other values
-        against it are a martingale that starts at K - 1. Without log_belief, or where nothing is pruned, this is the
-        whole grid, bit for bit.
+        against it are a martingale that starts at K - 1 (for Eq. (5), where theta stands still). Without log_belief, or
+        where nothing is pruned, this is the whole grid, bit for bit.
         """
         n, k = len(state), len(self.theta)
         kept = np.ones((n, k), bool)

@@ -402,18 +402,19 @@ class TestComparison:
         monkeypatch.setattr(comparison, "gathered", lambda every, against: (read.extend(every), {"mine": {}})[1])
         monkeypatch.setattr(comparison, "write", lambda *_: "written")
         monkeypatch.setattr(comparison, "outdated", lambda *_: [])
-        changes = ({}, {"preset": "smoke"}, {"salt": "x"}, {"set": ["seeds=2"], "preset": "paper"})
+        changes = ({}, {"preset": "smoke"}, {"salt": "x"}, {"set": ["seeds=2"], "preset": "paper"}, {"eval_trials": 16})
         unpaired = "note: runs of salts none, x: a seed has other thetas in each, and nothing is paired"
         made = [record("mine", seed, 0.5) | change for seed, change in enumerate(changes)]
         for name, kept in (("plain", made[:1]), ("all", made)):
             records.write(tmp_path / name, kept)
             monkeypatch.setattr("sys.argv", ["compare", *[str(tmp_path / name)] * 2, "--out", str(tmp_path / "out")])
             compare.main()
-        assert [each["seed"] for each in read] == [0, 0, 1, 2, 3]
+        assert [each["seed"] for each in read] == [0, 0, 1, 2, 3, 4]
         kinds = ("preset paper, smoke", "set ['seeds=2']", "salt x")
         lines = capsys.readouterr().out.splitlines()
         noted = [f"note: runs of {kind}" for kind in kinds]
-        assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + noted + [unpaired]
+        fewer = "note: runs of 128 and 16 trials a seed, the package's of 128: seeds are in the same trials only in part"
+        assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + [*noted, fewer, unpaired]
 
     def test_bad_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
