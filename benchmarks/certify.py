@@ -34,7 +34,7 @@ from deconfounded.experts.rollout import run_trials
 EPISODES, SEED, TRIALS = 5, 0, 64
 STAGES = ("evidence", "interventional", "conditional", "stakes", "blind BC")
 LEVELS = 5  # of theta in the stakes matrix, for one latent
-PARTS = 8  # of trials, whose scatter gives a standard error
+PARTS = 8  # of trials, each of which is left out for a standard error
 MOST = 16  # levels of many latents, drawn from all combinations
 THRESHOLDS = {
     "blind_bc": ("<=", 0.7),
@@ -134,11 +134,11 @@ def stakes(task: envs.Task, expert: Expert, trials: int) -> Stakes:
     returns = run_trials(env, ExpertAgent(env, expert, assumed), 1, SEED, true).returns
     random = run_trials(env, RandomAgent(task.action_space), 1, SEED, true).returns
     matrix = returns.reshape(j, j, trials)
-    parts = zip(*(np.array_split(x, PARTS, -1) for x in (matrix, random.reshape(j, j, trials))), strict=True)
-    far, scored = far_pairs(task, levels), scores(matrix, random.reshape(j, j, trials))
-    wrong = [float(np.nanmean(scores(*part)[far])) for part in parts]
-    about = float(np.nanmean(scored[far])), float(np.std(wrong, ddof=1) / PARTS**0.5)
-    return Stakes(levels, scored, matrix.mean(-1), *about)
+    random, far, part = random.reshape(j, j, trials), far_pairs(task, levels), np.arange(trials) % PARTS
+    scored = scores(matrix, random)
+    without = [np.nanmean(scores(matrix[..., part != i], random[..., part != i])[far]) for i in range(PARTS)]
+    error = float(np.std(without) * (PARTS - 1) ** 0.5)  # jackknife
+    return Stakes(levels, scored, matrix.mean(-1), float(np.nanmean(scored[far])), error)
 
 
 def scores(returns: Array, random: Array) -> Array:

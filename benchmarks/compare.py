@@ -57,7 +57,7 @@ def main() -> None:
     counts = [sorted({str(record["eval_trials"]) for record in of}) for of in (every, package)]
     if package and counts[0] != counts[1]:
         given, kept = (" and ".join(of) for of in counts)
-        print(f"note: runs of {given} trials a seed, the package's of {kept}: seeds are in the same trials only in part")
+        print(f"note: runs of {given} trials a seed, the package's of {kept}: a seed's are the same only in part")
     if len(salts := sorted({record["salt"] or "none" for record in every})) > 1:
         print(f"note: runs of salts {', '.join(salts)}: a seed has other thetas in each, and nothing is paired")
     for line in comparison.outdated(every, against):

@@ -11,6 +11,7 @@ precision: then threads and CPU kernels move a number by some 1e-12, and a chang
 import argparse
 import contextlib
 import datetime
+import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -42,6 +43,7 @@ TOLERANCE = 2e-8  # of a number's size
 SINGLE = 2e-6  # for experts, whose networks are of single precision
 LIBRARIES = ("mujoco", "numpy", "torch")  # which may move numbers too
 CONTROL = "tests.toys:control"
+PRESET_FOR = ("bandit", "icy_stop", "ant_goal", "patchy_road", "rolling_deck")  # few numbers, many, latents, drift
 Numbers = dict[str, list[float]]
 FEW = {  # updates, rounds, batches and widths of every method: a second each
     **dict.fromkeys(("updates", "inference_updates", "offline_updates", "online_updates", "teacher_updates"), 3),
@@ -148,12 +150,19 @@ def small(amounts: Preset) -> Preset:
     return replace(amounts, expert_trials=5, explore_trials=4, query_trials=4, eval_trials=4, configs=configs)
 
 
+def amounts_of(name: str, task: str) -> list[float]:
+    """A number that stands for a method's hyperparameters on a task, of which `few` leaves little."""
+    config = preset("default", envs.get(task), "cpu", [name]).configs.get(name, {})
+    text = json.dumps({key: value for key, value in config.items() if key != "device"}, sort_keys=True)
+    return [float(int(hashlib.sha256(text.encode()).hexdigest(), 16) % 10**6)]
+
+
 def of_method(name: str) -> Numbers:
     """A few updates on each toy task; what the agent then does there, and what it remembers."""
     from deconfounded.benchmarks.engine.catalogue import label
     from deconfounded.benchmarks.engine.provider import deployed, fit
 
-    numbers: Numbers = {}
+    numbers = {f"amounts on {task}": amounts_of(name, task) for task in PRESET_FOR}
     for task in (toys.Push(), toys.Arms(), toys.Drift()):
         amounts = small(preset("default", task, "cpu", [name]))
         if task.drifts and name not in EXACT and "drifts" not in amounts.configs.get(name, {}):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from deconfounded import envs
-from deconfounded.deconf import equations
+from deconfounded.deconf import equations, methods
 from deconfounded.deconf.core import adam
 from deconfounded.deconf.methods import deconfounded_offline
 from tests import fingerprints
@@ -30,6 +31,16 @@ def test_nothing_does_otherwise(label: str) -> None:
 
 def test_the_file_holds_nothing_else() -> None:
     assert list(fingerprints.kept()) == fingerprints.EVERY
+
+
+def test_amounts_of_a_preset_are_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of methods alone which they are changed for; the tiny runs have amounts of their own."""
+    before = {name: fingerprints.amounts_of(name, "icy_stop") for name in ("naive_rnn", "palr", "random")}
+    declared = fingerprints.METHODS["palr"]
+    more = replace(declared.on_control, updates=declared.on_control.updates + 1)
+    monkeypatch.setattr(methods.load("palr"), "method", replace(declared, on_control=more))
+    after = {name: fingerprints.amounts_of(name, "icy_stop") for name in before}
+    assert [name for name in before if before[name] != after[name]] == ["palr"]
 
 
 SOME = ["task:ant_goal", "expert:ant_goal", "method:deconfounded_gru", "method:naive_transformer", "method:palr"]

@@ -413,7 +413,7 @@ class TestComparison:
         kinds = ("preset paper, smoke", "set ['seeds=2']", "salt x")
         lines = capsys.readouterr().out.splitlines()
         noted = [f"note: runs of {kind}" for kind in kinds]
-        fewer = "note: runs of 128 and 16 trials a seed, the package's of 128: seeds are in the same trials only in part"
+        fewer = "note: runs of 128 and 16 trials a seed, the package's of 128: a seed's are the same only in part"
         assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + [*noted, fewer, unpaired]
 
     def test_bad_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -480,6 +480,22 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     assert returns[-1, 0] < 0.6 * returns[-1, -1]
 
 
+def test_the_error_of_a_certificate_s_checks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How much they scatter over other trials, within a factor of 1.6."""
+    rng = np.random.default_rng(0)
+    random, expert = rng.normal(0, 1, (200, 50)), rng.normal(5, 2, (200, 50))
+    returns = 0.8 * expert + rng.normal(0, 1, (200, 50))
+    made = scoring.normalise(returns.mean(1), random.mean(1), expert.mean(1))
+    said = np.mean([trial_scores.standard_error(*of) for of in zip(returns, random, expert, strict=True)])
+    assert said == pytest.approx(made.std(), rel=0.15)
+    task, measured = type("Forced", (toys.Push,), {"latents": (envs.Latent("force", "", 0.5, 1.0),)})(), []
+    for seed in range(12):
+        monkeypatch.setattr(certify, "SEED", 1000 * seed)
+        measured.append(certify.stakes(task, CallableExpert(task, toys.control, "control"), 32))
+    error = float(np.mean([of.error for of in measured]))
+    assert 1 / 1.6 < error / np.std([of.wrong for of in measured]) < 1.6
+
+
 def test_a_picture_of_stakes_has_the_true_theta_in_its_rows(figures: list[Any], tmp_path: Path) -> None:
     """And beside it each exact policy's own scores, and the evidence of each source."""
     policies = {

@@ -32,6 +32,7 @@ from deconfounded.deconf.exact import Grid
 from deconfounded.deconf.particles import exact_agent
 from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array
+from deconfounded.experts import policy
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.policy import CallableExpert
 from deconfounded.experts.rollout import run_trials
@@ -209,6 +210,18 @@ class TestCertificates:
         apart = (theta - PUSH.theta_grid(5).ravel()) * 0.4  # of the velocity; half of that of the position
         ratio = 0.5 * ((apart / PUSH.std[1]) ** 2 + (0.5 * apart / PUSH.std[0]) ** 2).mean()
         assert np.concatenate(recorder.dynamics).mean() == pytest.approx(ratio, rel=0.2)
+
+    def test_evidence_is_over_the_other_categories(self) -> None:
+        """The true one, which has no evidence over itself, is not among them."""
+        env = envs.BatchEnv(toys.Arms(), 32)
+        expert = policy.load(env.task)
+        recorder = certify.EvidenceRecorder(env, expert, Grid(env, expert, 9))
+        trials, _, theta = run_trials(env, recorder, 1, 0)
+        arms, obs, action = int(env.task.latents[0].high) + 1, trials.obs[:, 0, 0], trials.action[:, 0, 0].astype(float)
+        true, *others = (
+            expert.log_prob(obs, action, (theta[:, 0, :1] + i) % arms).reshape(len(obs)) for i in range(arms)
+        )
+        np.testing.assert_allclose(recorder.actions[0], true - np.mean(others, 0), atol=1e-6)
 
     def test_evidence_is_of_the_steps_that_took_place(self) -> None:
         """That of actions: the mean over them of what the expert's log-likelihood is above that under the grid."""

@@ -496,6 +496,20 @@ def test_check_command_says_a_fault_once(monkeypatch: pytest.MonkeyPatch, capsys
     assert done.value.code == 1
 
 
+def test_check_command_ends_with_the_quick_check(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """If that fails; others would say the same in their own ways."""
+    monkeypatch.setitem(envs.TASKS, "slippery_cartpole", NoReward)
+    monkeypatch.setattr("sys.argv", ["check", "--task", "slippery_cartpole"])
+    with pytest.raises(SystemExit) as done:
+        check.main()
+    failed, *rest = capsys.readouterr().out.splitlines()
+    assert failed.startswith("FAIL check_task: reward of slippery_cartpole gave [nan, nan]")
+    assert rest == [f"skip the other {len(CONTRACT)} checks until that is mended"]
+    assert done.value.code == 1
+
+
 @pytest.mark.slow
 def test_check_command_says_one_line() -> None:
     """Of a task that is not there, without a word of the interpreter's; and nothing is lost under `python -O`."""

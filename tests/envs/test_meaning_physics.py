@@ -34,6 +34,7 @@ def expected(name: str, policy_name: str) -> float:
     if certificate.is_file():
         return json.loads(certificate.read_text())[f"return_{policy_name}"]
     made = records.of_task(published.RECORDS, name)
+    assert made, f"{name} has neither certificate nor records; run `deconf certify --task {name}`, and put it in docs/"
     return float(np.mean([record["returns"] for record in made if record["method"] == policy_name]))
 
 

@@ -40,10 +40,16 @@ def faults() -> list[Fault]:
         return [Fault(**entry) for entry in tomllib.load(file)["fault"]]
 
 
+def check(fault: Fault, text: str) -> None:
+    """A fault's old text is there once in the text of its file."""
+    count, right = text.count(fault.old), "bring `old` and `new` in tests/faults/planted.toml in step with it"
+    assert count == 1, f"{fault.name}: {fault.old!r} occurs {count} times in {fault.file}; {right}"
+
+
 def plant(fault: Fault, tree: Path) -> str:
     """Put the fault into a file of the tree; returns the file's text without it."""
     text = (tree / fault.file).read_text(encoding="utf-8")
-    assert text.count(fault.old) == 1, f"{fault.name}: the old text occurs {text.count(fault.old)} times"
+    check(fault, text)
     (tree / fault.file).write_text(text.replace(fault.old, fault.new), encoding="utf-8")
     return text
 
