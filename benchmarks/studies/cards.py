@@ -61,7 +61,8 @@ def certificates(held: dict[str, Any]) -> str:
     """The table of certificates of docs/concepts.md."""
     rows, required = [], list[str]()
     for name, certificate in held.items():
-        measured = (f"{check['measured']:.2f}{'?' * (not check['sure'])}" for check in certificate["checks"].values())
+        checks = [(check["measured"], check.get("sure", True)) for check in certificate["checks"].values()]
+        measured = (f"{value:.2f}{'' if sure else '?'}" for value, sure in checks)
         rows.append((name, *measured, *nats(certificate), certificate["verdict"]))
         required = [f"{name} ({check['required']})" for name, check in certificate["checks"].items()]
     return markdown_table(("task", *required, "dynamics, nats a step", "actions, nats a step", "verdict"), rows)

@@ -41,7 +41,8 @@ def no_leak(task: Task) -> None:
     first = env.reset(seed=3, options={"theta": thetas[0]})[0]
     for theta in thetas:
         obs, info = env.reset(seed=3, options={"theta": theta})
-        same(obs, first, f"first observations of theta {theta} and {thetas[0]}, of the same seed,")
+        leaks = " ".join(name for name, x, y in zip(task.observation, obs, first, strict=True) if x != y)
+        same(obs, first, f"first observations of theta {theta} and {thetas[0]}, of the same seed, ({leaks})")
         require(info == {}, f"the info of reset was {info}; it must be empty")
     info = env.step(env.action_space.sample())[4]
     require(info == {}, f"the info of step was {info}; it must be empty")

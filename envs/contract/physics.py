@@ -89,6 +89,13 @@ def every_element_is_named(task: MujocoTask) -> None:
         require(not unnamed, f"of the {kind} of {task.name}, number {unnamed} of the MJCF must have a name")
 
 
+def _coordinate(task: MujocoTask, i: int) -> str:
+    """What the i-th number of qpos and qvel is."""
+    model, of = task.model, "position" if i < task.model.nq else "velocity"
+    joint = int(np.flatnonzero(model.jnt_qposadr <= i)[-1]) if i < model.nq else int(model.dof_jntid[i - model.nq])
+    return f"{of} of joint {model.joint(joint).name}"
+
+
 def noise_covers_every_coordinate_that_matters(task: MujocoTask) -> None:
     """Every coordinate has process noise; otherwise a single step could reveal theta, and no posterior would be exact.
 
@@ -102,7 +109,7 @@ def noise_covers_every_coordinate_that_matters(task: MujocoTask) -> None:
     for i in (i for i in quiet if (each[:, i] != each[0, i]).any()):
         moved = start.copy()
         moved[:, i] += 0.7
-        hint = f"theta moves a coordinate without process noise, number {i - 1} of qpos and qvel, that "
+        hint = f"theta moves a coordinate without process noise, {_coordinate(task, i - 1)}, that "
         require(np.array_equal(task.observe(moved), task.observe(start)), hint + "is observed")
         both = simulator.outcome(np.concatenate([start, moved]), np.tile(action, (2, 1)), np.zeros(2, int))[:, noisy]
         require(np.allclose(both[0], both[1], rtol=1e-7, atol=1e-9), hint + "changes what follows")
