@@ -90,7 +90,7 @@ deployment (after the comma, if not a draw at each step): a posterior over theta
 best method without theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the
 score of the fifth best method, each in its best deployment, if there are as many. What is *left* is the difference,
 over the seeds that both have. A task is *solved* where that is {NEAR:g} or less. A question mark says that its 95%
-interval, paired by seed, leaves that open. The ceiling is no bound: posterior sampling is not the best use of a belief.
+interval, paired by seed, leaves that *open*. The ceiling is no bound: posterior sampling is not the best use of a belief.
 Nor can it always be reached: exact policies read the state, of which observations may hide a part that tells of theta
 ([concepts](concepts.md#exact-policies)).
 
@@ -125,7 +125,7 @@ def _measured(found: index.Found, certified: dict[str, Any]) -> list[str]:
 def _solved(of: dict[str, Headroom]) -> str:
     solved = [one for one in of.values() if one.solved]
     unsure = sum(not one.sure for one in of.values())
-    note = f", and {unsure} of all are within the error of that" if unsure else ""
+    note = f"; of {unsure} that is open" if unsure else ""
     return f"{len(solved)} of {len(of)} tasks are solved ({len(solved) / len(of):.0%}{note})"
 
 
