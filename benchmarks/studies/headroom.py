@@ -90,9 +90,9 @@ deployment (after the comma, if not a draw at each step): a posterior over theta
 best method without theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the
 score of the fifth best method, each in its best deployment, if there are as many. What is *left* is the difference,
 over the seeds that both have. A task is *solved* where that is {NEAR:g} or less. A question mark says that its 95%
-interval, paired by seed, leaves that *open*. The ceiling is no bound: posterior sampling is not the best use of a belief.
-Nor can it always be reached: exact policies read the state, of which observations may hide a part that tells of theta
-([concepts](concepts.md#exact-policies)).
+interval, paired by seed, leaves that *open*. The ceiling is no bound: posterior sampling is not the best use of a
+belief. Nor can it always be reached: exact policies read the state, of which observations may hide a part that tells of
+theta ([concepts](concepts.md#exact-policies)).
 
 The rule of this suite: where {SHARE:.0%} of its tasks are solved in the last episode without queries, it no longer
 separates the best methods, and is to be made harder."""

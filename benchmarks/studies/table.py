@@ -70,6 +70,13 @@ def copied(job: "Job", preset: str, kept: "Sequence[Record]") -> "list[Record]":
     return []
 
 
+def _older(records: "Sequence[Record]", method: str, seeds: Sequence[int]) -> str:
+    """In brackets, of which older versions of the method there are records of these seeds."""
+    versions = {one["method_version"] for one in records if one["method"] == method and one["seed"] in seeds}
+    older = sorted(versions - {METHODS[method].version})
+    return f" (stale: of v{', v'.join(map(str, older))})" if older else ""
+
+
 def fitting(protocol: str, tasks: Sequence[envs.Task]) -> list[envs.Task]:
     """The tasks under a protocol; those that cannot be are left out, and a line says why."""
     fit = []
@@ -119,7 +126,8 @@ def main() -> None:
         for job, seeds in left.items():
             lacking.setdefault((job.task, job.method), []).extend(seeds)
         for (task_name, method), seeds_left in lacking.items():
-            print(f"{task_name}, {method}: seeds {' '.join(map(str, seeds_left))}")
+            older = _older(there[task_name], method, seeds_left)
+            print(f"{task_name}, {method}: seeds {' '.join(map(str, seeds_left))}{older}")
         print(f"{sum(map(len, lacking.values()))} seeds are missing or stale")
         return
     print(f"{sum(map(len, left.values()))} seeds to make, kept one by one: stop when you like")

@@ -626,10 +626,14 @@ def test_table_makes_what_is_missing(
     records.write(tmp_path / "records", [made[0], made[2], {**made[3], "method_version": 0}])
     left = [f"bandit, {method}: seeds {i}" for method, i in (("expert", 1), ("random", 1))]
     assert table("--list").splitlines()[:-1] == left
+    (tmp_path / "records" / "bandit.jsonl").unlink()
+    records.write(tmp_path / "records", [made[0], *({**one, "method_version": 0} for one in made[2:])])
+    left = ["bandit, expert: seeds 1", "bandit, random: seeds 0 1 (stale: of v0)"]
+    assert table("--list").splitlines()[:-1] == left
     other = METHODS["dagger"]
     config: Any = replace(other.on_bandit, learning_rate=7.0)  # type: ignore[type-var]
     monkeypatch.setattr(dagger.fit, "method", replace(other, on_bandit=config))
-    assert table().startswith("2 seeds to make")
+    assert table().startswith("3 seeds to make")
     assert table("--list") == "0 seeds are missing or stale\n"
 
 
