@@ -106,9 +106,9 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
             methods = [each for each in dict.fromkeys([*scores, *package]) if each not in REFERENCES]
             near = difflib.get_close_matches(name, methods, 1)
             hint = f"did you mean {near[0]}? " if near else ""
-            run = "" if hint else f"; `deconf run --task {next(iter(tasks))} --methods {name}` makes them"
+            made = f"; `deconf run --task {next(iter(tasks))} --methods {name}` makes them" * (name in METHODS)
             raise InputError(
-                f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(methods)}{run}"
+                f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(methods)}{made}"
             )
     return scores
 

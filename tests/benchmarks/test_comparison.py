@@ -420,8 +420,13 @@ class TestComparison:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]
         with pytest.raises(InputError, match="two records of mine on curling with seed 0"):
             comparison.gathered(twice, [])
-        with pytest.raises(InputError, match="--against nobody: no record is of it"):
+        with pytest.raises(InputError, match=r"--against nobody: no record is of it.*, rma$"):
             comparison.gathered(twice[:1], ["nobody"])
+        own = [record("mine", 0, 0.5) | {"task": "own_task"}, record("random", 0, 0.1) | {"task": "own_task"}]
+        own.append(record("expert", 0, 0.9) | {"task": "own_task"})
+        says = r"--against dagger: .* there are mine; `deconf run --task own_task --methods dagger` makes them$"
+        with pytest.raises(InputError, match=says):
+            comparison.gathered(own, ["dagger"])
         for wrong, near in (("naive_rn", "naive_rnn"), ("deconfounded_modes", "deconfounded_mode")):
             with pytest.raises(
                 InputError, match=f"--against {wrong}: .*; did you mean {near}. there are mine, .*, rma"
