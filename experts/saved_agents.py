@@ -18,6 +18,8 @@ from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.envs.support.files import as_json, check_folder, read_sealed, sealed, write_atomically
 from deconfounded.experts.agent import Agent
 
+OWN = "deconfounded."  # module names of this package's agents
+OLDER = "another version of this package saved it; train it anew, or use that one"
 ARRAYS = "agent.safetensors"
 CODE = "agent.py"  # source of an agent from outside, kept beside its arrays
 
@@ -152,6 +154,8 @@ def load(folder: Path | str) -> Agent:
     except InputError as error:
         if isinstance(error.__cause__, ModuleNotFoundError):
             raise InputError(f"{error}; modules that it imports must be importable, as by PYTHONPATH") from None
+        if about["class"].startswith(OWN):
+            raise InputError(f"{error}; {OLDER}") from None
         raise
     except Exception as error:
         raise InputError(f"the agent in {folder} is damaged ({error_line(error)}); run the benchmark again") from None
@@ -163,4 +167,5 @@ def load(folder: Path | str) -> Agent:
         raise
     except Exception as error:  # what was saved is whole, by its sha256
         what = f"from_state of {cls.__qualname__} fails on the agent in {folder}"
-        raise InputError(f"{what}: {error_line(error)}; it must undo what state() gives") from None
+        right = OLDER if about["class"].startswith(OWN) else "it must undo what state() gives"
+        raise InputError(f"{what}: {error_line(error)}; {right}") from None

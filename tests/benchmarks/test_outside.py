@@ -967,6 +967,23 @@ class TestSaved:
         with pytest.raises(envs.InputError, match="set its `side`"):
             agent.act(np.zeros((1, 6), np.float32))
 
+    def test_agents_of_another_version(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Whose parameters, or whose class, had other names: no mistake of the user's."""
+
+        def fails(*given: Any) -> Any:
+            raise RuntimeError("Missing key")
+
+        agent = fit(Context(envs.get("bandit"), tiny_preset(), [0]), "blind_bc")
+        assert isinstance(agent, LearnedAgent)
+        agent.save(tmp_path)
+        older = "another version of this package saved it; train it anew, or use that one"
+        monkeypatch.setattr(type(agent), "from_state", fails)
+        with pytest.raises(envs.InputError, match=rf"Missing key \(RuntimeError, .*\); {older}$"):
+            deconfounded.load(tmp_path)
+        monkeypatch.delattr(sys.modules[type(agent).__module__], type(agent).__name__)
+        with pytest.raises(envs.InputError, match=rf"has no '{type(agent).__name__}'; it has .*; {older}$"):
+            deconfounded.load(tmp_path)
+
     def test_without_metadata(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """A checkout on PYTHONPATH, that was never installed, keeps agents too."""
 
