@@ -38,6 +38,8 @@ def register(cls: type[Task]) -> type[Task]:
     _check_latents(task)
     before = TASKS.get(name, cls)
     if (before.__module__, before.__qualname__) != (cls.__module__, cls.__qualname__):  # not the same, defined again
+        if (where, cls.__qualname__) == (_where(before), before.__qualname__):
+            raise InputError(f"{where} is the file of {name}, which is registered; use that name")
         raise InputError(f"task name {name!r} of {where} is taken by {_where(before)}; give it another name")
     if "reference" not in vars(cls):
         ours = cls.__module__.startswith(f"{__package__}.")
@@ -113,7 +115,11 @@ def get(name: str) -> Task:
     cls.reference = reference
     if before:
         del TASKS[before.name]
-    return register(cls)()
+    try:
+        return register(cls)()
+    except InputError:
+        TASKS.update({before.name: before} if before else {})
+        raise
 
 
 def make(name: str, privileged: bool = False, render_mode: str | None = None, episodes: int = 1) -> GymEnv:

@@ -48,6 +48,19 @@ def test_a_world_is_that_of_the_file_as_it_is_now(tmp_path: Path) -> None:
     assert horizons == [6, 9, 9]
 
 
+def test_a_file_that_no_longer_works(tmp_path: Path) -> None:
+    """The task that it held keeps its name until the file is mended."""
+    file = tmp_path / "mine.py"
+    file.write_text(TASK.format(name="Mine", horizon=6))
+    before = type(envs.get(f"{file}:Mine"))
+    file.write_text(TASK.format(name="Mine", horizon=7) + "    latents = ()\n")
+    with pytest.raises(envs.InputError, match="latents of own_push were"):
+        envs.get(f"{file}:Mine")
+    assert type(envs.get("own_push")) is before
+    file.write_text(TASK.format(name="Mine", horizon=8))
+    assert envs.get(f"{file}:Mine").horizon == envs.get("own_push").horizon == 8
+
+
 def test_two_tasks_of_one_file_and_name_stay_refused(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text("\n".join(TASK.format(name=name, horizon=6) for name in ("Mine", "Other")))
     envs.get(f"{tmp_path}/mine.py:Mine")
@@ -93,3 +106,10 @@ def test_a_discrete_world_has_its_own_expert() -> None:
     world = Path(__file__).parents[2] / "docs" / "worlds" / "reversed_cart.py"
     with pytest.raises(envs.InputError, match=r"that of reversed_cart is the world's own `expert`, as actions are dis"):
         policy.load(envs.get(f"{world}:ReversedCart"), "mine.py:control")
+
+
+def test_a_registered_task_by_its_file() -> None:
+    """Of this package: it has a name."""
+    file = Path(envs.tasks.curling.__file__).resolve()
+    with pytest.raises(envs.InputError, match=rf"{file} is the file of curling, which is registered; use that name$"):
+        envs.get(f"{file}:Curling")
