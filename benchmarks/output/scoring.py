@@ -219,7 +219,7 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
 
 INTERVALS = (
     "Intervals: percentile bootstrap over seeds. In brackets: how often an interval of that many seeds contains the"
-    " true mean, if scores are normally distributed, and 0 and 1 exact."
+    " true mean, if scores are normally distributed and the returns that have score 0 and 1 are known exactly."
 )
 DROPPED = (
     *("data, a seed", "theta R2 of each episode", "CPU s, a seed", "Eq. (1)", "return", "tier"),

@@ -54,7 +54,9 @@ def _outdated(rows: list[dict[str, Any]]) -> str:
     old = [row["case"] for row in judged if row.get("diagnosis") != VERSION]
     if not old:
         return ""
-    return f" Verdicts of an earlier version of the diagnosis: {'all' if len(old) == len(judged) else ', '.join(old)}."
+    versions = ", ".join(map(str, sorted({row.get("diagnosis", 0) for row in judged} - {VERSION})))
+    which = "all" if len(old) == len(judged) else ", ".join(old)
+    return f" Verdicts of earlier versions of the diagnosis ({versions}; today's is {VERSION}): {which}."
 
 
 def validated() -> str:
@@ -81,7 +83,8 @@ def right() -> str:
         judged = [is_right for is_right, unseen in cases if unseen]
         shares = f"{sum(is_right for is_right, _ in cases)} of {len(cases)} {what}"
         parts.append(f"{shares} ({sum(judged)} of the {len(judged)} by which no threshold was set)")
-    return f"Verdicts are right in {' and in '.join(parts)}: [how often the diagnosis is right](diagnose_accuracy.md)."
+    where = "[how often the diagnosis is right](diagnose_accuracy.md), and by which of its versions"
+    return f"Verdicts are right in {' and in '.join(parts)}: {where}."
 
 
 def noises() -> str:

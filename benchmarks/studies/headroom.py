@@ -17,7 +17,7 @@ from deconfounded.benchmarks.studies.results import outdated
 from deconfounded.envs.streams import Array
 
 EXACT = "interventional"
-REACHED = """**That is so now.** To compare strong methods, use `--protocol scarce`, or those of the
+REACHED = """**That is so now.** To compare strong methods, use `--protocol unseen` or `scarce`, or those of the
 [hard tasks](hard.md) that are still hard."""
 SHARE = 0.5  # of the tasks, solved in the last episode without queries: then the suite is to be made harder
 BEST = 5  # methods, whose spread is shown

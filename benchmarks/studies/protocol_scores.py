@@ -29,11 +29,11 @@ def page(standard: index.Found, by_protocol: Mapping[str, index.Found]) -> str:
 A protocol changes the amounts of data, the trial, or the thetas of a task, alike for all methods (`--protocol`). Made
 by `deconf publish` from the [records](records) alone. Scores: 0 = random actions, 1 = the expert that sees theta; five
 seeds, with intervals of a percentile bootstrap over seeds, which contain the true mean in {held:.0%} of cases, if
-scores are normally distributed, and 0 and 1 exact. A method's tier is in brackets. `deconfounded_mode` is
-`deconfounded`, acting on the likeliest latent. Interquartile means are over the tasks where all agents of the table
-have records under both protocols (the hard ones among them, other than in README), and over the seeds that both have.
-The standard protocol's is empty where its records are of another version of the method. The last row has the versions.
-[Headroom](headroom.md) says what is left to gain under each."""
+scores are normally distributed and the returns that have score 0 and 1 are known exactly. A method's tier is in
+brackets. `deconfounded_mode` is `deconfounded`, acting on the likeliest latent. Interquartile means are over the tasks
+where all agents of the table have records under both protocols (hard tasks too, if all have them there, other than in
+README), and over the seeds that both have. The cell of the standard protocol is empty for a method whose records there
+are of another version. The last row has the versions. [Headroom](headroom.md) says what is left to gain under each."""
     over = {name: dict(by_end) for name, by_end in points(standard, by_protocol)}
     pictures = ["![interquartile means under each protocol](protocols.png)"] * bool(over)
     parts = [_part(name, by_protocol.get(name, ()), over.get(name, {})) for name in PROTOCOLS if name != STANDARD]

@@ -52,7 +52,9 @@ def predictions(points: list[Point]) -> str:
         ahead = [np.mean(scores["deconfounded"]) - np.mean(scores["naive_rnn"]) for scores in of]
         ends = " to ".join(two_decimals(end(ahead)) for end in (min, max)) if ahead else "(none)"
         parts.append(f"where it is {verdict}, on {len(ahead)}, by {ends}")
-    return f"The certificate predicts this. `deconfounded` is ahead of `naive_rnn` {'; '.join(parts)}."
+    return (
+        f"The certificate predicts where a clone is deluded. `deconfounded` is ahead of `naive_rnn` {'; '.join(parts)}."
+    )
 
 
 def table(points: list[Point]) -> str:
