@@ -361,7 +361,7 @@ class UnnamedGeom(SlipperyCartpole):
         (
             QuietPole,
             "noise_covers_every_coordinate_that_matters",
-            r"theta moves a coordinate without process noise, \w+ of joint \w+, that",
+            "theta moves a coordinate without process noise, velocity of joint hinge, that",
         ),
         (NarrowBounds, "bounds_are_wide_enough", "observation velocity of slippery_cartpole was"),
         (FixedTheta, "keep_theta", "a reset without keep_theta drew the theta of the trial before"),
