@@ -1,5 +1,6 @@
 """Scores against the amount of exploration: what is run, and what is shown of it."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -118,3 +119,17 @@ def test_picture(count: int, points: list[dict[str, Any]], tmp_path: Path) -> No
     """Of the first point alone, too, and of tasks with more and with fewer amounts."""
     exploration.picture(points[:count], tmp_path / "exploration.png")
     assert (tmp_path / "exploration.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.slow
+def test_all_trials_are_of_the_records() -> None:
+    """In docs/exploration.json, where records are of today's version of the method: the same scores."""
+    compared, points = 0, json.loads((exploration.DOCS / "exploration.json").read_text())
+    for whole in (each for each in points if each["share"] == 1):
+        task, method = envs.get(whole["task"]), whole["method"]
+        made = exploration.recorded(task, preset("default", task, "cpu", [method]), method, len(whole["last"]))
+        if made:
+            today = exploration.measured(made, method, 1)
+            assert [today[end] for end in exploration.ENDS] == [whole[end] for end in exploration.ENDS], task.name
+            compared += 1
+    assert compared > 15
