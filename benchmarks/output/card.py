@@ -46,7 +46,7 @@ def _scores(record: records.Record, every: Sequence[records.Record]) -> tuple[fl
     rows += [f"| score | {' | '.join(map(scoring.two_decimals, score))} |"]
     ends = " to ".join(scoring.two_decimals(score[-1] + side * NORMAL_95 * error[-1]) for side in (-1, 1))
     of_seed = f"This agent, in the last episode: {scoring.two_decimals(score[-1])}, 95% interval {ends}"
-    text = f"{of_seed} (normal, over {record['eval_trials']} trials with fresh thetas)."
+    text = f"{of_seed} (normal, over {record['eval_trials']} trials with fresh thetas; 0 and 1 are taken to be exact)."
     name = records.named(record)
     seeds = [each["returns"][episodes - 1] for each in every if records.named(each) == name]
     if (interval := scoring.bootstrap(scoring.normalise(np.array(seeds), zero, one))) is not None:
