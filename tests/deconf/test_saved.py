@@ -1,0 +1,50 @@
+"""Agents that were saved before can be loaded: their classes and arrays have the names that they had."""
+
+import hashlib
+
+import pytest
+
+from deconfounded import envs
+from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.provider import fit
+from deconfounded.deconf.core.agents import LearnedAgent
+from tests.tools import tiny_preset
+
+SAVED: dict[str, tuple[str, str]] = {
+    "deconfounded": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
+    "deconfounded_gru": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "1ae427793226"),
+    "deconfounded_discrete": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "67edd957d851"),
+    "deconfounded_forgetting": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3e2082a00457"),
+    "deconfounded_large": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
+    "deconfounded_offline": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
+    "deconfounded_mean": ("deconfounded.deconf.methods.deconfounded_mean:MeanAgent", "1ae427793226"),
+    "dagger": ("deconfounded.deconf.methods.dagger:DaggerAgent", "559d9a5659b2"),
+    "dpt": ("deconfounded.deconf.methods.dpt:DptAgent", "322145c9999b"),
+    "gail": ("deconfounded.deconf.methods.gail:GailAgent", "5b65796938e3"),
+    "rma": ("deconfounded.deconf.methods.rma:RmaAgent", "0c7ed29b2342"),
+    "naive_transformer": ("deconfounded.deconf.methods.naive_transformer:TransformerAgent", "fafa7d615bbb"),
+    "naive_obs": ("deconfounded.deconf.methods.naive_obs:ObsAgent", "a517fdfd8ff1"),
+    "naive_dropout": ("deconfounded.deconf.methods.naive_dropout:ActionDropoutAgent", "a517fdfd8ff1"),
+    "palr": ("deconfounded.deconf.methods.palr:PalrAgent", "a517fdfd8ff1"),
+    "dml_il": ("deconfounded.deconf.methods.dml_il:DmlAgent", "b206ec64f6fa"),
+    "dadp": ("deconfounded.deconf.methods.dadp:DadpAgent", "de8755d515ec"),
+    "flow_bc": ("deconfounded.deconf.methods.flow_bc:FlowAgent", "1c2cabeed89b"),
+    "naive_rnn": ("deconfounded.deconf.methods.sequence_bc:RecurrentAgent", "a517fdfd8ff1"),
+    "oracle_bc": ("deconfounded.deconf.methods.memoryless_bc:MemorylessAgent", "b84baa7f289c"),
+    "blind_bc": ("deconfounded.deconf.methods.memoryless_bc:MemorylessAgent", "b84baa7f289c"),
+}
+"""By method: the agent's class, and a hash of the names of its arrays and of what its shape states."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [name for name, declared in METHODS.items() if declared.learned])
+def test_names_are_those_of_agents_that_were_saved(method: str) -> None:
+    """Or nobody can load these; version 6 of `deconfounded` was such a change, and the changelog says so."""
+    agent = fit(Context(envs.get("curling"), tiny_preset(), [0]), method)
+    assert isinstance(agent, LearnedAgent)
+    settings, arrays = agent.state()
+    names = " ".join([*sorted(arrays), *sorted(settings), *sorted(settings["shape"])])
+    today = f"{type(agent).__module__}:{type(agent).__qualname__}", hashlib.sha256(names.encode()).hexdigest()[:12]
+    remedy = "undo that; or, if it is meant, say so in CHANGELOG, and put here what it is now"
+    assert SAVED.get(method) == today, f"agents of {method} that were saved before cannot be loaded: {remedy}"
