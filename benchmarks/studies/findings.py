@@ -54,7 +54,8 @@ def _outdated(rows: list[dict[str, Any]]) -> str:
     old = [row["case"] for row in judged if row.get("diagnosis") != VERSION]
     if not old:
         return ""
-    versions = ", ".join(map(str, sorted({row.get("diagnosis", 0) for row in judged} - {VERSION})))
+    numbers = sorted({row.get("diagnosis", 0) for row in judged} - {VERSION})
+    versions = ", ".join(str(number) if number else "unknown" for number in numbers)
     which = "all" if len(old) == len(judged) else ", ".join(old)
     return f" Verdicts of earlier versions of the diagnosis ({versions}; today's is {VERSION}): {which}."
 

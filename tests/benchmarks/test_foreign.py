@@ -140,7 +140,7 @@ def test_verdicts_of_earlier_versions_of_the_diagnosis_are_named() -> None:
     """Those that name no version too; what was not diagnosed has no verdict."""
     old = [{"case": "old", "verdict": "", "diagnosis": VERSION - 1}, {"case": "first", "verdict": ""}, {"case": "none"}]
     new = {"case": "new", "verdict": "", "diagnosis": VERSION}
-    said = " Verdicts of an earlier version of the diagnosis: "
+    said = f" Verdicts of earlier versions of the diagnosis (unknown, {VERSION - 1}; today's is {VERSION}): "
     assert findings._outdated([new, *old]) == f"{said}old, first."
     assert findings._outdated(old) == f"{said}all."
     assert findings._outdated([new, old[-1]]) == ""

@@ -50,9 +50,10 @@ def test_a_certificate_s_exit_code(
 ) -> None:
     """It is of as many trials as were asked for, and says how well theta is known in the last episode."""
     asked: list[Any] = []
+    check = {"measured": 0.9, "required": "<= 0.7", "passed": verdict == "passed", "error": 0.12, "sure": code == 0}
     result = {
         **{"task": "bandit", "verdict": verdict, "inferability": [{"arm": 0.2}, {"arm": 0.9}]},
-        **{"checks": {"blind_bc": {"measured": 0.9, "required": "<= 0.7", "passed": verdict == "passed"}}},
+        **{"checks": {"blind_bc": check}},
         **{"evidence_nats_per_step": {"dynamics": 1.0, "actions": 1.0}},
     }
     monkeypatch.setattr(certify, "certify", lambda *given, **_: (asked.extend(given[2:]), result)[1])
@@ -67,6 +68,8 @@ def test_a_certificate_s_exit_code(
     assert asked == [7]
     said = capsys.readouterr().out
     assert f"certificate {verdict}" in said
+    assert "blind_bc: 0.900 +- 0.120 (required <= 0.7)" in said
+    assert (": within two standard errors; --trials says more\n" in said) == (code == 1)
     assert "theta from expert trials (R2, or the share that is right): arm 0.90\n" in said
 
 
