@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from deconfounded.deconf.core.adam import Adam
-from deconfounded.deconf.core.agents import LearnedAgent
+from deconfounded.deconf.core.agents import Checkpoint, LearnedAgent
 from deconfounded.deconf.core.beliefs import EvidenceBelief
 from deconfounded.deconf.core.data import (
     Batch,
@@ -151,7 +151,11 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
     updates = by_round(config.updates, config.rounds)
     optimizer, done = Adam([agent.memory, agent.policy], config.learning_rate, sum(updates)), 0
     agent.memory.whiten.updates_left = sum(updates) // 2  # moments change with each round's roll-outs
-    for i in range(config.rounds):
+    checkpoint, begin = Checkpoint(monitor, rngs, **agent.parts(), optimizer=optimizer, draws=draws), 0
+    if before := checkpoint.load():
+        begin, data, label = before["round"], Batch(*before["data"]), before["label"]
+        done = sum(updates[:begin])
+    for i in range(begin, config.rounds):
         if i > 0:
             _, more, new = labelled(query, agent, *asked)
             data, label = data.joined(more), joined_trials(label, new)
@@ -163,6 +167,7 @@ def train(query: Query, config: DaggerConfig, rng: Rngs, monitor: Monitor | None
             optimizer.step(loss + agent.memory.innovation_loss(own.steps(own.draw_steps(config.steps, draws))))
             done += 1
             monitor.update(done, sum(updates), {"imitation": loss.mean().item()}, agent)
+        checkpoint.save(round=i + 1, data=data.tensors, label=label)
     return agent
 
 
