@@ -84,19 +84,19 @@ class EvidenceRecorder(ExpertAgent):
         self._state, self._theta = self.env.state, self.env.theta.copy()
         return super().act(obs)
 
-    def _others(self) -> Callable[[Array], Array]:
-        """The mean of values [N, K] over the thetas of the grid that are not the true one, [N]."""
-        other = (self.grid.theta != self._theta[:, None]).any(-1)  # a category is in the grid itself
-        return lambda values: np.where(other, values, 0).sum(-1) / other.sum(-1)
+    def _wrong(self, values: Array) -> Array:
+        """The mean of values [N, K] over the thetas of the grid that are wrong, [N]."""
+        wrong = (self.grid.theta != self._theta[:, None]).any(-1)  # a category is in the grid itself
+        return np.where(wrong, values, 0).sum(-1) / wrong.sum(-1)
 
     def observe(
         self, obs: NDArray[np.float32], action: Array, next_obs: NDArray[np.float32], alive: NDArray[np.bool_]
     ) -> None:
         log_dynamics = self.grid.log_dynamics(self._state, action, self.env.state)
         true = self.grid.log_true(self._state, action, self.env.state, self._theta)
-        acted, others = self.expert.log_prob(obs, action, self._theta), self._others()
-        self.dynamics.append(others(true[:, None] - log_dynamics)[alive])
-        self.actions.append(others(acted[:, None] - self.grid.log_policy(obs, action))[alive])
+        self.dynamics.append(self._wrong(true[:, None] - log_dynamics)[alive])
+        acted = self.expert.log_prob(obs, action, self._theta)
+        self.actions.append(self._wrong(acted[:, None] - self.grid.log_policy(obs, action))[alive])
         if self.particles:
             self.particles.learn(self._state, obs, action, self.env.state, alive)
         updated = self.grid.updated(self.log_belief, self._state, obs, log_dynamics)

@@ -123,8 +123,8 @@ def _measured(found: index.Found, certified: dict[str, Any]) -> list[str]:
 
 
 def _solved(of: dict[str, Headroom]) -> str:
-    solved = [one for one in of.values() if one.solved]
-    unsure = sum(not one.sure for one in of.values())
+    solved = [task for task in of.values() if task.solved]
+    unsure = sum(not task.sure for task in of.values())
     note = f"; of {unsure} that is open" if unsure else ""
     return f"{len(solved)} of {len(of)} tasks are solved ({len(solved) / len(of):.0%}{note})"
 

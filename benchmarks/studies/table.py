@@ -72,7 +72,8 @@ def copied(job: "Job", preset: str, kept: "Sequence[Record]") -> "list[Record]":
 
 def _older(records: "Sequence[Record]", method: str, seeds: Sequence[int]) -> str:
     """In brackets, of which older versions of the method there are records of these seeds."""
-    versions = {one["method_version"] for one in records if one["method"] == method and one["seed"] in seeds}
+    own = [record for record in records if record["method"] == method and record["seed"] in seeds]
+    versions = {record["method_version"] for record in own}
     older = sorted(versions - {METHODS[method].version})
     return f" (stale: of v{', v'.join(map(str, older))})" if older else ""
 
