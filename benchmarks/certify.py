@@ -217,9 +217,9 @@ def certify(
     means = {name: x.mean(0) for name, x in policies.items()}
     curves = {name: {"return": x.tolist(), "score": normalise(x, zero, one).tolist()} for name, x in means.items()}
     scored = {"blind_bc": blind.mean(1)} | {f"{name}_last": policies[name][:, -1] for name in EXACT}
+    references = random.mean(1), best.mean(1)
     measured = {
-        name: (float(normalise(x.mean(), zero, one)), standard_error(x, random.mean(1), best.mean(1)))
-        for name, x in scored.items()
+        name: (float(normalise(x.mean(), zero, one)), standard_error(x, *references)) for name, x in scored.items()
     }
     measured["wrong_theta"] = staked.wrong, staked.error
     checks = {}

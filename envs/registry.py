@@ -118,7 +118,8 @@ def get(name: str) -> Task:
     try:
         return register(cls)()
     except InputError:
-        TASKS.update({before.name: before} if before else {})
+        if before:
+            TASKS[before.name] = before
         raise
 
 

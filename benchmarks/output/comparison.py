@@ -164,17 +164,12 @@ def over_tasks(scores: Scores, methods: Sequence[str], against: Sequence[str]) -
             mean[measure] = average
             for other in against if name in methods else ():
                 theirs = {task: at(scores, other, task, measure) for task in own if task in scores[other]}
-                pairs = {task: sorted(set(own[task]) & set(of)) for task, of in theirs.items()}
-                pairs = {task: seeds for task, seeds in pairs.items() if seeds}
-                if other == name or not pairs:
+                first, second = statistics.matched(own, theirs)
+                if other == name or not first:
                     continue
-                differences = {
-                    task: np.array([own[task][seed] - theirs[task][seed] for seed in seeds])
-                    for task, seeds in pairs.items()
-                }
-                minus[measure][other] = statistics.mean_difference(differences)
+                minus[measure][other] = statistics.mean_difference({task: first[task] - second[task] for task in first})
                 if measure == "last":
-                    improvement = statistics.over_tasks(statistics.improvement, *statistics.matched(own, theirs))
+                    improvement = statistics.over_tasks(statistics.improvement, first, second)
                     assert improvement is not None
                     better[other] = improvement
         made.append(Row(name, "", len(scores[name]), mean, minus, better))

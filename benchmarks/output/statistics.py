@@ -31,8 +31,8 @@ class Figure:
 
 def paired(one: Mapping[int, float], other: Mapping[int, float]) -> Figure | None:
     """Mean of one less the other over the seeds that both have, with Student's interval; None if they share none."""
-    seeds = sorted(set(one) & set(other))
-    return mean_difference({"": np.array([one[seed] - other[seed] for seed in seeds])}) if seeds else None
+    first, second = matched({"": one}, {"": other})
+    return mean_difference({"": first[""] - second[""]}) if first else None
 
 
 def mean_difference(differences: Mapping[str, Array]) -> Figure:

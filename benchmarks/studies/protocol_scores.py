@@ -4,8 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from deconfounded.benchmarks.engine import protocols, published
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD
@@ -15,7 +13,6 @@ from deconfounded.benchmarks.output.scoring import coverage, two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.headroom import ENDS
 from deconfounded.benchmarks.studies.results import of_versions, with_interval
-from deconfounded.envs.streams import Array
 
 SHOWN = (COMPARED[0], "deconfounded_mode", *COMPARED[1:])  # agents in the tables
 INTERVALS = {"first": "ci95_first", "last": "ci95"}  # of an entry of results.json, by episode
@@ -106,21 +103,15 @@ def means(protocol: str, end: str, standard: index.Found, found: index.Found) ->
     versions, before = (_versions([made[name] for name in names]) for made in (here, there))
     rows = []
     for agent, now, was in zip(SHOWN, versions, before, strict=True):
-        pairs = {name: _shared(under[name][agent], plain[name][agent]) for name in names}
-        figure = statistics.over_tasks(statistics.iqm, {name: scores for name, (scores, _) in pairs.items()})
+        runs, usual = statistics.matched(*({name: made[name][agent] for name in names} for made in (under, plain)))
+        figure = statistics.over_tasks(statistics.iqm, runs)
         if figure is None:
             return []
-        beside = statistics.iqm([scores for _, scores in pairs.values()])
+        beside = statistics.iqm([*usual.values()])
         value, standing = (round(float(mean), 4) for mean in (figure.value, beside))  # the same on all machines
         low, high = (round(end.item(), 4) for end in figure.interval or (figure.value, figure.value))
         rows.append(Mean(agent, len(names), value, (low, high), standing if was == now else None))
     return rows
-
-
-def _shared(one: Mapping[int, float], other: Mapping[int, float]) -> tuple[Array, Array]:
-    """Scores by seed -> those of the seeds that both have, seed by seed."""
-    seeds = sorted({*one} & {*other})
-    return np.array([one[seed] for seed in seeds]), np.array([other[seed] for seed in seeds])
 
 
 def _versions(found: index.Found) -> list[str]:

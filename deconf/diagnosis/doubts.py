@@ -3,7 +3,6 @@
 Signs that exploration was not blind, that it was under one condition alone, and that trials differ in another way.
 """
 
-import statistics
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,8 +15,10 @@ from deconfounded.deconf.diagnosis.fits import (
     Steps,
     by_trial,
     clipped,
+    deviations,
     fitted,
     halves,
+    in_both,
     one_hot,
     random_features,
     sample,
@@ -25,7 +26,6 @@ from deconfounded.deconf.diagnosis.fits import (
 )
 from deconfounded.experts.trials import Trials
 
-CHANCE = 0.001  # probability that there is a doubt where nothing is odd, each
 LARGE = 0.5  # of what a fit leaves of a step, by which trials move differently
 
 
@@ -64,14 +64,13 @@ def _alike(one: Array, other: Array, tests: int) -> float:
     if len(one) < 16 or not np.ptp(one) or not np.ptp(other):
         return 0.0
     alike = float(np.corrcoef(rankdata(one), rankdata(other))[0, 1])
-    chance = statistics.NormalDist().inv_cdf(1 - CHANCE / tests) / float(len(one)) ** 0.5
-    return alike if alike > chance else 0.0
+    return alike if alike > deviations(tests) / float(len(one)) ** 0.5 else 0.0
 
 
 def _means(columns: Array, steps: Steps, half: Numbers, count: int) -> Iterator[tuple[Array, Array]]:
     """Of each column [N, C], the means of both halves of the trials that have three steps in each."""
     group = 2 * steps.trial + half
-    both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
+    both = in_both(group, count)
     for column in columns.T:
         first, second = by_trial(column, group, 2 * count).reshape(count, 2)[both].T
         yield first, second

@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from deconfounded.experts.trials import Trials
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 FEW = 6  # columns, up to which their products are features too
 ENOUGH = 8  # steps of a trial for each feature of a fit of its own
 MENDED = 4.0  # excess kurtosis
@@ -19,6 +21,7 @@ HIDDEN, FITTED, RIDGE = 128, 20_000, 1e-4  # random features; steps, at most; of
 FINE = 512  # features for dynamics: of 128 an acrobot's trials, with nothing hidden, left what looked like it
 CLIP = 4.0  # usual deviations
 ALIKE, APART = 24, 10  # trials in which alike observations are looked for; rows by which these are apart
+CHANCE = 0.001  # probability that trials that are alike are said to differ, or that there is a doubt, each
 LONGEST = 1500  # rows of a trial that are looked at for that
 MOST, FEWEST = 50_000, 32  # steps of a look's fits; trials: fits of what differs between trials take 16
 
@@ -65,6 +68,16 @@ def halves(trials: Trials, steps: Steps) -> Numbers:
     taken = np.arange(len(step)) - np.searchsorted(steps.trial, steps.trial)  # steps of the trial before this one
     halfway = taken >= trials.mask.sum((1, 2))[steps.trial] / 2
     return np.where(took_place.sum(1)[steps.trial] > 1, number % 2, halfway).astype(int)
+
+
+def in_both(group: Numbers, count: int) -> Mask:
+    """Which of so many trials have three steps in each half; group: of each step, twice its trial, and the half."""
+    return np.bincount(group, minlength=2 * count).reshape(count, 2).min(1) > 2
+
+
+def deviations(tests: int) -> float:
+    """By how many standard deviations the largest of so many normal numbers is off with probability CHANCE."""
+    return NormalDist().inv_cdf(1 - CHANCE / tests)
 
 
 def kurtosis(x: Array) -> float:

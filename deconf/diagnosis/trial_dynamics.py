@@ -1,7 +1,5 @@
 """Whether trials differ in their dynamics: what a fit of all trials leaves of the motion, in halves of each trial."""
 
-import statistics
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,15 +13,16 @@ from deconfounded.deconf.diagnosis.fits import (
     Steps,
     by_trial,
     clipped,
+    deviations,
     fitted,
     halves,
+    in_both,
     one_hot,
     random_features,
     usual_size,
 )
 from deconfounded.experts.trials import Trials
 
-CHANCE = 0.001  # probability that trials that are alike are said to differ
 RATIOS, LASTING = (0.0, 0.01, 0.1, 1.0, 10.0), (0.0, 0.3, 0.6, 0.9)  # of variances; correlations from step to step
 
 
@@ -49,12 +48,12 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
     kept = np.flatnonzero(np.isfinite(unit))
     _, episode, step = np.nonzero(trials.mask)
     group = 2 * steps.trial + halves(trials, steps)
-    both = (np.bincount(group, minlength=2 * count).reshape(count, 2) > 2).all(1)
+    both = in_both(group, count)
     if not len(kept) or both.sum() < 16:
         return None
     tests = len(kept) * (1 + inputs.shape[1])
-    deviations = statistics.NormalDist().inv_cdf(1 - CHANCE / tests)
-    chance, rest = deviations / float(both.sum()) ** 0.5, (left[:, kept] / unit[kept]).clip(-CLIP, CLIP)
+    limit = deviations(tests)
+    chance, rest = limit / float(both.sum()) ** 0.5, (left[:, kept] / unit[kept]).clip(-CLIP, CLIP)
 
     def alike(columns: Numbers, rest: Array, slopes: Array) -> tuple[float, int]:
         best = (0.0, 0)
@@ -74,7 +73,7 @@ def own_dynamics(trials: Trials, steps: Steps, least: float = 1.0) -> tuple[floa
         succeeds = (np.diff(steps.trial) == 0) & (np.diff(episode) == 0) & (np.diff(step) == 1)
         follows = np.concatenate([[False], succeeds])
         rest, likelier = trial_means(basis, rest, steps.trial, follows)
-        own = likelier > deviations**2 / 2
+        own = likelier > limit**2 / 2
         best = alike(kept[own], rest[:, own], constant)
     return best if best[0] or chance <= least else None
 

@@ -161,17 +161,17 @@ class TestStatistics:
 
     def test_seeds_of_several_methods_are_drawn_together(self) -> None:
         """What is the same of both cancels."""
-        one = {task: np.random.default_rng(i).standard_normal(4) for i, task in enumerate("ab")}
-        other = {task: x - 0.5 for task, x in one.items()}
-        figure = statistics.over_tasks(lambda x, y: statistics.iqm(x) - statistics.iqm(y), one, other)
+        ours = {task: np.random.default_rng(i).standard_normal(4) for i, task in enumerate("ab")}
+        theirs = {task: x - 0.5 for task, x in ours.items()}
+        figure = statistics.over_tasks(lambda x, y: statistics.iqm(x) - statistics.iqm(y), ours, theirs)
         assert figure is not None
         assert figure.interval == pytest.approx((0.5, 0.5))
 
     def test_matched(self) -> None:
         """Seeds that all have, in one order; tasks without are left out."""
-        one = {"a": {3: 0.3, 1: 0.1, 2: 0.2}, "b": {0: 0.5}, "c": {0: 0.7}}
-        other = {"a": {1: 1.1, 3: 1.3, 4: 1.4}, "b": {1: 1.5}, "d": {0: 1.7}}
-        runs = [{task: x.tolist() for task, x in of.items()} for of in statistics.matched(one, other)]
+        ours = {"a": {3: 0.3, 1: 0.1, 2: 0.2}, "b": {0: 0.5}, "c": {0: 0.7}}
+        theirs = {"a": {1: 1.1, 3: 1.3, 4: 1.4}, "b": {1: 1.5}, "d": {0: 1.7}}
+        runs = [{task: x.tolist() for task, x in of.items()} for of in statistics.matched(ours, theirs)]
         assert runs == [{"a": [0.1, 0.3]}, {"a": [1.1, 1.3]}]
 
     def test_iqm(self) -> None:

@@ -9,7 +9,7 @@ import torch
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import LabelScaler, Scaler
-from deconfounded.deconf.diagnosis import judgement, latent, measures, trial_dynamics
+from deconfounded.deconf.diagnosis import fits, judgement, latent, measures, trial_dynamics
 from deconfounded.deconf.diagnosis.fits import Steps
 from deconfounded.deconf.diagnosis.measures import Amounts
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
@@ -192,7 +192,7 @@ class TestHalves:
         In fewer than three of twelve, with probability .98.
         """
         monkeypatch.setattr(trial_dynamics, "FINE", 4)
-        monkeypatch.setattr(trial_dynamics, "CHANCE", 0.05)
+        monkeypatch.setattr(fits, "CHANCE", 0.05)
         said = 0
         for seed in range(12):
             rng = np.random.default_rng(seed)
