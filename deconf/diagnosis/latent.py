@@ -32,6 +32,7 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials
 
 REFERENCE = 256  # observations at which a policy's actions are compared
+OTHERS = 16  # trials at most, with whose latents that of a trial is compared: of two values, half of them have the same
 MIN_COVERAGE = 0.02  # share of exploration's steps that are in the range of the dynamics
 
 LogProb = Callable[[Batch, Tensor], Tensor]
@@ -43,7 +44,7 @@ class Explanation(NamedTuple):
 
     Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
-    much to overfit, each at its best. action_evidence: the former less that given another trial's latent;
+    much to overfit, each at its best. action_evidence: the former less that given other trials' latents;
     exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
     shared: see `shared_with`.
     """
@@ -199,12 +200,15 @@ def _refitted(model: LatentModel, data: Batch, draws: Draws) -> DynamicsHead:
 
 @torch.no_grad()
 def _evidence(log_prob: LogProb, data: Batch, latents: Tensor, per_theta: int) -> float:
-    """Log-likelihood of steps given the latent [1, B, D] of their trial, less that given the latent of another trial.
+    """Log-likelihood of steps given the latent [1, B, D] of their trial, less its mean given latents of other trials.
 
-    Nats a step. The other trial is `per_theta` before.
+    Nats a step. Trials `per_theta` apart, or more, are under thetas of their own.
     """
-    own, other = (log_prob(data, each_step(data, x)) for x in (latents, latents.roll(per_theta, 1)))
-    return typical(own - other, data)
+    n = latents.shape[1]
+    shifts = range(per_theta, max(n - per_theta, per_theta) + 1, per_theta)
+    shifts = shifts[:: -(-len(shifts) // OTHERS)]
+    own, *others = (log_prob(data, each_step(data, latents.roll(shift, 1))) for shift in (0, *shifts))
+    return typical(own - torch.stack(others).mean(0), data)
 
 
 def _log_action(model: LatentModel, policy: ActionHead) -> LogProb:

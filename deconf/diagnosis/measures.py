@@ -83,7 +83,7 @@ class Findings(NamedTuple):
     memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone, each
     at its best (`held_out.Best`).
     latent_gain: that by the latent inferred from the dynamics, over latents of other trials, each at its best, too.
-    Evidence is the log-likelihood given a trial's own latent less that given another trial's. exploration_evidence,
+    Evidence is the log-likelihood given a trial's own latent less that given other trials'. exploration_evidence,
     expert_evidence: evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the
     expert's actions, for which a naive clone takes its own.
     dynamics_differ: rank correlation of what two halves of an exploration trial, or of an episode, do beyond a fit of
