@@ -136,6 +136,16 @@ def test_a_column_of_the_last_action_is_named() -> None:
     assert "tell nothing" not in said(remarks, "state")
 
 
+def test_the_column_that_an_action_equals_is_named() -> None:
+    """That of the next row, beside another that is near to the action in the present one."""
+    rng = np.random.default_rng(0)
+    action, none = rng.uniform(-1, 1, (B, E, T, 1)), np.zeros((B, E, 1, 1))
+    near = np.concatenate([action + 0.3 * rng.standard_normal(action.shape), none], 2)
+    last = np.concatenate([none, action], 2)
+    remarks = look(Trials(np.concatenate([near, last], -1), action, np.ones((B, E, T), bool)))
+    assert said(remarks, "state").startswith("The action action 0 is the next observation 1, to 0.0% of its spread")
+
+
 def test_what_never_moves_is_said_to_be_so() -> None:
     trials = driven()
     remarks = look(changed(trials, obs=0 * trials.obs + 3))
@@ -160,6 +170,7 @@ def with_pauses(trials: Trials) -> Trials:
     obs, action = trials.obs.copy(), trials.action.copy()
     obs[:, :, :9], action[:, :, :8] = obs[:, :, 8:9], 0
     obs[::2, 0, 30:38] = obs[::2, 0, 30:31]
+    obs[::4, 0, 45:53] = obs[::4, 0, 45:46]
     obs[..., 0] += 1e-4 * np.random.default_rng(0).standard_normal(obs.shape[:-1])
     return changed(trials, obs=obs, action=action)
 
@@ -240,7 +251,7 @@ PLANTED: dict[str, tuple[Any, set[str], str, str]] = {  # trials; what is odd; a
         lambda: with_pauses(driven()),
         {"pause"},
         "pause",
-        "at the start of 96 of 96 episodes, and 24 times later",
+        "at the start of 96 of 96 episodes, and 36 times later",
     ),
     "AR(1)": (lambda: driven(0.95, 0.3), {"lasting"}, "lasting", "Noise that lasts, AR(1), or the expert's own memory"),
     "copies": (lambda: with_copies(driven()), {"duplicate"}, "duplicate", "1 of 48 trials repeats another: 3 = 7."),

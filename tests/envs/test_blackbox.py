@@ -163,6 +163,22 @@ def test_a_world_s_own_time_limit() -> None:
     assert discounts == [1.0] * 7
 
 
+def test_an_end_in_the_last_step() -> None:
+    """It is an end, though the time is up too: dm_env's discount is 0."""
+
+    class Short(Push):
+        horizon = 1
+
+        def terminated(self, state: Array) -> Any:
+            return state[:, 0] > -9
+
+    env, dm = envs.GymEnv(Short()), envs.DmEnv(Short())
+    env.reset(seed=0)
+    dm.reset()
+    assert env.step(np.zeros(1))[2:4] == (True, True)
+    assert dm.step(np.zeros(1)).discount == 0
+
+
 def test_a_closed_world_takes_no_step() -> None:
     """Until it is reset."""
     env = BatchEnv(task_with(), 2)

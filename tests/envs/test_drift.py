@@ -33,10 +33,10 @@ def drifting(*drifts: float) -> envs.Task:
     return Push().changed(latents=tuple(envs.Latent(f"x{i}", "", -1.0, 1.0, drift=d) for i, d in enumerate(drifts)))
 
 
-@pytest.mark.parametrize("distribution", ["uniform", "loguniform"])
-def test_transition_is_that_of_the_walk(distribution: str) -> None:
+@pytest.mark.parametrize(("distribution", "drift"), [("uniform", 0.3), ("loguniform", 0.3), ("uniform", 1.0)])
+def test_transition_is_that_of_the_walk(distribution: str, drift: float) -> None:
     """Of 200,000 walks from each bin's middle, as many end in each bin: within 5 standard errors and .002."""
-    latent, k, n = envs.Latent("x", "m", 1.0, 4.0, distribution, 0.3), 7, 200_000  # type: ignore[arg-type]
+    latent, k, n = envs.Latent("x", "m", 1.0, 4.0, distribution, drift), 7, 200_000  # type: ignore[arg-type]
     matrix, rng = latent.transition(k), np.random.default_rng(0)
     np.testing.assert_allclose(matrix.sum(0), 1, atol=1e-9)
     np.testing.assert_allclose(matrix.sum(1), 1, atol=1e-9)

@@ -81,11 +81,12 @@ def test_a_class_that_is_defined_again(monkeypatch: pytest.MonkeyPatch) -> None:
     gymnasium.registry.pop("deconf/OwnPush-v1")
 
 
-def test_helpers_of_one_name_in_two_folders(tmp_path: Path) -> None:
+@pytest.mark.parametrize("helper", ["util.py", "util/__init__.py"])
+def test_helpers_of_one_name_in_two_folders(helper: str, tmp_path: Path) -> None:
     """The second file would silently get the first one's; of one folder, and of installed modules, nothing is said."""
     for folder, gain in (("a", 1), ("b", -1)):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "util.py").write_text(f"GAIN = {gain}")
+        (tmp_path / folder / helper).parent.mkdir(parents=True)
+        (tmp_path / folder / helper).write_text(f"GAIN = {gain}")
         (tmp_path / folder / "random.py").write_text("")  # which Python does not take
         for name in ("mine", "more"):
             text = "import random\nimport numpy as np\nfrom util import GAIN\n"
@@ -97,7 +98,7 @@ def test_helpers_of_one_name_in_two_folders(tmp_path: Path) -> None:
         np.testing.assert_array_equal(expert.mean(obs, theta), np.full((2, 1), 0.5))  # type: ignore[attr-defined]
     for _ in range(2):
         with pytest.raises(
-            envs.InputError, match=r"b/mine.py imports util, and got .*a/util.py of another plug-in; re"
+            envs.InputError, match=rf"b/mine.py imports util, and got .*a/{helper} of another plug-in; re"
         ):
             policy.load(task, f"{tmp_path}/b/mine.py:control")
 

@@ -1,6 +1,7 @@
 """Data that travels: Trials to a Minari data set and back."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -48,6 +49,18 @@ def test_the_same_in_another_process(
         np.testing.assert_array_equal(array, again.state()[1][key])
     with pytest.raises(envs.InputError, match="is there already"):
         data.main()
+
+
+@pytest.mark.parametrize("before", [None, "/somewhere"])
+def test_a_user_s_folder_of_minari_stays(before: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Writing sets it for a moment."""
+    monkeypatch.delenv("MINARI_DATASETS_PATH", raising=False)
+    if before:
+        monkeypatch.setenv("MINARI_DATASETS_PATH", before)
+    task = envs.get("bandit")
+    collected = datasets.collect(task, 2, lambda env: RandomAgent(task.action_space), 0)
+    datasets.write(tmp_path, task, "random", collected, "random", (1.0, 2.0))
+    assert os.environ.get("MINARI_DATASETS_PATH") == before
 
 
 def test_episodes_in_any_order(tmp_path: Path) -> None:

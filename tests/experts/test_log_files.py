@@ -98,6 +98,16 @@ def test_parts_of_one_name(kept: int, tmp_path: Path) -> None:
     assert log.units.obs == tuple(f"observation.state.{part}" for part in ("xy" if kept == 1 else "01"))
 
 
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_a_trial_of_lerobot_by_its_tasks(version: str, tmp_path: Path) -> None:
+    """Which are lists, of which each episode has its own."""
+    log = of_lerobot(tmp_path, version)
+    by_tasks = datasets.read(tmp_path / "set", "tasks")
+    assert by_tasks.names == tuple(f"drive {name}" for name in log.names)
+    np.testing.assert_array_equal(by_tasks.mask, log.mask)
+    np.testing.assert_array_equal(by_tasks.obs, log.obs)
+
+
 def test_what_episodes_of_lerobot_are_not(tmp_path: Path) -> None:
     """A number that is none is no episode's; where all lack one, nothing is known of them but their frames."""
     of_lerobot(tmp_path, "v2.1")

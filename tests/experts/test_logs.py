@@ -156,13 +156,19 @@ def of_lerobot(folder: Path, version: str = "v3.0") -> datasets.Log:
     if version == "v3.0":
         data("file-000.parquet", [1, 0])
         data("file-001.parquet", [2, 3, 4])
-        about: dict[str, list[Any]] = {"episode_index": list(range(5)), "vehicle": OWNERS, "tasks": [["drive"]] * 5}
+        about: dict[str, list[Any]] = {
+            "episode_index": list(range(5)),
+            "vehicle": OWNERS,
+            "tasks": [[f"drive {name}"] for name in OWNERS],
+        }
         about |= {"stats/action/max": [[1.0]] * 5, "length": [len(frames[i]) for i in range(5)]}
         write_parquet(folder / "set" / "meta" / "episodes" / "chunk-000" / "file-000.parquet", about)
     else:
         for i in range(5):
             data(f"episode_{i:06d}.parquet", [i])
-        lines = [json.dumps({"episode_index": i, "vehicle": OWNERS[i], "tasks": ["drive"]}) for i in range(5)]
+        lines = [
+            json.dumps({"episode_index": i, "vehicle": OWNERS[i], "tasks": [f"drive {OWNERS[i]}"]}) for i in range(5)
+        ]
         (folder / "set" / "meta" / "episodes.jsonl").write_text("\n".join(lines))
     return datasets.read(folder / "set", "vehicle")
 
@@ -582,6 +588,13 @@ class TestBadInput:
         with pytest.raises(envs.InputError, match=says) as caught:
             datasets.read(write_csv(tmp_path / "x.csv", made), **{**ROLES, **roles})
         assert "\n" not in str(caught.value)
+
+    def test_half_an_observation_at_the_end_of_an_episode(self, tmp_path: Path) -> None:
+        """A row without any observation has none to give; one that lacks a part of it is a failure of a sensor."""
+        made = rows()
+        made[-1]["speed x"] = ""
+        with pytest.raises(envs.InputError, match=rf"'speed x' of .*x.csv holds no number in row {len(made)}"):
+            datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
 
     @pytest.mark.parametrize("source", [None, 3, [], [None]])
     def test_no_path(self, source: Any) -> None:
