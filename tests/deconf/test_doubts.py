@@ -61,6 +61,15 @@ def test_what_the_world_tells_beyond_its_mean_motion(kind: Kind, says: str) -> N
 
 
 @pytest.mark.slow
+def test_episodes_that_a_log_lacks_end_nowhere() -> None:
+    """Ends are compared between the first and the last of three episodes, if there is no second one."""
+    explore = roll("cliff", thetas("cliff", 96, 1), False, 1)
+    lacks = np.arange(3)[:, None] == 1
+    ragged = Trials(np.where(lacks[..., None], 0, explore.obs), explore.action, explore.mask & ~lacks)
+    assert any("where their episodes end" in doubt for doubt in doubted("cliff", ragged))
+
+
+@pytest.mark.slow
 def test_exploration_under_one_condition() -> None:
     (doubt,) = doubted("drift", roll("drift", np.full(96, 0.3), False, 1))
     assert "under one condition alone" in doubt
