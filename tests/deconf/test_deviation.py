@@ -6,7 +6,7 @@ import torch
 
 from deconfounded.deconf.core.data import Batch, Draws
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
-from deconfounded.deconf.diagnosis.measures import draw_distant
+from deconfounded.deconf.diagnosis.measures import draw_distant, stakes_of
 from deconfounded.experts.trials import Trials
 
 
@@ -92,6 +92,15 @@ def test_chance_scores_one() -> None:
     for draw in range(10):
         right, *repeats, paths, wrong = (walks(400, 5 * draw + i) for i in range(5))
         assert paired_score(paths, 2 * wrong, right, tuple(repeats)) > 0.9
+
+
+def test_chance_is_of_the_trials_that_deviate() -> None:
+    """Of the second half, whose latents lead apart in one coordinate; wrong latents lead elsewhere in the other."""
+    home, repeat, second, away = (walks(400, seed) for seed in range(4))
+    for paths in (home, repeat, second, away):
+        paths[200:, :, 0] *= 5
+    away[..., 1] += 20
+    assert stakes_of([away, home, repeat, second])[0] > 3
 
 
 def test_distant_latents() -> None:

@@ -46,6 +46,8 @@ def test_constant_means_in_all_steps_of_a_trial_and_not_in_all_trials() -> None:
     mask[3, :, 5:] = False  # steps that did not take place
     column = Trials(obs, trials.action, mask)
     assert labels.constant(column) == [1]
+    mask[7] = False  # a trial that did not take place
+    assert labels.constant(Trials(obs, trials.action, mask)) == [1]
     [remark] = [remark for remark in look(column) if remark.kind == "label"]
     assert remark.odd
     assert "observation 1" in remark.text

@@ -83,6 +83,28 @@ class Walker:
         return torch.ones_like(obs)
 
 
+class Astray(Walker):
+    """A reference that would take a step of 2."""
+
+    def point(self, obs: torch.Tensor, latent: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(obs, 2)
+
+
+def trial(*obs: float) -> Batch:
+    """A trial of one episode with these observations."""
+    steps = len(obs) - 1
+    return Batch.of(Trials(np.reshape(obs, (1, 1, -1, 1)), np.zeros((1, 1, steps, 1)), np.ones((1, 1, steps), bool)), 1)
+
+
+def test_errors_are_of_the_steps_before_an_episode_s_end() -> None:
+    """All four are wrong there, of which an early end is no excuse."""
+    make: Any = LearnedEnv
+    env = make(
+        Astray(), trial(*range(6)), [trial(-1, 99.0)], 1, 20, SimpleNamespace(logit=lambda obs: obs[..., 0] - 3.5)
+    )
+    assert env.rollout(Walker(), [np.random.default_rng(0)]).error.item() == 1
+
+
 @pytest.mark.parametrize(
     ("limit", "observed", "steps", "last", "error"),
     [(3.5, 99.0, 4, 4.0, 0.0), (99.0, 99.0, 8, 8.0, 12 / 20), (99.0, 5.0, 20, 5.0, 0.0)],
@@ -94,13 +116,6 @@ class Walker:
 )
 def test_rollouts_end(limit: float, observed: float, steps: int, last: float, error: float) -> None:
     """From 0 on, a step at a time; the data is 0 to 5, so that dynamics are valid from -2.5 to 7.5."""
-
-    def trial(*obs: float) -> Batch:
-        steps = len(obs) - 1
-        return Batch.of(
-            Trials(np.reshape(obs, (1, 1, -1, 1)), np.zeros((1, 1, steps, 1)), np.ones((1, 1, steps), bool)), 1
-        )
-
     walker, model = Walker(), SimpleNamespace(logit=lambda obs: obs[..., 0] - limit)
     make: Any = LearnedEnv
     expert = trial(*range(6))
