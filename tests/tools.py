@@ -26,7 +26,7 @@ PLAIN: dict[str, dict[str, Any]] = {
     "deconfounded_large": {**FEW, "restart": True},
     "deconfounded_offline": {**OFFLINE, "online_steps": 64},
     "deconfounded_mean": {**FEW, "inference_steps": 64},
-    "dagger": {"updates": 2, "rounds": 2, "batch": 4},
+    "dagger": {"updates": 6, "rounds": 2, "batch": 4},
     "dpt": {"updates": 2, "rounds": 2, "batch": 4, "width": 16, "heads": 2},
     "gail": {
         **{"width": 16, "rounds": 2, "envs": 2, "steps": 32},

@@ -600,7 +600,10 @@ class Interrupted(Monitor):
 
     def __init__(self, before: Training | None = None) -> None:
         super().__init__()
-        self.before, self.saved = before, list[Training]()
+        self.before, self.saved, self.counts = before, list[Training](), list[int]()
+
+    def update(self, done: int, *_: Any) -> None:
+        self.counts.append(done)
 
     def save(self, state: Callable[[], Training]) -> None:
         self.saved.append(copy.deepcopy(state()))
@@ -612,12 +615,18 @@ class Interrupted(Monitor):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", [*NEW, "deconfounded_large"])
 def test_interrupted_training_resumes(method: str) -> None:
-    """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one."""
+    """An agent of resumed training acts, bit for bit, as one without interruption, and so does a loaded one.
+
+    Updates go on to be counted where they stood.
+    """
     monitor, task = Interrupted(), envs.get("bandit")
     whole = made(method, "bandit", monitor=monitor)
     assert isinstance(whole, LearnedAgent)
     agents = [whole, type(whole).from_state(*whole.state())]
-    agents += [made(method, "bandit", monitor=Interrupted(monitor.saved[i])) for i in (0, -1)]  # the last is of a whole
+    resumed = [Interrupted(monitor.saved[i]) for i in (0, -1)]  # the last is of a whole training
+    agents += [made(method, "bandit", monitor=each) for each in resumed]
+    for each in resumed:
+        assert each.counts == monitor.counts[len(monitor.counts) - len(each.counts) :]
     actions: list[Array] = []
     for agent in agents:
         for key, array in whole.state()[1].items():  # few updates may leave all actions as they were
