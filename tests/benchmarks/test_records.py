@@ -549,14 +549,14 @@ def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_jobs_of_another_text_are_left_out(job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those before the latest: of the task, or of the same method."""
+    """Those before the latest: of the task, or of the same method. The latest ended last, if it was interrupted, too."""
     other = replace(job, method="random", seeds=(0,))
     other.run()
     for made, seed, text in ((other, 0, {"method": "c"}), (job, 0, {"method": "a"}), (job, 1, {"method": "b"})):
         data = job_files.read(made.file(seed))
         assert data is not None
         meta = data.pop("meta")
-        meta["identity"]["outside"], meta["spans"] = text, [[0, 1 + seed]]
+        meta["identity"]["outside"], meta["spans"] = text, [[1 - seed, 2 - seed], *[[4, 5]] * seed]
         np.savez(made.file(seed), meta=np.array(json.dumps(meta)), **data)
     left = [(method, seed) for method, seed, _ in job_files.left_in(job.folder)]
     assert left == [("blind_bc", 1), ("random", 0)]
