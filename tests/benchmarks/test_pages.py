@@ -387,6 +387,13 @@ class TestHeadroom:
         assert "hidden_goal" not in text
         assert "| a | 2 | 0.60 (0.60 to 0.60) | 0.93 (0.93 to 0.93) | 0.47 (0.47 to 0.47) |" in text
 
+    def test_tasks_of_which_it_is_open(self) -> None:
+        """Whether they are solved or seem not to be."""
+        left = ((0.0, (0.0, 0.01)), (0.0, (-0.1, 0.1)), (0.1, (0.0, 0.2)), (0.1, (0.02, 0.2)))
+        gaps = (statistics.Figure(np.array(value), interval, 5) for value, interval in left)  # type: ignore[arg-type]
+        tasks = {str(i): headroom.Headroom(("x", 1.0), [], gap) for i, gap in enumerate(gaps)}
+        assert headroom._solved(tasks) == "2 of 4 tasks are solved (50%; of 3 that is open)"
+
     def test_hard_in(self) -> None:
         """A task is hard where the best learner has .8 at most, and nobody counts who sees theta."""
         assert hard.hard_in({"first": 0.7, "last": 0.8}) == "first, last"
@@ -553,6 +560,16 @@ class TestIndex:
                 beside = values[task, other]
                 if row["n"] == beside["n"]:
                     assert difference["value"] == pytest.approx(row["value"] - beside["value"], abs=2e-4)
+
+    def test_over_tasks_is_among_those_of_tasks(self, made: dict[str, Any]) -> None:
+        """Each measure's own: random actions have a regret of 5, and a latent of the prior does badly at first."""
+        for tier, over in made["over"].items():
+            tasks = {task["name"] for task in made["tasks"] if tier in ("", task["tier"])}
+            for name, method in over["methods"].items():
+                rows = [row for row in made["rows"] if row["task"] in tasks and row["method"] == name]
+                for measure in ("first", "regret"):
+                    values = [row[measure]["value"] for row in rows]
+                    assert min(values) - 0.15 <= method[measure]["value"] <= max(values) + 0.15, (tier, name, measure)
 
     def test_a_method_that_was_not_run(self) -> None:
         """It has figures of the tasks that it has, which say how many these are; one without any is not there."""

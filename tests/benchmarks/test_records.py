@@ -465,6 +465,7 @@ class TestRecords:
 
 def test_time_worked_counts_overlaps_once() -> None:
     assert aggregation.covered([(5, 6), (0, 2), (1, 3)]) == 4
+    assert aggregation.covered([(0, 9), (1, 2), (4, 5)]) == 9
 
 
 class TestVerify:
@@ -549,7 +550,7 @@ def test_report_again(job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_jobs_of_another_text_are_left_out(job: BenchmarkJob, capsys: pytest.CaptureFixture[str]) -> None:
-    """Those before the latest: of the task, or of the same method. The latest ended last, if it was interrupted, too."""
+    """Those before the latest: of the task, or of the same method. The latest ended last, interrupted or not."""
     other = replace(job, method="random", seeds=(0,))
     other.run()
     for made, seed, text in ((other, 0, {"method": "c"}), (job, 0, {"method": "a"}), (job, 1, {"method": "b"})):

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from deconfounded import envs
@@ -93,6 +94,19 @@ def test_whatever_is_read_counts(task: envs.MujocoTask, tmp_path: Path) -> None:
         assert sources.digest(sources.of_task(task)) != first, name
         file.write_bytes(before)
     assert sources.digest(sources.of_task(task)) == first
+
+
+def test_paths_that_are_stripped(tmp_path: Path) -> None:
+    """Of them the name alone counts: MuJoCo looks for it in meshdir."""
+    for name in ("m.obj", "apart.obj"):
+        (tmp_path / name).write_text(MESH)
+    model = tmp_path / "model.xml"
+    model.write_text(
+        '<mujoco><compiler strippath="true"/><asset><mesh name="m" file="elsewhere/m.obj"/></asset>'
+        '<worldbody><geom type="mesh" mesh="m"/></worldbody></mujoco>'
+    )
+    assert mujoco.MjModel.from_xml_path(str(model)).nmesh == 1
+    assert sources.mjcf(model) == {model, tmp_path / "m.obj"}
 
 
 def test_data_files_that_code_names_count(tmp_path: Path) -> None:
