@@ -1,13 +1,14 @@
 """Foreign worlds: their cases, scores and filter, in those simulators that are ours too."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from deconfounded.benchmarks.studies import findings, validate
-from deconfounded.benchmarks.studies.foreign import cases, report, world
+from deconfounded.benchmarks.studies.foreign import cases, measure, report, world
 from deconfounded.benchmarks.studies.foreign.cases import CASES, Case
 from deconfounded.benchmarks.studies.foreign.measure import scores
 from deconfounded.deconf.diagnosis import exploration
@@ -102,6 +103,21 @@ def test_scores() -> None:
     returns = {"random": [0.0, 0.0], "expert": [9.0, 10.0], "wrong theta": [9.0, 6.0], "naive_rnn": [9.0, 8.0]}
     assert scores(returns) == {"random": -1.5, "expert": 1, "wrong theta": 0, "naive_rnn": 0.5}
     assert scores(returns | {"wrong theta": [9.0, 9.9]})["naive_rnn"] == 0.8  # nothing is at stake: 0 is random
+
+
+def test_returns_are_kept_until_a_method_has_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of expert and random actions have none, and stay."""
+    monkeypatch.setattr(measure, "roll_out", lambda *_: SimpleNamespace(returns=np.full((4, 5), next(returns))))
+    monkeypatch.setattr(measure.Bench, "theta", None)
+    agents = dict.fromkeys(("naive_rnn", "random"), lambda bench: RandomAgent(np.zeros(1)))  # type: ignore[arg-type]
+    monkeypatch.setattr(measure, "AGENTS", agents)
+    returns, said = iter(range(9)), []
+    for version in (2, 2, 3):
+        monkeypatch.setattr(measure, "METHODS", {"naive_rnn": SimpleNamespace(version=version)})
+        bench = measure.Bench(OURS[0], tmp_path)
+        said += [[bench.measure(name) for name in agents]]
+    assert said == [["0", "1"], ["0", "1"], ["2", "1"]]
+    assert bench.made["method_versions"] == {"naive_rnn": 3}
 
 
 def test_report() -> None:

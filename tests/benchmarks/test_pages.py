@@ -1102,6 +1102,20 @@ def test_a_still_is_small_and_made_once(tmp_path: Path) -> None:
         assert file.stat().st_mtime_ns != before
 
 
+def test_a_picture_is_drawn_again_when_it_would_be_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As its data have changed, or the code that draws it; and otherwise it is left alone."""
+    drawn = []
+
+    def draw(data: Any, file: Path, mark: str) -> None:
+        drawn.append(data)
+        save_figure(Figure(), file, 20, mark)
+
+    for data, code in ((1, "a"), (1, "a"), (2, "a"), (2, "b"), (2, "b")):
+        monkeypatch.setattr(publish.sources, "of_code", lambda _, code=code: code)
+        publish.redraw(tmp_path / "x.png", draw, data)
+    assert drawn == [1, 2, 2]
+
+
 def test_a_clip_of_the_same_film_is_not_encoded_anew(tmp_path: Path) -> None:
     """Its mark says of which film it is; a copy is made only where that differs."""
     frames = np.repeat(np.uint8([0, 40, 80, 120, 160, 200]), 16 * 16 * 3).reshape(6, 16, 16, 3)
