@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock, Timeout
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.presets import changed, preset
 from deconfounded.benchmarks.output import records
-from deconfounded.benchmarks.studies import exploration, table
+from deconfounded.benchmarks.studies import cards, exploration, table
 from tests.tools import bars, dots
 
 PNG = b"\x89PNG"
@@ -63,6 +64,19 @@ def test_two_programs_add_to_a_file(tmp_path: Path) -> None:
     for task, last in (("curling", 0.5), ("windy_drone", 0.6), ("curling", 0.7)):
         points = exploration.added(file, point(task, "rma", 4, [last]))
     assert {key[0]: of["last"] for key, of in points.items()} == {"curling": [0.7], "windy_drone": [0.6]}
+
+
+def test_other_programs_wait_while_a_file_changes(tmp_path: Path) -> None:
+    """Until what was read of it is written."""
+    file = tmp_path / "exploration.json"
+
+    def add(held: list[int] | None) -> list[int]:
+        with pytest.raises(Timeout):
+            FileLock(file.with_suffix(".lock")).acquire(timeout=0)
+        return [*(held or []), 1]
+
+    assert [cards.changed(file, add) for _ in range(2)] == [[1], [1, 1]]
+    FileLock(file.with_suffix(".lock")).acquire(timeout=0).release()
 
 
 def test_points_of_two_presets_are_not_in_one_file(tmp_path: Path) -> None:
