@@ -76,7 +76,6 @@ def test_other_programs_wait_while_a_file_changes(tmp_path: Path) -> None:
         return [*(held or []), 1]
 
     assert [cards.changed(file, add) for _ in range(2)] == [[1], [1, 1]]
-    FileLock(file.with_suffix(".lock")).acquire(timeout=0).release()
 
 
 def test_points_of_two_presets_are_not_in_one_file(tmp_path: Path) -> None:
