@@ -149,3 +149,4 @@ class TestVerdict:
         expert, explore = roll("goal", thetas("goal", 30, 0), True, 0), roll("goal", thetas("goal", 30, 1), False, 1)
         assert diagnose.conclude([MIXED] * 3, expert, explore).verdict == "cannot tell"
         assert diagnose.conclude([CLEAR] * 3, expert, explore).verdict == "confounded"
+        assert diagnose.conclude([CLEAR, CLEAR, MIXED], expert, explore).dissenting == ("cannot tell",)
