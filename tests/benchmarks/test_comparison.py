@@ -361,7 +361,7 @@ class TestComparison:
         assert dots(second)[0] == pytest.approx((0.5, 0))
         student = 12.7062 * 0.1  # of one degree of freedom, times the standard error
         assert bars(second)[0] == pytest.approx((0.5 - student, 0, 0.5 + student, 0), abs=1e-4)
-        assert [x for x, _ in dots(last)] == pytest.approx([1.5 / 3, 1.6 / 3, 0.1])
+        assert [x for x, _ in dots(last)] == pytest.approx([0.6 / 2 + 0.3 / 2, 1.6 / 3, 0.1])
         assert [label.get_text() for label in last.get_yticklabels()] == ["a", "b", "c"]
 
     def test_records_of_older_versions_are_named(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
