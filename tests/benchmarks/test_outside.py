@@ -463,6 +463,7 @@ class TestWire:
             wire.pack(object())
 
     def test_what_is_read_may_be_changed(self) -> None:
+        assert wire.unpack(wire.pack(np.array(3.0))).shape == ()
         back = wire.unpack(wire.pack(np.zeros(3)))
         back += 1
         assert back.tolist() == [1, 1, 1]

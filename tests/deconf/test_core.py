@@ -75,7 +75,8 @@ class TestEquations:
     def test_objective(self) -> None:
         """Eq. (1): -1 - 2, the third step came after the end."""
         taken = np.array([True, True, False])
-        assert imitation_objective(np.array([-1.0, -2.0, -4.0]), taken) == -3
+        for after in (-4.0, -np.inf, np.nan):
+            assert imitation_objective(np.array([-1.0, -2.0, after]), taken) == -3
 
     def test_posterior_policy(self) -> None:
         """Eq. (2): half of (.6, .4) and half of (.2, .8)."""

@@ -308,6 +308,20 @@ def test_a_trial_does_not_depend_on_those_beside_it() -> None:
     np.testing.assert_array_equal(final([1, 2])[4:], final([2]))
 
 
+def test_a_theta_of_an_episode_is_drawn_anew_in_the_next() -> None:
+    env = envs.BatchEnv(Three(), N)
+    agent, obs = ParticleAgent(env, expert(env.task), False), env.reset(0)
+    agent.way = "episode"
+    agent.begin(N)
+    drawn = []
+    for episode in range(2):
+        agent.reset([np.random.default_rng(episode)])
+        agent.act(obs)
+        assert agent._theta is not None
+        drawn.append(agent._theta.copy())
+    assert (drawn[0] != drawn[1]).all()
+
+
 def test_particles_are_for_many_latents() -> None:
     """Of one or two latents the exact policy has a grid; patches factorise, whatever their number."""
     for task, many in ((Push(), False), (Three(), True), (PatchyRoad(), False), (envs.get("windy_drone"), False)):

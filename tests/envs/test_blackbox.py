@@ -553,6 +553,13 @@ def paid(reward: Any) -> Callable[..., Any]:
     return lambda self, theta: type("Odd", (Slide,), {"step": step})(0.0)
 
 
+def lost(self: Sliding, obs: Any, theta: Any) -> Any:
+    """An expert that goes where it has no plan; others do not."""
+    if obs[0] > 3:
+        raise ValueError("there is no plan beyond 3")
+    return np.full(1, 4.0)
+
+
 class TestErrors:
     """Each is one line, which says what was given."""
 
@@ -577,7 +584,8 @@ class TestErrors:
         ("expert", lambda self, obs, theta: None, "expert of sliding gave None for an observation; it must be of"),
         ("expert", lambda self, obs, theta: UNSURE.random(1), "expert of sliding gave two actions for one observat"),
         ("steps", 0, "the number of steps of Sliding was 0"),
-        ("noise", -1, "noise of Sliding was -1; it must be a number from 0 up"),
+        *(("noise", x, rf"noise of Sliding was {x}; it must be a number from 0 up") for x in (-1, np.nan, np.inf)),
+        ("expert", lost, "expert of sliding: there is no plan beyond 3 "),
         ("names", ("a", "b"), "names of Sliding were .*; they must be 1 different texts"),
     ]
 
@@ -591,6 +599,30 @@ class TestErrors:
         (tmp_path / "mine.py").write_text("class Mine:\n    steps = 3\n    def make(self, theta): pass\n")
         with pytest.raises(envs.InputError, match="world Mine lacks sample_theta, expert, episodes; a world has make"):
             envs.get(f"{tmp_path}/mine.py:Mine")
+
+
+class Holding(Slide):
+    """A part of it holds its generator."""
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        made = super().reset(seed=seed)
+        self.wind = self.np_random
+        return made
+
+    def step(self, action: Any) -> Any:
+        return self.wind.normal(size=1).astype("f4"), 0.0, False, False, {}
+
+
+def test_noise_of_a_part_of_an_environment() -> None:
+    """It follows the noise's seed, though the part got its generator at the reset."""
+    simulator = task_with(make=lambda self, theta: Holding(theta[0])).simulator(1)
+    simulator.set_theta(0, np.zeros(1))
+    rows, after = np.arange(1), []
+    for noise in (7, 8):
+        state = simulator.start(rows, np.array([[3.0]]), np.full((1, 12, 1), noise))
+        after.append((state[0, 0], simulator.outcome(state, np.zeros((1, 1)), rows)[0, 0]))
+    assert after[0][0] == after[1][0]
+    assert after[0][1] != after[1][1]
 
 
 class Remembering(Sliding):

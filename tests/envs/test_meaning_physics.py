@@ -10,11 +10,13 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine import published
 from deconfounded.benchmarks.output import records
 from deconfounded.deconf import exact
+from deconfounded.envs import render
 from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.forked_path import ForkedPath
+from deconfounded.envs.tasks.icy_road import road
 from deconfounded.envs.tasks.loaded_arm import INNER, OUTER
 from deconfounded.envs.tasks.windy_drone import HEIGHT
 from deconfounded.experts import policy
@@ -152,6 +154,26 @@ def test_a_reading_is_evidence_of_the_state_that_it_was_taken_in() -> None:
     before[:, -1], after[:, -1] = -1, 1
     log_likelihood = exact.log_next(task.simulator(2), before, np.zeros((2, 6)), after, np.array([[1.0], [3.0]]))
     np.testing.assert_allclose(np.exp(log_likelihood), [0.8, 0.2])
+
+
+@pytest.mark.parametrize(("lamp", "colour"), [(1, 0), (-1, 2)])
+def test_the_colour_of_a_lamp(lamp: int, colour: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Red for too fast, blue for too slow, as the task says."""
+    monkeypatch.setattr(render, "MujocoRenderer", lambda model: lambda state, action: model.site("lamp").rgba[:3])
+    task = envs.get("cheetah_speed")
+    assert isinstance(task, MujocoTask)
+    state = task.state()[0]
+    state[-1] = lamp
+    assert np.argmax(task.renderer(np.array([1.0]))(state, np.zeros(6))) == colour
+
+
+@pytest.mark.parametrize("turns", [0, 1, -2])
+def test_a_car_that_has_spun_heads_where_it_did(turns: int) -> None:
+    task, along = envs.get("icy_road"), road(np.zeros(1))[1]
+    assert isinstance(task, MujocoTask)
+    heading = along + 0.3 + 2 * np.pi * turns
+    seen = task.observe(task.state(yaw=(heading, 0)))[0]
+    assert seen[list(task.observation).index("heading_error")] == pytest.approx(0.3)
 
 
 def test_sensors_read_the_world_after_the_step() -> None:

@@ -136,3 +136,7 @@ def test_a_still_task_has_no_switches() -> None:
     env = envs.BatchEnv(still, 2)
     assert run_trials(env, RandomAgent(task.action_space), 1, 0).theta.shape == (2, 1, 2)
     assert task.theta_path(task.sample_theta(streams(1, 2)), streams(3, 4)).shape == (2, task.horizon + 1, 2)
+    wind, load = envs.Latent("wind", "m/s", -16, 16, switch=0.02), envs.Latent("load", "m", -0.02, 0.02, drift=0.2)
+    both = envs.get("windy_drone").changed(latents=(wind, load))
+    assert (both.switches, both.drifts) == (True, True)
+    assert (both.without_switches().switches, both.without_switches().drifts) == (False, True)

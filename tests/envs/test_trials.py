@@ -19,6 +19,29 @@ def same(one: Any, other: Any) -> None:
         assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
 
 
+def test_a_reset_of_some_environments() -> None:
+    """Each gets the theta that is given for it; what is asked of them depends on no other."""
+    env, some = envs.BatchEnv(envs.get(NAME), 3), np.array([False, True, True])
+    env.reset(0, where=some)
+    with pytest.raises(envs.InputError, match="keep_theta was given before the first reset"):
+        env.reset(options={"keep_theta": True}, where=~some)
+    before = env.theta[some]
+    env.reset(options={"keep_theta": True}, where=some)
+    np.testing.assert_array_equal(env.theta[some], before)
+    given = envs.get(NAME).theta_grid(3)
+    env.reset(options={"theta": given}, where=some)
+    np.testing.assert_array_equal(env.theta[some], given[some])
+
+
+def test_a_theta_out_of_bounds_is_named() -> None:
+    """It, and not one of those beside it."""
+    env = envs.BatchEnv(envs.get("tilted_cartpole"), 3)
+    with pytest.raises(
+        envs.InputError, match=r"^tilt of tilted_cartpole was 7; it must be a number from -0\.3 to 0\.3"
+    ):
+        env.reset(0, {"theta": [[0.1], [0.2], [7.0]]})
+
+
 def test_resets_keep_theta_until_the_trial_is_over() -> None:
     env = gymnasium.make(envs.get(NAME).gym_id, episodes=3)
     batch = env.unwrapped.batch  # type: ignore[attr-defined]

@@ -193,6 +193,12 @@ class TestTrials:
             Trials(moved, action, mask)
         np.testing.assert_allclose(Trials(noise, action, mask).obs, noise, rtol=1e-6)
 
+    def test_whole_numbers_that_float32_loses(self) -> None:
+        """Unix times, whose steps are all alike in float32."""
+        times = (1_700_000_000 + np.arange(51)).reshape(1, 1, 51, 1)
+        with pytest.raises(envs.InputError, match=r"float32 rounds it by up to .*; subtract its mean"):
+            Trials(times, np.zeros((1, 1, 50, 1)), np.ones((1, 1, 50), bool))
+
     def test_what_float32_holds_well_enough(self) -> None:
         """Constants that it rounds, and columns that hardly vary."""
         obs = np.full((2, 1, 4, 3), 0.1)

@@ -549,6 +549,18 @@ class TestActions:
             units.scaled(np.array([["jump"]], object))
 
 
+def test_ranges_of_several_logs() -> None:
+    """The widest that any of them declares, whatever was done."""
+    made = [
+        Table(
+            name, {"o": np.arange(6.0), "a": np.linspace(-0.3, 0.4, 6)}, np.zeros(6, int), ("o",), ("a",), None, limits
+        )
+        for name, limits in (("first", {"a": (-1.0, 1.0)}), ("second", {"a": (-2.0, 0.5)}))
+    ]
+    for log in trials_of([[table] for table in made], Roles()):
+        assert (log.units.low, log.units.high) == ((-2.0,), (1.0,))
+
+
 BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes of row 3; what is said
     "missing": ({"obs": ["speed z"]}, {}, "obs 'speed z' is no column of .*x.csv; did you mean 'speed [xy]'?"),
     "pattern": (
@@ -594,6 +606,12 @@ class TestBadInput:
         made = rows()
         made[-1]["speed x"] = ""
         with pytest.raises(envs.InputError, match=rf"'speed x' of .*x.csv holds no number in row {len(made)}"):
+            datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
+
+    def test_a_row_of_a_later_episode_is_named(self, tmp_path: Path) -> None:
+        made = rows()
+        made[-3]["throttle"] = "inf"
+        with pytest.raises(envs.InputError, match=rf"'throttle' of .*x.csv is infinite in row {len(made) - 2}"):
             datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES)
 
     @pytest.mark.parametrize("source", [None, 3, [], [None]])
