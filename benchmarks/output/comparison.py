@@ -211,7 +211,8 @@ def notes() -> str:
         " method's, summed over the episodes; less is better. Differences are paired by seed; their 95% intervals are"
         " Student's, over tasks Welch's. Over tasks they are of means, not of interquartile means."
         " IQM is the interquartile mean of all runs, in which each task counts the same; P is of the seeds that both"
-        " have. Their intervals are stratified bootstraps, and of few seeds of a few tasks too narrow. The references, 0 and 1, are taken to be exact."
+        " have. Their intervals are stratified bootstraps, and of few seeds of a few tasks too narrow. The references,"
+        " 0 and 1, are taken to be exact."
     )
 
 
