@@ -149,9 +149,9 @@ class TestBadInput:
 
     def test_exploration_elsewhere(self) -> None:
         expert, other = trials(), trials(seed=1)
-        away = Trials(other.obs + 99, other.action, other.mask)
-        with pytest.raises(InputError, match="where the expert goes for"):
-            diagnose.check(expert, away, DiagnoseConfig())
+        for obs in (other.obs + 99, 999 * other.obs):  # elsewhere, and nearly everywhere
+            with pytest.raises(InputError, match="where the expert goes for"):
+                diagnose.check(expert, Trials(obs, other.action, other.mask), DiagnoseConfig())
 
     @pytest.mark.slow
     def test_command(self, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -86,6 +86,15 @@ def test_exploration_that_sees_what_is_hidden(share: float) -> None:
 
 
 @pytest.mark.slow
+def test_trials_of_exploration_without_a_step() -> None:
+    """They act like nobody; the last of a log is one as good as another."""
+    explore = roll("drift", thetas("drift", 96, 1), True, 1)
+    mask = explore.mask & (np.arange(96) % 5 < 4)[:, None, None]
+    mask[-1] = False
+    assert "seems to see" in doubted("drift", Trials(explore.obs, explore.action, mask))[0]
+
+
+@pytest.mark.slow
 def test_nothing_to_doubt() -> None:
     """Of a goal that nothing tells."""
     assert not doubted("goal")

@@ -160,6 +160,15 @@ def test_empty_trials_are_no_copies_of_each_other() -> None:
     assert not said(look(changed(trials, mask=mask, obs=obs, action=action)), "duplicate")
 
 
+def test_what_the_own_row_tells_of_actions() -> None:
+    """Beside what an earlier one does; by the fit of that row."""
+    trials = driven(reaction=2)
+    window = fits.Window.of(trials, 10)  # as of lags up to 8
+    left = {lag: window.unexplained([lag]) for lag in (-1, 0, 2)}
+    assert f"({1 - left[2]:.0%} of their variance, and {1 - left[0]:.0%} by that of their" in said(look(trials), "late")
+    assert left[-1] - left[0] > 0.02
+
+
 def late(trials: Trials) -> Trials:
     action = np.concatenate([0 * trials.action[:, :, :1], trials.action[:, :, :-1]], 2)
     return changed(trials, action=action)

@@ -17,7 +17,7 @@ from deconfounded.deconf.core.nets import ActionHead, Inputs, Scales
 from deconfounded.deconf.diagnosis import advice, diagnose, fits, labels, latent, measures, state, trait
 from deconfounded.deconf.diagnosis.deviation import paired_score
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
-from deconfounded.deconf.diagnosis.held_out import PartMonitor, Report
+from deconfounded.deconf.diagnosis.held_out import Best, PartMonitor, Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import Explanation
 from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, LearnedEnv
@@ -244,6 +244,31 @@ def test_exploration_counts_where_the_expert_goes_in_all_columns() -> None:
     np.testing.assert_array_equal(measures.near(expert, explored).mask, inside)
     masked = latent.in_range(Batch.of(expert, 1), Batch.of(explored, 1)).mask
     np.testing.assert_array_equal(masked[0], inside[:, 0])
+
+
+def test_padding_is_not_outside_of_the_expert_s_range() -> None:
+    """Exploration whose episodes end after one step of a hundred is where the expert goes all the time."""
+    rng = np.random.default_rng(0)
+    obs, action = rng.uniform(-1, 1, (6, 1, 101, 2)), rng.uniform(-1, 1, (6, 1, 100, 1))
+    expert = Trials(obs, action, np.ones((6, 1, 100), bool))
+    explored = Trials(obs, action, np.broadcast_to(np.arange(100) < 1, (6, 1, 100)))
+    assert latent.in_range(Batch.of(expert, 1), Batch.of(explored, 1)).mask.sum() == 6
+
+
+def test_a_held_out_trait_is_of_the_early_half(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Actions of the late half are predicted by it, and are no part of what it is inferred from."""
+    read, forward = list[torch.Tensor](), trait.Encoder.forward
+    monkeypatch.setattr(trait.Encoder, "forward", lambda self, x: (read.append(x.mask), forward(self, x))[1])
+    trials, held_out = (Batch.of(world(0.2, True, n, n), 1) for n in (12, 5))
+    config = MemorylessConfig(updates=2, width=8)
+    trait.fit(trials, held_out, Signature.of(world(0.2, True, 12, 12)), config, streams())
+    assert torch.equal(read[-1], trait.halves(held_out)[0].mask)
+
+
+def test_learning_that_fails_is_kept_to_be_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    best = Best(Batch.of(world(0.2, True, 5, 0), 1))
+    assert best.check(1, 1, lambda: torch.full((1, 5, 40), torch.nan))
+    assert best.log_prob.isnan().all()
 
 
 def test_few_steps_of_a_set_are_from_anywhere_in_its_trials(monkeypatch: pytest.MonkeyPatch) -> None:

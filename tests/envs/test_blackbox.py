@@ -511,6 +511,12 @@ def dict_obs(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"observation_space": spaces.Dict(x=spaces.Box(-1, 1, (1,)))})(0.0)
 
 
+def half_empty(self: Any, theta: Any) -> Any:
+    """The second of two actions has no range."""
+    low, high = np.array([-1.0, 0.5], "f4"), np.array([1.0, 0.5], "f4")
+    return type("Odd", (Slide,), {"action_space": spaces.Box(low, high)})(0.0)
+
+
 def unbounded(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"action_space": spaces.Box(-np.inf, np.inf, (1,))})(0.0)
 
@@ -567,6 +573,7 @@ class TestErrors:
         ("make", lambda self, theta: 3, "make of Sliding gave 3; it must be a gymnasium.Env"),
         ("make", lambda self, theta: 1 / 0, r"make of Sliding: division by zero \(ZeroDivisionError, test_bl"),
         ("make", dict_obs, "observation_space of Sliding was Dict.*; it must be a Box of one axis: wrap"),
+        ("make", half_empty, r"action_space of Sliding was Box.*; it must be bounded"),
         ("make", unbounded, r"action_space of Sliding was Box\(-inf.*; it must be bounded"),
         ("make", four, "step of sliding returned 4 values; it must return obs, reward, terminated, truncated, info"),
         ("make", old_reset, "reset of Sliding takes no seed; it must be reset.seed=None, options=None., as gymn"),

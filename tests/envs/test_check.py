@@ -28,7 +28,7 @@ from deconfounded.envs.tasks.ant_goal import AntGoal
 from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
 from deconfounded.experts import policy
-from tests.toys import Arms
+from tests.toys import Arms, Push
 
 
 class MissingFile(SlipperyCartpole):
@@ -175,6 +175,10 @@ def test_slips_are_named(task: type[envs.Task], says: str) -> None:
     [
         (lambda theta: np.where(np.arange(3) == theta, 1.0, 0.0), r"gave \[.*0\.0.*\]; each must be above 0"),
         (lambda theta: np.full((len(theta), 3), 0.5), r"gave \[0.5, 0.5, 0.5\]; each must be above 0, and their sum 1"),
+        (
+            lambda theta: np.where(np.arange(len(theta))[:, None] == 9, 0.5, np.full(3, 1 / 3)),
+            r"gave \[0.5, 0.5, 0.5\]",
+        ),
         (lambda theta: np.full((len(theta), 2), 0.5), r"had shape \(16, 2\); it must be \(16, 3\)"),
         (lambda theta: None, r"had shape \(0,\); it must be \(16, 3\)"),
     ],
@@ -185,6 +189,27 @@ def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -
     with pytest.raises(envs.InputError, match=f"^expert_probs of arms {says}"):
         envs.check_task(task)
     envs.check_task(Arms())
+
+
+class Places(Push):
+    """Theta shows by where one starts: the middle one to the right, and the upper one to the left, of 0."""
+
+    def outcome(self, state: Array, action: Array, theta: Array) -> Array:
+        right, middle = state[:, 0] > 0, np.abs(theta[:, 0]) < 0.3
+        shows = np.where(right, middle, theta[:, 0] > 0.3)
+        return np.stack([state[:, 0] * (1 + 0.1 * shows), state[:, 1]], -1)
+
+    def apply_noise(self, outcome: Array, noise: Array) -> Array:
+        return outcome
+
+    def terminated(self, state: Array) -> np.ndarray:
+        return np.zeros(len(state), bool)
+
+
+def test_an_effect_from_one_of_several_starts_is_enough() -> None:
+    starts = np.concatenate([envs.BatchEnv(Places(), 1).reset(seed)[:, 0] for seed in range(3, 9)])
+    assert starts[0] * starts[1] < 0 or starts[0] * starts[-1] < 0
+    CONTRACT["effect"](Places())
 
 
 def test_broken_mjcf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,8 @@ def test_far_thetas_reach_both_ends() -> None:
     many = far_thetas(task.changed(latents=(two,) * 4))
     assert many.shape == (9, 4)
     assert (many.min(0).tolist(), many.max(0).tolist()) == ([0] * 4, [1] * 4)
+    ranges = far_thetas(task.changed(latents=(Latent("size", "", 0, 5),) * 4))
+    assert (ranges.min(0).tolist(), ranges.max(0).tolist()) == ([0.5] * 4, [4.5] * 4)
 
 
 @pytest.mark.parametrize("name", TASKS)

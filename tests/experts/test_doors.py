@@ -33,7 +33,7 @@ from deconfounded.deconf.methods.memoryless_bc import MemorylessConfig
 from deconfounded.deconf.methods.sequence_bc import RecurrentConfig
 from deconfounded.envs.streams import Array
 from deconfounded.envs.tasks.slippery_cartpole import SlipperyCartpole
-from deconfounded.experts import datasets, policy
+from deconfounded.experts import arrays, datasets, policy
 from deconfounded.experts.agent import Agent, RandomAgent
 from deconfounded.experts.rollout import run_trials
 from deconfounded.experts.trials import Trials, joined
@@ -192,6 +192,11 @@ class TestTrials:
         with pytest.raises(envs.InputError, match=r"float32 rounds it by up to .*; subtract its mean"):
             Trials(moved, action, mask)
         np.testing.assert_allclose(Trials(noise, action, mask).obs, noise, rtol=1e-6)
+
+    def test_the_least_integer_is_large(self) -> None:
+        """It has no negative in its type."""
+        for kind in (np.int8, np.int64):
+            assert arrays.size(np.array([np.iinfo(kind).min, 5], kind)) == -float(np.iinfo(kind).min)
 
     def test_whole_numbers_that_float32_loses(self) -> None:
         """Unix times, whose steps are all alike in float32."""

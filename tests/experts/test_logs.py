@@ -185,7 +185,7 @@ def write_minari(folder: Path, about: list[dict[str, Any]]) -> Path:
         buffers.append(EpisodeBuffer(i, None, None, seen, action, [0.0] * n, ends.tolist(), [False] * n, {}))  # type: ignore[arg-type]
     space = spaces.Dict(speed=spaces.Box(-9.0, 9.0, (2,), float), mode=spaces.Discrete(2))
     with patch.dict(os.environ, MINARI_DATASETS_PATH=str(folder)):
-        kinds = {"observation_space": space, "action_space": spaces.Box(-np.inf, np.inf, (1,), float)}
+        kinds = {"observation_space": space, "action_space": spaces.Box(0.0, np.inf, (1,), float)}
         made = minari.create_dataset_from_buffers("of/others-v0", buffers, data_format="hdf5", **kinds)
     if about[0]:
         made.storage.update_episode_metadata(about)
@@ -547,6 +547,14 @@ class TestActions:
         units = Units(("x",), ("y",), (0.0,), (1.0,), ("go", "stop"))
         with pytest.raises(envs.InputError, match="an action was 'jump'; it must be one of go, stop"):
             units.scaled(np.array([["jump"]], object))
+
+
+def test_large_ids_beside_small_ones(tmp_path: Path) -> None:
+    """Of a parquet file: float64 would take the last two for one."""
+    ids = [1, 2**53, 2**53 + 1]
+    columns = {"id": np.repeat(ids, 3), "o": np.arange(9.0), "a": np.arange(9.0) % 2 - 0.3}
+    log = datasets.read(write_parquet(tmp_path / "x.parquet", columns), "id", obs=["o"], action=["a"])
+    assert log.names == tuple(map(str, ids))
 
 
 def test_ranges_of_several_logs() -> None:
