@@ -59,9 +59,9 @@ def iqm(runs: list[Array]) -> Array:
     returns [...].
     """
     values, sizes = np.concatenate(runs, -1), [x.shape[-1] for x in runs]
-    order = values.argsort(-1)
+    order, n = values.argsort(-1), sum(sizes)
     weight = np.repeat(1 / (len(sizes) * np.array(sizes)), sizes)[order]
-    upto, cut = weight.cumsum(-1), len(order.T) // 4 / len(order.T)
+    upto, cut = weight.cumsum(-1), n // 4 / n  # as much as so many whole runs, as in Agarwal et al. (2021)
     inside = (np.minimum(upto, 1 - cut) - np.maximum(upto - weight, cut)).clip(min=0)
     return (np.take_along_axis(values, order, -1) * inside).sum(-1) / inside.sum(-1)
 

@@ -87,7 +87,7 @@ def test_exploration_that_sees_what_is_hidden(share: float) -> None:
 
 @pytest.mark.slow
 def test_trials_of_exploration_without_a_step() -> None:
-    """They act like nobody; the last of a log is one as good as another."""
+    """None of them acts as the expert does, the last trial of a log included."""
     explore = roll("drift", thetas("drift", 96, 1), True, 1)
     mask = explore.mask & (np.arange(96) % 5 < 4)[:, None, None]
     mask[-1] = False

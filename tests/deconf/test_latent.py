@@ -89,31 +89,27 @@ def test_even_steps_predict_odd_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not odd[..., ::2].any()
 
 
+def evidence_of(latents: Any, batch: Batch, per_theta: int) -> float:
+    """Of trials with these latents, 0 or 1, of which a wrong one costs a nat a step."""
+    own = torch.tensor(latents, dtype=torch.float)[None, :, None]
+    return latent._evidence(lambda _, given: -(given - own[:, :, None]).square()[..., 0], batch, own, per_theta)
+
+
 @pytest.mark.parametrize(("n", "per_theta", "nats"), [(4, 2, 1.0), (4, 1, 2 / 3), (16, 2, 4 / 7), (16, 1, 8 / 15)])
 def test_evidence_is_against_trials_under_other_thetas(n: int, per_theta: int, nats: float) -> None:
     """Pairs of trials share a latent, 0 or 1, in turn; a wrong one costs a nat a step. No trial is held against itself.
 
     Of four trials, two trials away is a wrong one; of sixteen, four of the seven that are a multiple of two away.
     """
-    latents = torch.tensor([0.0, 0, 1, 1]).repeat(n // 4)[None, :, None]
     batch = Batch.of(world(0.2, False, n, 0), 1)
-
-    def log_prob(data: Batch, given: torch.Tensor) -> torch.Tensor:
-        return -(given - latents[:, :, None]).square()[..., 0]
-
-    assert latent._evidence(log_prob, batch, latents, per_theta) == pytest.approx(nats)
+    assert evidence_of([0.0, 0, 1, 1] * (n // 4), batch, per_theta) == pytest.approx(nats)
 
 
 def test_evidence_hardly_depends_on_which_trials_are_neighbours() -> None:
     """Of a latent of two values, in any order of the trials; one neighbour each would tell .2 to .8 of them apart."""
     batch, rng = Batch.of(world(0.2, False, 40, 0), 1), np.random.default_rng(0)
-
-    def log_prob(data: Batch, given: torch.Tensor) -> torch.Tensor:
-        return -(given - latents[:, :, None]).square()[..., 0]
-
     for _ in range(20):
-        latents = torch.tensor(rng.permutation(np.arange(40) % 2), dtype=torch.float)[None, :, None]
-        assert latent._evidence(log_prob, batch, latents, 1) == pytest.approx(0.5, abs=0.08)
+        assert evidence_of(rng.permutation(np.arange(40) % 2), batch, 1) == pytest.approx(0.5, abs=0.08)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
-from deconfounded.envs.contract.core import CONTRACT
+from deconfounded.envs.contract.core import CONTRACT, STARTS
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.streams import Array, Streams
@@ -207,8 +207,8 @@ class Places(Push):
 
 
 def test_an_effect_from_one_of_several_starts_is_enough() -> None:
-    starts = np.concatenate([envs.BatchEnv(Places(), 1).reset(seed)[:, 0] for seed in range(3, 9)])
-    assert starts[0] * starts[1] < 0 or starts[0] * starts[-1] < 0
+    starts = [envs.BatchEnv(Places(), 1).reset(seed)[0, 0] for seed in range(3, 3 + STARTS)]
+    assert min(starts) < 0 < max(starts)
     CONTRACT["effect"](Places())
 
 
