@@ -480,6 +480,7 @@ def test_stakes_are_of_a_true_theta_and_another_that_is_told() -> None:
     assert returns[-1, 0] < 0.6 * returns[-1, -1]
 
 
+@pytest.mark.slow
 def test_the_error_of_a_certificate_s_checks(monkeypatch: pytest.MonkeyPatch) -> None:
     """How much they scatter over other trials, within a factor of 1.6."""
     rng = np.random.default_rng(0)

@@ -580,6 +580,7 @@ def test_gail_without_its_library(monkeypatch: pytest.MonkeyPatch) -> None:
         made("gail")
 
 
+@pytest.mark.slow
 def test_stable_baselines_leaves_no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Neither in a baseline's rounds nor for an expert."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
