@@ -207,8 +207,8 @@ def _evidence(log_prob: LogProb, data: Batch, latents: Tensor, per_theta: int) -
     n = latents.shape[1]
     shifts = range(per_theta, max(n - per_theta, per_theta) + 1, per_theta)
     shifts = shifts[:: -(-len(shifts) // OTHERS)]
-    own, *others = (log_prob(data, each_step(data, latents.roll(shift, 1))) for shift in (0, *shifts))
-    return typical(own - torch.stack(others).mean(0), data)
+    own, *mismatched = (log_prob(data, each_step(data, latents.roll(shift, 1))) for shift in (0, *shifts))
+    return typical(own - torch.stack(mismatched).mean(0), data)
 
 
 def _log_action(model: LatentModel, policy: ActionHead) -> LogProb:

@@ -34,11 +34,6 @@ def points() -> list[dict[str, Any]]:
     return [*of, point("windy_drone", "deconfounded", 4, [0.5]), point("windy_drone", "deconfounded", 1, [0.8])]
 
 
-def of_three(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """And of a third task, on which little exploration is of no use at all."""
-    return [*points, point("icy_stop", "deconfounded", 4, [0.0]), point("icy_stop", "deconfounded", 1, [0.9])]
-
-
 def test_methods_are_those_that_explore_or_query() -> None:
     """All but gail, whose interactions are no trials of the preset."""
     able = exploration.explorers()
@@ -116,7 +111,8 @@ def test_table(points: list[dict[str, Any]]) -> None:
 
 def test_median_loss(points: list[dict[str, Any]]) -> None:
     """Over tasks: .1 and .3 with a quarter; .4 of one task with a 16th; none with a 64th."""
-    for of, median in ((points, "0.20 (2)"), (of_three(points), "0.30 (3)")):  # .1, .3 and .9
+    third = [point("icy_stop", "deconfounded", share, [score]) for share, score in ((4, 0.0), (1, 0.9))]
+    for of, median in ((points, "0.20 (2)"), ([*points, *third], "0.30 (3)")):  # .1, .3 and .9
         last = exploration.median_losses(of).splitlines()[-1]
         assert [cell.strip() for cell in last.split("|")[1:-1]] == ["deconfounded", median, "0.40 (1)", ""]
 

@@ -21,16 +21,16 @@ def same(one: Any, other: Any) -> None:
 
 def test_a_reset_of_some_environments() -> None:
     """Each gets the theta that is given for it; what is asked of them depends on no other."""
-    env, some = envs.BatchEnv(envs.get(NAME), 3), np.array([False, True, True])
-    env.reset(0, where=some)
+    env, where = envs.BatchEnv(envs.get(NAME), 3), np.array([False, True, True])
+    env.reset(0, where=where)
     with pytest.raises(envs.InputError, match="keep_theta was given before the first reset"):
-        env.reset(options={"keep_theta": True}, where=~some)
-    before = env.theta[some]
-    env.reset(options={"keep_theta": True}, where=some)
-    np.testing.assert_array_equal(env.theta[some], before)
+        env.reset(options={"keep_theta": True}, where=~where)
+    before = env.theta[where]
+    env.reset(options={"keep_theta": True}, where=where)
+    np.testing.assert_array_equal(env.theta[where], before)
     given = envs.get(NAME).theta_grid(3)
-    env.reset(options={"theta": given}, where=some)
-    np.testing.assert_array_equal(env.theta[some], given[some])
+    env.reset(options={"theta": given}, where=where)
+    np.testing.assert_array_equal(env.theta[where], given[where])
 
 
 def test_a_theta_out_of_bounds_is_named() -> None:
