@@ -34,14 +34,16 @@ SLOT = (*APART, "method", "deployment", "seed")  # of which a task's file holds 
 
 
 def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: int) -> list[Record]:
-    """The records of what a job wrote of a seed, one for each agent that it scored; see record.schema.json."""
+    """The records of what a job wrote of a seed, one for each agent that it scored; see record.schema.json.
+
+    The training curve is in that of the agent as it is, and not again in those of its other ways of deployment.
+    """
     meta = data["meta"]
     seed = {key: meta["identity"][key] for key in ("task", "method", *MADE_OF) if key in meta["identity"]}
     seed |= {"versions": meta["identity"]["versions"]}
     seed |= {key: meta[key] for key in ("seed", "tier", "budget", "cpu_s", "commit", "machine")}
     seed |= {"schema": 3, "preset": preset, "set": list(changes), "episodes": episodes}
     seed |= {"spans": [[round(at, 1) for at in span] for span in meta["spans"]]}
-    seed |= {"curve": thinned(meta["curve"])} if meta["curve"] else {}
     seed |= {key: meta[key] for key in ("salts", "package") if key in meta}
     records = []
     for name, deployment in meta["agents"].items():
@@ -55,7 +57,8 @@ def of_job(data: dict[str, Any], preset: str, changes: Sequence[str], episodes: 
             "theta_r2": data[f"{name}/probe"].round(4).tolist(),
             "bits": bits(returns),
         }
-        records.append(seed | scored)
+        curve = {"curve": thinned(meta["curve"])} if meta["curve"] and not deployment else {}
+        records.append(seed | scored | curve)
     return records
 
 

@@ -94,13 +94,18 @@ def test_a_record_is_by_episode_over_trials() -> None:
     returns = np.array([[1.0, 10.0, 100.0], [3.0, 10.0, 104.0]])
     made = {"task": "bandit", "method": "x", "settings": {}, "versions": {}, "outside": {}, "salt": ""}
     made |= dict.fromkeys(("task_version", "method_version", "protocol", "expert_version"), 0) | {"expert": "e"}
-    meta = {"identity": made, "agents": {"x": ""}, "curve": {}, "seed": 4, "tier": "1", "budget": {}, "cpu_s": 1.0}
+    curve = {"imitation": [(1, 0.5), (2, 0.25)]}
+    meta = {"identity": made, "agents": {"x": "", "x_mode": "mode"}, "curve": curve, "seed": 4, "tier": "1"}
+    meta |= {"budget": {}, "cpu_s": 1.0}
     meta |= {"spans": [[0.0, 1.0]], "commit": None, "machine": "m"}
     data = {"meta": meta, "x/returns": returns, "x/objective": -returns, "x/probe": np.array([0.5, 0.6, 0.7])}
-    (record,) = records.of_job(data, "smoke", [], 3)
+    data |= {f"x_mode/{key}": data[f"x/{key}"] for key in ("returns", "objective", "probe")}
+    record, by_mode = records.of_job(data, "smoke", [], 3)
     assert (record["returns"], record["returns_sd"]) == ([2.0, 10.0, 102.0], [1.0, 0.0, 2.0])
     assert (record["objective"], record["theta_r2"]) == ([-2.0, -10.0, -102.0], [0.5, 0.6, 0.7])
     assert (record["eval_trials"], record["episodes"], record["seed"]) == (2, 3, 4)
+    assert record.pop("curve") == {"imitation": {"update": [1, 2], "loss": [0.5, 0.25]}}
+    assert by_mode == {**record, "deployment": "mode"}  # one training: its curve is kept once
 
 
 class TestBudget:
