@@ -128,7 +128,10 @@ def _cpu() -> str:
 
 @cache
 def commit() -> str | None:
-    """Of this checkout, with a + if files differ from it; None outside of one."""
+    """Of this checkout, with a + if files differ from it; None outside of one.
+
+    Changed records, which `deconf table` makes one after another, are no difference: nothing is made of them but pages.
+    """
 
     def run(*what: str) -> str:
         return os.fsdecode(subprocess.run(["git", *what], cwd=ROOT, capture_output=True, check=True).stdout)
@@ -137,6 +140,7 @@ def commit() -> str | None:
         top = run("rev-parse", "--show-toplevel").strip()
         if Path(top).resolve() != ROOT:
             return None
-        return run("rev-parse", "HEAD").strip() + ("+" if run("status", "--porcelain", "-uno") else "")
+        changed = run("status", "--porcelain", "-uno", "--", ".", ":(exclude)docs/records")
+        return run("rev-parse", "HEAD").strip() + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Signature, extent
 from deconfounded.deconf.core.layers import Linear, Mlp
 from deconfounded.deconf.core.sizes import HEAVY
 
@@ -30,8 +30,18 @@ def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
     return mean, ((flat - mean[:, None]).square() * weight).sum(1) / count
 
 
+def medians(x: Tensor, kept: Tensor) -> Tensor:
+    """Medians [S, F] of x [S, N, F] where kept [S, N]; 0 of a seed that has no step."""
+    return torch.stack(
+        [rows[own].median(0).values if own.any() else rows[0] * 0 for rows, own in zip(x, kept, strict=True)]
+    )
+
+
 class Scaler(nn.Module):
-    """Standardises by mean and std of data [S, ..., F] where mask is 1; columns that hardly vary keep their scale."""
+    """Standardises by mean and std of data [S, ..., F] where mask is 1; columns that hardly vary keep their scale.
+
+    The rounded mean of a constant is not quite that constant, so that its std is not 0: it is known by its range.
+    """
 
     mean: Tensor
     std: Tensor
@@ -40,8 +50,10 @@ class Scaler(nn.Module):
         super().__init__()
         mean, variance = moments(data, mask)
         std, size = variance.sqrt(), data.abs().flatten(1, -2).amax(1)
+        low, high = extent(data.flatten(1, -2)[:, :, None], mask.flatten(1)[..., None])
+        varies = (std > (1e-5 * size).clamp(max=1e-6)) & (high > low)[:, 0]
         self.register_buffer("mean", mean)
-        self.register_buffer("std", torch.where(std > (1e-5 * size).clamp(max=1e-6), std, torch.ones_like(std)))
+        self.register_buffer("std", torch.where(varies, std, torch.ones_like(std)))
 
     def forward(self, x: Tensor) -> Tensor:
         return (x - per_seed(self.mean, x)) / per_seed(self.std, x)
@@ -65,9 +77,8 @@ class LabelScaler(Scaler):
         flat, kept = data.flatten(1, -2), mask.flatten(1) > 0
         mean, variance = moments(data, mask)
         fourth, _ = moments((data - per_seed(mean, data)).square().square(), mask)
-        median = torch.stack([x[steps].median(0).values for x, steps in zip(flat, kept, strict=True)])
-        distance = (flat - median[:, None]).abs()
-        usual = 1.48 * torch.stack([x[steps].median(0).values for x, steps in zip(distance, kept, strict=True)])
+        median = medians(flat, kept)
+        usual = 1.48 * medians((flat - median[:, None]).abs(), kept)
         super().__init__(data, mask)
         self.register_buffer("median", median)
         self.register_buffer("size", torch.where(usual > 1e-6, usual, self.std))

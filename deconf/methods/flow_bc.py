@@ -168,7 +168,8 @@ class FlowAgent(LearnedAgent):
 
     def remember(self, step: Batch) -> None:
         new = self.before(step.obs, step.action, step.mask)
-        self._past = torch.cat([new[:, :, None], self._past[:, :, :-1]], 2)
+        longer = torch.cat([new[:, :, None], self._past[:, :, :-1]], 2)
+        self._past = torch.where(step.mask[..., None, None] > 0, longer, self._past)
 
     def loss(self, episodes: Batch, label: Tensor, steps: int | None, draws: Draws) -> Tensor:
         """The loss [S] of chunks of labels [S, B, T, A] from so many steps of episodes [S, B, T] on; None: from all."""
@@ -220,6 +221,7 @@ def train(trials: Source, config: FlowConfig, rng: Rngs, monitor: Monitor | None
 
 @uses(
     "demonstrations",
+    version=2,
     cost=2,
     on_control=FlowConfig(),
     on_bandit=FlowConfig(updates=1500, executed=1, ahead=4, history=32),

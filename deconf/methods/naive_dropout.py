@@ -1,7 +1,7 @@
 """Recurrent behavioural cloning with dropout of past actions (Swamy et al., 2022).
 
-The memory reads each past action with probability 1 - dropout in training, and all of them in deployment. All else is
-naive_rnn's.
+The memory reads each past action with probability 1 - dropout in training, divided by that probability, as torch's
+Dropout does; in deployment it reads all of them as they are. All else is naive_rnn's.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,11 @@
 """Records by what they claim: what they were made of decides whether they are kept, and they can be made again."""
 
 import queue
+import re
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -151,14 +152,23 @@ def test_an_identity_is_of_no_device(tmp_path: Path) -> None:
     assert first == second
 
 
-@pytest.mark.parametrize(("status", "commit"), [("", "abc"), (" M x.py\n", "abc+")])
-def test_a_commit_of_changed_files_has_a_plus(status: str, commit: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a folder in another checkout has none."""
-    said = {"--show-toplevel": f"{identity.ROOT}\n", "HEAD": "abc\n", "--porcelain": status}
-    answer = lambda command, **_: SimpleNamespace(stdout=said[command[2]].encode())  # noqa: E731
-    monkeypatch.setattr(identity.subprocess, "run", answer)
+def test_a_commit_of_changed_files_has_a_plus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not where records alone have changed, as after each method of a table; a folder in another checkout has none."""
+    code, record = tmp_path / "code.py", tmp_path / "docs" / "records" / "bandit.jsonl"
+    record.parent.mkdir(parents=True)
+    git = ("git", "-C", str(tmp_path), "-c", "user.name=A", "-c", "user.email=a@example.org")
+    for file in (code, record):
+        file.write_text("1")
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "first"]):
+        subprocess.run([*git, *words], check=True)
+    monkeypatch.setattr(identity, "ROOT", tmp_path.resolve())
+    commit = identity.commit.__wrapped__()
+    assert re.fullmatch("[0-9a-f]{40}", commit or "")
+    record.write_text("2")
     assert identity.commit.__wrapped__() == commit
-    said["--show-toplevel"] = f"{identity.ROOT.parent}\n"
+    code.write_text("2")
+    assert identity.commit.__wrapped__() == f"{commit}+"
+    monkeypatch.setattr(identity, "ROOT", record.parent.resolve())
     assert identity.commit.__wrapped__() is None
 
 

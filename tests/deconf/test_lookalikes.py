@@ -265,8 +265,10 @@ def test_small_units_are_no_constants() -> None:
     x = torch.randn(1, 50, 20, 1, generator=torch.Generator().manual_seed(0))
     mask = torch.ones(1, 50, 20)
     torch.testing.assert_close(Scaler(1e-7 * x, mask)(1e-7 * x), Scaler(x, mask)(x), rtol=1e-3, atol=1e-3)
-    for constant in (0.0, 1e-7, 0.1, 0.3, 7.0, 1e4):
-        assert Scaler(torch.full_like(x, constant), mask).std.item() == 1
+    for constant in (0.0, 1e-7, 0.1, 0.3, 7.0, 30.1, 100.3, 1000.1, 1e4, 12345.6):
+        column = torch.full((1, 500, 256, 1), constant)
+        column[:, :, 200:] = 0  # padding
+        assert Scaler(column, (torch.arange(256) < 200).float().expand(1, 500, -1)).std.item() == 1
 
 
 class TestHeavyTails:
@@ -288,6 +290,14 @@ class TestHeavyTails:
         padded, short = LabelScaler(x, mask), LabelScaler(x[:, :, :8], mask[:, :, :8])
         assert padded.heavy.tolist() == [[True, False]]
         torch.testing.assert_close(padded(self.x), short(self.x))
+
+    def test_a_seed_without_a_step(self) -> None:
+        """It leaves the others as they are, and its own labels, too."""
+        x, mask = self.x.repeat(2, 1, 1, 1), self.mask.repeat(2, 1, 1)
+        mask[1] = 0
+        both, alone = LabelScaler(x, mask)(x), LabelScaler(self.x, self.mask)(self.x)
+        assert torch.equal(both[:1], alone)
+        assert torch.equal(both[1:], self.x)
 
     def test_inverse(self) -> None:
         scaler = LabelScaler(self.x, self.mask)

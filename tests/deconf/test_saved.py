@@ -1,7 +1,8 @@
-"""Agents that were saved before can be loaded: their classes and arrays have the names that they had."""
+"""Trained agents of all methods: those that were saved before can be loaded, and memories hold what took place."""
 
 import hashlib
 
+import numpy as np
 import pytest
 
 from deconfounded import envs
@@ -37,14 +38,40 @@ SAVED: dict[str, tuple[str, str]] = {
 """By method: the agent's class, and a hash of the names of its arrays and of what its shape states."""
 
 
+@pytest.fixture(scope="module", params=[name for name, declared in METHODS.items() if declared.learned])
+def method(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def agent(method: str) -> LearnedAgent:
+    made = fit(Context(envs.get("curling"), tiny_preset(), [0]), method)
+    assert isinstance(made, LearnedAgent)
+    return made
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [name for name, declared in METHODS.items() if declared.learned])
-def test_names_are_those_of_agents_that_were_saved(method: str) -> None:
+def test_names_are_those_of_agents_that_were_saved(method: str, agent: LearnedAgent) -> None:
     """Or nobody can load these; version 6 of `deconfounded` was such a change, and the changelog says so."""
-    agent = fit(Context(envs.get("curling"), tiny_preset(), [0]), method)
-    assert isinstance(agent, LearnedAgent)
     settings, arrays = agent.state()
     names = " ".join([*sorted(arrays), *sorted(settings), *sorted(settings["shape"])])
     today = f"{type(agent).__module__}:{type(agent).__qualname__}", hashlib.sha256(names.encode()).hexdigest()[:12]
     remedy = "undo that; or, if it is meant, say so in CHANGELOG, and put here what it is now"
     assert SAVED.get(method) == today, f"agents of {method} that were saved before cannot be loaded: {remedy}"
+
+
+@pytest.mark.slow
+def test_a_memory_stays_where_an_episode_is_over(agent: LearnedAgent) -> None:
+    """While another trial's goes on; probes read it when all are over."""
+    obs = np.random.default_rng(0).standard_normal((5, 2, agent.policy.signature.obs), dtype=np.float32)
+    obs[1:, 0] = obs[1, 0]  # where it ended
+    agent.begin(2)
+    agent.reset([np.random.default_rng(0)])
+    if agent.features() is None:
+        return
+    memories = []
+    for i in range(4):
+        agent.observe(obs[i], agent.act(obs[i]), obs[i + 1], np.array([i == 0, True]))
+        memories.append(agent.features())
+    _, over, *later = memories  # a transformer reads the last transition when it acts on it
+    assert all(np.array_equal(memory[0], over[0]) and (memory[1] != over[1]).any() for memory in later)
