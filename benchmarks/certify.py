@@ -58,17 +58,18 @@ class EvidenceRecorder(ExpertAgent):
         super().begin(n)
         if self.particles:
             self.particles.begin(n)
-        self.log_belief, self._steps = self.grid.prior(n), 0
+        self.log_belief = self._updated = self.grid.prior(n)
+        self._truth, self._steps = np.full((n, len(self.env.task.latents)), np.nan), 0
         self.dynamics: list[Array] = []  # nats for the true theta over another one of the grid, a step
         self.actions: list[Array] = []
         self.estimates: list[Array] = []  # of theta [N, L], at the end of each episode
         self.truths: list[Array] = []  # theta [N, L] then
 
     def note(self) -> None:
-        """Keep the estimate of the theta of an episode's last step, now that it is over."""
+        """Keep the estimate of the theta of an episode's last step that took place, now that it is over."""
         mean = self.particles.mean(self.particles.log_weight) if self.particles else self.grid.mean(self._updated)
         self.estimates.append(mean)
-        self.truths.append(self._theta)
+        self.truths.append(self._truth)
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
@@ -100,8 +101,10 @@ class EvidenceRecorder(ExpertAgent):
         if self.particles:
             self.particles.learn(self._state, obs, action, self.env.state, alive)
         updated = self.grid.updated(self.log_belief, self._state, obs, log_dynamics)
-        self._updated = np.where(alive.reshape(-1, *[1] * (updated.ndim - 1)), updated, self.log_belief)
-        self.log_belief = self.grid.predict_steps(self._updated)
+        took_place = alive.reshape(-1, *[1] * (updated.ndim - 1))
+        self._updated = np.where(took_place, updated, self._updated)
+        self._truth = np.where(alive[:, None], self._theta, self._truth)
+        self.log_belief = self.grid.predict_steps(np.where(took_place, updated, self.log_belief))
         self._steps += 1
 
 

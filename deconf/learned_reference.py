@@ -114,7 +114,7 @@ def steps(rollouts: list[Rollout], which: Mask) -> tuple[Array, Array, Array, Ar
 
 
 def calibrated(dynamics: LearnedDynamics, rollouts: list[Rollout], which: Mask) -> float:
-    """The exponent under which posteriors of the true theta among decoys are best, over all beginnings of trials."""
+    """The exponent under which posteriors of the true theta among others are best, over all beginnings of trials."""
     decoys = dynamics.task.theta_grid(DECOYS)
     score = np.zeros(len(EXPONENTS))
     for rollout in rollouts:
@@ -122,7 +122,9 @@ def calibrated(dynamics: LearnedDynamics, rollouts: list[Rollout], which: Mask) 
             trial = np.arange(len(which)) == b
             obs, action, next_obs, theta = steps([rollout], trial)
             true = dynamics.log_prob(obs, action, next_obs, theta)
-            nats = (dynamics.log_grid(obs, action, next_obs, decoys) - true[:, None]).cumsum(0)
+            nats = dynamics.log_grid(obs, action, next_obs, decoys) - true[:, None]
+            nats[(decoys == theta[:, None]).all(-1)] = -np.inf  # no other one: of a category the grid has each value
+            nats = nats.cumsum(0)
             score -= [np.logaddexp.reduce(np.insert(e * nats, 0, 0, 1), 1).mean() for e in EXPONENTS]
     return EXPONENTS[int(score.argmax())]
 

@@ -2,14 +2,15 @@
 
 A grid of so many latents has too few values of each. K particles are drawn from p(theta), and weighed by the
 likelihood of every transition. Before their effective number falls below K / 2, they are drawn anew by their weights
-and moved: by a normal kernel that keeps their mean and covariance (Liu and West 2001), in quantiles of the latents,
-reflected at 0 and 1. Values of categorical latents stay as they are: between two of them lies a third. A transition
-that says much is taken in by several such stages, each with a power of its likelihood.
+and moved: by a normal kernel that keeps their mean and covariance (Liu and West 2001), in normal scores of the latents,
+in which p(theta) is N(0, I): a latent of which nothing is known stays as it was. Values of categorical latents stay as
+they are: between two of them lies a third. A transition that says much is taken in by several such stages, each with a
+power of its likelihood.
 
 Simulating every particle would cost too much. A share of them is simulated, and the outcomes of the others are those of
 a quadratic function of theta, fitted to these by least squares for each transition. Where it misses the log-likelihoods
-of those simulated, as of thetas far apart, and wherever a latent is categorical, every particle is simulated, trial by
-trial, as a model of each particle of all trials would take gigabytes.
+of those simulated (it misses others by more), and wherever a latent is categorical, every particle is simulated, trial
+by trial, as a model of each particle of all trials would take gigabytes.
 """
 
 from collections.abc import Sequence
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
 
 from deconfounded.deconf.core.deployment import Way, acted_on
 from deconfounded.deconf.exact import GRID, ExactAgent, Grid
@@ -30,13 +32,12 @@ from deconfounded.envs.task import Simulator
 from deconfounded.experts.agent import Agent
 from deconfounded.experts.policy import Expert, sample_rows
 
-PARTICLES = 1024
+PARTICLES = 1024  # of a trial
 GRID_UP_TO = 2  # latents: a task of more needs particles, unless its posterior factorises
 SIMULATED, LEAST = 1.5, 15  # particles for each coefficient of the quadratic; in all, so that they show a kink
 TOLERANCE, NEAR = 0.1, 10.0  # nats: rms error of the quadratic, over particles so near the likeliest one
-KERNEL = 0.5  # std of the kernel, in units of the particles' own
-IMPOSSIBLE = 50  # nats by which a likelihood of 0 is below the least other one
-HALVINGS = 20  # of the interval, in the search for the power of a stage
+KERNEL, IMPOSSIBLE = 0.5, 50  # the kernel's std, of the particles' own; nats from the least likelihood down to 0
+EDGE, HALVINGS = 1e-9, 20  # of quantiles, from 0 and 1; of the interval, in the search for the power of a stage
 
 
 class Particles:
@@ -124,7 +125,7 @@ class Particles:
         return self.theta[np.arange(len(self.theta)), sample_rows(np.exp(log_weight), rng)]
 
     def mode(self, log_weight: Array) -> Array:
-        """As `mean`: that of a normal fitted to the particles, as they have no density of their own."""
+        """As `mean`: that of a normal fitted to the particles, which have no density."""
         return self.mean(log_weight)
 
     def mean(self, log_weight: Array) -> Array:
@@ -142,7 +143,7 @@ class Particles:
 
     def _set(self, rows: NDArray[np.int64], u: Array) -> None:
         """Replace the particles of trials `rows` by those of quantiles u [M, K, L], folded into [0, 1)."""
-        self._u[rows] = u = folded(u).clip(max=1 - 1e-9)
+        self._u[rows] = u = folded(u).clip(max=1 - EDGE)
         theta = np.stack([lat.ppf(u[..., i]) for i, lat in enumerate(self.task.latents)], -1)
         share = self._simulated
         changed = (theta != self.theta[rows])[:, share].any(-1)
@@ -223,35 +224,35 @@ class Particles:
 
     def _move(self, rows: NDArray[np.int64]) -> None:
         """Draw particles of trials `rows` anew by their weights, and move them, but for categorical latents."""
-        u, weight = self._u[rows], np.exp(self.log_weight[rows])
-        mean = self._centre(rows, u, weight)
-        spread = np.einsum("nk,nkl,nkm->nlm", weight, u - mean, u - mean)
-        root = np.linalg.cholesky(spread + 1e-12 * np.eye(u.shape[-1]))
+        z, weight = ndtri(self._u[rows].clip(min=EDGE)), np.exp(self.log_weight[rows])
+        mean, root = self._moments(rows, z, weight)
         draws = Streams([self._rngs[i] for i in rows.tolist()])
-        start = draws.random((len(rows), 1))
-        level = (start + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
+        level = (draws.random((len(rows), 1)) + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
         level = level * weight.sum(-1, keepdims=True)
         index = np.stack([np.searchsorted(*each) for each in zip(weight.cumsum(-1), level, strict=True)])
         index = index.clip(0, PARTICLES - 1)[..., None]
-        kept = np.take_along_axis(u, index, 1)
         if mean.shape[1] > 1:
-            mean = np.take_along_axis(mean, index, 1)
-        normal = draws.standard_normal((u[..., 0].size, u.shape[-1])).reshape(u.shape)
-        noise = np.einsum("nlm,nkm->nkl", root, normal)
-        moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * noise
+            mean, root = np.take_along_axis(mean, index, 1), np.take_along_axis(root, index[..., None], 1)
+        normal = draws.standard_normal((z[..., 0].size, z.shape[-1])).reshape(z.shape)
+        kept = np.take_along_axis(z, index, 1)
+        moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * (root @ normal[..., None])[..., 0]
         self.log_weight[rows] = -np.log(PARTICLES)
-        self._set(rows, np.where(self._categorical, kept, moved))
+        self._set(rows, np.where(self._categorical, np.take_along_axis(self._u[rows], index, 1), ndtr(moved)))
 
-    def _centre(self, rows: NDArray[np.int64], u: Array, weight: Array) -> Array:
-        """The mean [M, 1, L] of quantiles u [M, K, L]; or, of each particle, that of its own categories [M, K, L].
+    def _moments(self, rows: NDArray[np.int64], z: Array, weight: Array) -> tuple[Array, Array]:
+        """Means [M, 1, L] of z [M, K, L], and roots of covariances; or, of each particle, its category's [M, K, ..].
 
-        So other latents go on depending on a category as they do: towards a mean over categories they would forget it.
+        So other latents go on depending on a category as they do: by moments over categories they would forget it.
         """
-        if not self._categorical.any():
-            return np.einsum("nk,nkl->nl", weight, u)[:, None]
-        category = self.theta[rows][..., self._categorical]
-        share = (category[:, :, None] == category[:, None]).all(-1) * weight[:, None]
-        return (share @ u) / np.maximum(share.sum(-1, keepdims=True), 1e-300)
+        share = weight[:, None]
+        if self._categorical.any():
+            category = self.theta[rows][..., self._categorical]
+            share = share * (category[:, :, None] == category[:, None]).all(-1)
+        share = share / np.maximum(share.sum(-1, keepdims=True), 1e-300)
+        mean = share @ z
+        products = (z[..., None] * z[..., None, :]).reshape(*z.shape[:2], -1)
+        spread = (share @ products).reshape(*mean.shape, -1) - mean[..., None] * mean[..., None, :]
+        return mean, np.linalg.cholesky(spread + 1e-12 * np.eye(z.shape[-1]))
 
 
 def quadratic(x: Array) -> Array:

@@ -17,10 +17,9 @@ from deconfounded.benchmarks.output.templates import template
 from deconfounded.envs.streams import Array
 
 NOTE = (
-    "Scores in the last episode, over all tasks whose certificate is passed and where all three were run, with the seeds"
-    " that all three have. Baselines"
-    " were tuned for their scores on two of these tasks, with other seeds. naive_rnn kept its preset, though other"
-    " settings score higher, see baselines.md."
+    "Scores in the last episode, over all tasks whose certificate is passed and where all three were run, with the"
+    " seeds that all three have. Baselines were tuned for their scores on two of these tasks, with other seeds."
+    " naive_rnn kept its preset, though other settings score higher, see baselines.md."
 )
 QUESTIONS = {
     "naive_transformer": "Does scale cure the delusion?",

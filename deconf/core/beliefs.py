@@ -185,10 +185,11 @@ class EvidenceBelief(Belief):
 class InnovationBelief(EvidenceBelief):
     """The order-free belief whose evidence is linear in innovations, sum_t G(s_t, a_t) (s'_t - E[s' | s_t, a_t]).
 
-    That is the sufficient statistic of a linear-Gaussian effect of theta, s' = f(s, a) + g(s, a) theta + noise, with
-    gains G = g^T Sigma^-1, which are learned. Evidence that depends on states otherwise tells of theta by where a trial
-    went: a controller that is wrong about theta drifts to one side. This holds of exploration, but not of the expert's
-    trials, so that their latents differ from those by which an agent acts.
+    That is the linear part of the evidence of a linear-Gaussian effect of theta, s' = f(s, a) + g(s, a) theta + noise,
+    with gains G = g^T Sigma^-1, which are learned; the precision is taken for a function of the count. Evidence that
+    depends on states otherwise tells of theta by where a trial went: a controller that is wrong about theta drifts to
+    one side. This holds of exploration, but not of the expert's trials, so that their latents differ from those by
+    which an agent acts.
     """
 
     linear = True

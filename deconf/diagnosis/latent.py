@@ -125,7 +125,8 @@ def shared_with(explored: Batch, expert: Batch, model: LatentModel, policy: Late
             acted.append(action - action.mean(1, keepdim=True))
         return float((acted[0] * acted[1]).mean())
 
-    return min(max(lasting(explored) / max(lasting(expert), 1e-12), 0.0), 1.0)
+    whole = lasting(expert)
+    return min(max(lasting(explored) / whole, 0.0), 1.0) if whole > 0 else 0.0  # of nothing, no share is known
 
 
 def halves(data: Batch) -> tuple[Batch, Batch]:

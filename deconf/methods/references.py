@@ -35,13 +35,13 @@ EXACT: dict[str, Any] = {
 }
 
 
-@uses("environment", cost=1, **EXACT)
+@uses("environment", version=2, cost=1, **EXACT)
 def conditional(given: Given) -> Agent:
     """The exact conditional policy: the optimum of naive cloning."""
     return _exact(given, True)
 
 
-@uses("environment", cost=4, **EXACT, deployments=deployments("episode", "mode", "mean"))
+@uses("environment", version=2, cost=4, **EXACT, deployments=deployments("episode", "mode", "mean"))
 def interventional(given: Given) -> Agent:
     """The exact interventional policy, by posterior sampling, given the state: what deconfounded imitation aims at."""
     return _exact(given, False)

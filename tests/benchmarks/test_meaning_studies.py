@@ -201,6 +201,21 @@ class TestCertificates:
         np.testing.assert_allclose(recorder.log_belief, recorder.grid.predict(learned))
         assert (recorder.log_belief.max(-1) < learned.max(-1)).all()
 
+    def test_estimates_are_of_the_theta_of_the_last_step_that_took_place(self) -> None:
+        """Where theta switches on, and the belief with it, while other trials' episodes last longer."""
+        env = envs.BatchEnv(toys.Switch(), 256)
+        expert = CallableExpert(env.task, toys.control, "control")
+        recorder = certify.EvidenceRecorder(env, expert, Grid(env, expert, 9))
+        rollout = run_trials(env, recorder, 2, 0)
+        recorder.note()
+        steps = rollout.trials.mask.sum(2)
+        assert (steps < steps.max()).mean() > 0.5
+        theta = of_steps(rollout.theta, env.task.horizon)
+        for episode, (estimate, truth) in enumerate(zip(recorder.estimates, recorder.truths, strict=True)):
+            last = theta[np.arange(256), episode, steps[:, episode] - 1]
+            np.testing.assert_array_equal(truth, last)
+            assert np.corrcoef(estimate[:, 0], last[:, 0])[0, 1] > 0.95
+
     def test_evidence_of_dynamics(self) -> None:
         """The mean log-likelihood ratio of theta against a grid: of Gaussians, half the squared difference of means."""
         env = envs.BatchEnv(PUSH, 256)

@@ -208,3 +208,5 @@ def test_a_latent_in_the_system_lasts_through_exploration_too(
     expert, explored = (moved(rng.choice([-30.0, 30.0], (n, episodes))) for episodes in (1, 2))
     shared = latent.shared_with(explored, expert, model, policy)  # type: ignore[arg-type]
     assert share[0] <= shared <= share[1]
+    monkeypatch.setattr(latent, "final_belief", lambda _, batch: belief(_, batch) * (batch.obs is not expert.obs))
+    assert latent.shared_with(explored, expert, model, policy) == 0  # type: ignore[arg-type]  # nothing lasts there

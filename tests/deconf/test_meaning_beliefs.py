@@ -135,6 +135,28 @@ def test_an_exponent_is_of_whole_beginnings_of_trials() -> None:
     assert learned_reference.calibrated(dynamics, [rollout], np.ones(n, bool)) < 0.2
 
 
+@pytest.mark.parametrize("effect", [0.2, 0.5])
+def test_an_exact_likelihood_of_a_category_keeps_its_exponent(effect: float) -> None:
+    """The true category is among all values of the grid, and counts once; a world of one effect a category."""
+    rng, n, length = np.random.default_rng(0), 400, 20
+    theta = rng.integers(3, size=(n, 1, 1)).astype(float)
+    obs = effect * theta[..., None] + rng.standard_normal((n, 1, length + 1, 1))
+
+    class Exact:
+        task = toys.Arms()
+
+        def log_prob(self, obs: Array, action: Array, next_obs: Array, theta: Array) -> Array:
+            return -0.5 * (next_obs[:, 0] - effect * theta[:, 0]) ** 2
+
+        def log_grid(self, obs: Array, action: Array, next_obs: Array, decoys: Array) -> Array:
+            return -0.5 * (next_obs - effect * decoys[:, 0]) ** 2
+
+    actions, mask = np.zeros((n, 1, length, 1)), np.ones((n, 1, length), bool)
+    rollout = Rollout(Trials(obs, actions, mask), np.zeros((n, 1)), theta)
+    dynamics: Any = Exact()
+    assert learned_reference.calibrated(dynamics, [rollout], np.ones(n, bool)) == 1
+
+
 def test_padding_is_no_reason_to_forget() -> None:
     """Steps that did not take place do not count in the choice of what is kept between episodes."""
     generator, trials, episodes, steps, kept = torch.Generator().manual_seed(0), 200, 4, 5, []
