@@ -214,7 +214,7 @@ class TestCertificates:
         for episode, (estimate, truth) in enumerate(zip(recorder.estimates, recorder.truths, strict=True)):
             last = theta[np.arange(256), episode, steps[:, episode] - 1]
             np.testing.assert_array_equal(truth, last)
-            assert np.square(estimate - last).mean() < 0.1 * last.var()
+            assert np.square(estimate - last).mean() < 0.03 * last.var()
 
     def test_evidence_of_dynamics(self) -> None:
         """The mean log-likelihood ratio of theta against a grid: of Gaussians, half the squared difference of means."""
