@@ -31,7 +31,7 @@ def add_data(parser: argparse.ArgumentParser) -> None:
 
 def columns(args: argparse.Namespace) -> dict[str, Any]:
     """Columns that were given, as arguments of `datasets.read`."""
-    return {name: getattr(args, name) for name in COLUMNS if getattr(args, name)}
+    return {name: getattr(args, name) for name in COLUMNS if getattr(args, name) not in (None, [])}
 
 
 def read(data: list[Path], explore: list[Path] | None, chosen: dict[str, Any]) -> "tuple[Log, Log | None]":

@@ -39,6 +39,9 @@ def main() -> None:
         raise envs.InputError(f"{file} is here already; give --out {file} to replace it, or another --out")
     envs.check_task(task)
     check_file(file)
+    if not policy.has_card(file):
+        what = f"{file.with_suffix('.json')}, where the card of the weights belongs, is none"
+        raise envs.InputError(f"{what}; give another --out")
     from deconfounded.experts.train import PPO_SETTINGS, train
 
     start = time.time()

@@ -104,9 +104,14 @@ class Given:
 
     def progress(self, share: float, **losses: float) -> None:
         """Report the share of the training that is done, from 0 to 1, and losses for the learning curve."""
-        if not np.isfinite([share, *losses.values()]).all():
+        try:
+            share, *values = map(float, (share, *losses.values()))  # of arrays and tensors that are a number
+            finite = bool(np.isfinite([share, *values]).all())
+        except Exception:  # any error of a class from outside
+            finite = False
+        if not finite:
             raise InputError(f"progress was {share}, {losses}; it must be finite numbers")
-        self.monitor.update(round(1000 * min(max(share, 0), 1)), 1000, losses)
+        self.monitor.update(round(1000 * min(max(share, 0), 1)), 1000, dict(zip(losses, values, strict=True)))
 
 
 class Environments:

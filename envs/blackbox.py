@@ -18,7 +18,7 @@ from deconfounded.envs.latent import Latent
 from deconfounded.envs.streams import Array, Mask, Streams
 from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.task import Renderer, Simulator, Task
-from deconfounded.envs.world import Facts, World, bounds, drawn, facts, made, part
+from deconfounded.envs.world import Facts, World, as_numbers, bounds, drawn, facts, made, part
 
 LARGEST = float(np.finfo(np.float32).max)  # of an observation
 LEAST_PART = 4  # draws that a theta of a grid stands for, at least
@@ -249,7 +249,7 @@ class BlackBox(Task):
         for seen, hidden in zip(obs, theta, strict=True):
             with part(self.name, "expert"):
                 given = self.facts.world.expert(seen.astype(float), hidden.copy())
-                rows.append(np.asarray(given, float).reshape(-1))
+                rows.append(as_numbers(given, f"expert of {self.name}").reshape(-1))
             right = () if isinstance(space, spaces.Discrete) else space.shape
             if rows[-1].size != np.prod(right) or not np.isfinite(rows[-1]).all():
                 wrong = f"{given if given is None else rows[-1].tolist()} for an observation"

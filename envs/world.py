@@ -127,19 +127,30 @@ def made(name: str, world: World, theta: Array) -> gymnasium.Env[Any, Any]:
     if not any(parameter.name == "seed" or parameter.kind == parameter.VAR_KEYWORD for parameter in parameters):
         raise InputError(f"reset of {name} takes no seed; it must be reset(seed=None, options=None), as gymnasium.Env")
     seen, acts = (" ".join(str(space).split()) for space in (env.observation_space, env.action_space))
-    if not isinstance(env.observation_space, spaces.Box) or len(env.observation_space.shape) != 1:
-        right = "a Box of one axis: wrap it in gymnasium.wrappers.FlattenObservation"
+    shape = env.observation_space.shape if isinstance(env.observation_space, spaces.Box) else ()
+    if len(shape) != 1 or not shape[0]:
+        wrapped = "a Box of one axis: wrap it in gymnasium.wrappers.FlattenObservation"
+        right = "of one number or more" if shape == (0,) else wrapped
         raise InputError(f"observation_space of {name} was {seen}; it must be {right}")
     if isinstance(space := env.action_space, spaces.Discrete):
         return env
-    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
-        raise InputError(f"action_space of {name} was {acts}; it must be Discrete, or a Box of one axis")
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1 or not space.shape[0]:
+        raise InputError(f"action_space of {name} was {acts}; it must be Discrete, or a Box of one axis, not empty")
     with np.errstate(over="ignore"):  # a range of the largest numbers is infinite
         bounded = np.isfinite(space.high - space.low).all() and (space.low < space.high).all()
     if not bounded:
         right = "bounded, as its bounds are scaled to -1 and 1"
         raise InputError(f"action_space of {name} was {acts}; it must be {right}")
     return env
+
+
+def as_numbers(given: Any, who: str) -> Array:
+    """What an expert gave, as an array of numbers. Raises InputError if it is none."""
+    try:
+        return np.asarray(given, float)
+    except (TypeError, ValueError):
+        hint = ": of what `predict` of Stable-Baselines3 returns, the first part" if isinstance(given, tuple) else ""
+        raise InputError(f"{who} gave a {type(given).__name__}; it must be an array of numbers{hint}") from None
 
 
 def bounds(space: spaces.Box) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from deconfounded.envs import BatchEnv, InputError, Task
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS, Array, Streams
+from deconfounded.envs.world import as_numbers
 
 RandomSource = np.random.Generator | Streams
 
@@ -105,7 +106,8 @@ class CallableExpert(BoxExpert):
         """Mean action, clipped to [-1, 1]. Raises InputError unless it is a finite row for each observation."""
         parts = zip(np.split(obs, groups), np.split(theta, groups), strict=True)
         try:  # on copies, as the callable may change them in place
-            given = np.concatenate([np.asarray(self.call(np.array(o), np.array(t)), float) for o, t in parts])
+            rows = [as_numbers(self.call(np.array(o), np.array(t)), f"expert {self.name}") for o, t in parts]
+            given = np.concatenate([np.atleast_1d(row) for row in rows])
         except InputError:
             raise
         except Exception as error:
@@ -120,6 +122,11 @@ def path(task: Task) -> Path:
     """Path of the weights of a task's expert; its card is the .json beside them."""
     folder = ASSETS / "experts" if task.home == ASSETS else task.home
     return folder / f"{task.name}.safetensors"
+
+
+def has_card(file: Path) -> bool:
+    """Whether what is in the place of the card of a file of weights, if anything is there, is a card."""
+    return not file.with_suffix(".json").exists() or "sha256" in _card(file)
 
 
 def _card(file: Path) -> dict[str, Any]:
@@ -161,7 +168,10 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")
     file = path(task) if source is None else Path(source)
-    remedy = f"`deconf train --task {task.reference or task.name} --out {file}` makes such a file"
+    if file.suffix != ".safetensors":
+        raise InputError(f"expert was {source}; it must be weights.safetensors, or path/file.py:name of a callable")
+    train = f"`deconf train --task {task.reference or task.name} --out {file}` makes such a file"
+    remedy = f"the expert of {task.name} itself is a closed form" if task.has_closed_expert else train
     return NetworkExpert(task, _weights(task, file, remedy))
 
 

@@ -122,10 +122,16 @@ class Guest(Agent):
             answer = ("over", self.provider(kind, *what, agent=self if has_agent else None))
         except envs.InputError as error:
             answer = ("refused", str(error))
-        self.channel.send(answer)
+        self._say(answer)
+
+    def _say(self, message: tuple[Any, ...]) -> None:
+        try:
+            self.channel.send(message)
+        except ConnectionError:
+            raise envs.InputError(f"method {self.name}: its process {self._end()}") from None
 
     def _do(self, what: str, *given: Any) -> Any:
-        self.channel.send((what, *given))
+        self._say((what, *given))
         said = self._hear()
         if said[0] != "done" or len(said) != 3 or not isinstance(said[2], float):
             raise envs.InputError(f"method {self.name}: it said {said[0]!r}, out of turn")

@@ -131,6 +131,9 @@ def prepare(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     if not file.exists():
         if any((folder / "jobs").iterdir()):
             raise envs.InputError(f"{folder} holds jobs, but not their settings.json; give another --out")
+        if files := sorted(each.name for each in folder.iterdir() if each.is_file() and each.name[0] != "."):
+            right = "give --out a folder of its own, which may be new"
+            raise envs.InputError(f"{folder} holds {files[0]}, and no run whose file that could be; {right}")
         write_sealed(file, settings)
     elif not resume:
         raise envs.InputError(f"{folder} holds a run already; give --resume to go on with it, or another --out")

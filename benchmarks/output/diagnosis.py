@@ -75,6 +75,7 @@ def _code(diagnosis: Diagnosis, about: dict[str, Any]) -> str:
     asked = next((name for name in WRITTEN if name in re.findall(r"\w+", diagnosis.next.fit)), "")
     own = WRITTEN[asked].format(log="explored" if about["explore"] else "trials") if asked else ""
     raw = "agent = trials.units.agent(agent)  # acts in the units of the log\n" if Units(**about["units"]).raw else ""
+    names = ", ".join(" ".join(name.split()) for name in about["units"]["obs"])  # a line break would end the comment
     return f"""import numpy as np
 from deconfounded.deconf.methods import {method}
 from deconfounded.experts import datasets
@@ -82,7 +83,7 @@ from deconfounded.experts import datasets
 {read}{own}agent = {diagnosis.next.fit}  # takes minutes, prints nothing
 {raw}agent.save("agent")
 
-# In your own program, after `import deconfounded`; obs: {", ".join(about["units"]["obs"])}
+# In your own program, after `import deconfounded`; obs: {names}
 # agent = deconfounded.load("agent")
 # agent.begin(1)  # when a trial starts
 # agent.reset([np.random.default_rng()])  # when an episode starts

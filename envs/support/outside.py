@@ -13,6 +13,7 @@ from types import ModuleType
 from typing import Any
 
 from deconfounded.envs.support.errors import InputError, error_line, users_line
+from deconfounded.envs.support.origin import ROOT
 
 SENT = "DECONFOUNDED_OUTSIDE"  # environment variable of a cluster worker: the folder that plug-in files were sent to
 FOLDERS: set[str] = set()  # of plug-in files, which are on the import path for their sake
@@ -135,7 +136,8 @@ def _run(file: Path) -> ModuleType:
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
         if (folder := str(path.parent)) not in sys.path:
-            sys.path.append(folder)
+            own = [entry for entry in sys.path if entry and Path(entry).resolve() == ROOT]
+            sys.path[:] = [*(entry for entry in sys.path if entry not in own), folder, *own]  # its `envs`, not ours
             FOLDERS.add(folder)
         try:
             spec.loader.exec_module(module)

@@ -109,6 +109,9 @@ def _d4rl(file: Path, opened: Any) -> Table:
     n = len(arrays["actions"])
     if len(arrays["observations"]) != n:
         raise InputError(f"{file} has {len(arrays['observations'])} observations and {n} actions; they must be as many")
+    if strange := {name for name in FLAGS if name in arrays and arrays[name].shape not in ((n,), (n, 1))}:
+        what = f"{min(strange)} of {file} has shape {arrays[min(strange)].shape}"
+        raise InputError(f"{what}; it must be ({n},), a row an action")
     flat = {name: np.ravel(array) for name, array in arrays.items() if array.shape == (n, 1) and name in FLAGS}
     columns = _rows(str(file), arrays | flat, n)
     flags = [columns[name] for name in FLAGS if name in columns]

@@ -75,9 +75,14 @@ def read_together(
 ) -> list[Log]:
     """Several logs of the same columns, an expert's and exploration, say, with one range of actions; as `read`."""
     for what, given in (("obs", obs), ("action", action)):
-        if isinstance(given, str) or not isinstance(given, Sequence):
+        if isinstance(given, str) or not isinstance(given, Sequence) or not all(isinstance(x, str) for x in given):
             right = f", [{given!r}]" if isinstance(given, str) else ""
             raise InputError(f"{what} was {given!r}; it must be a list of columns{right}")
+    for what, name in (("trial", trial), ("episode", episode)):
+        if name is not None and not (isinstance(name, str) and name.strip()):
+            raise InputError(f"{what} was {name!r}; it must be the name of a column")
+    if isinstance(sources, str | Path):
+        raise InputError(f"logs were {str(sources)!r}; they must be a list of logs, [{str(sources)!r}]")
     roles = Roles(trial, episode, tuple(obs), tuple(action))
     files = [_files(source) for source in sources]
     if not files:
@@ -120,6 +125,13 @@ def trials_of(sources: list[list[Table]], roles: Roles) -> list[Log]:
         if (part.obs, part.action) != (parts[0].obs, parts[0].action):
             differ = sorted({*part.obs, *part.action} ^ {*parts[0].obs, *parts[0].action}) or ["their order"]
             raise InputError(f"{table.where} and {tables[0].where} have other columns: {', '.join(differ[:5])}")
+        if len(tables) > 1 and (times := [name for name in (*part.obs, *part.action) if name in table.times]):
+            what = f"{times[0]!r} of {table.where} is a time, which each file counts from its own first"
+            raise InputError(f"{what}; leave it out, or give all rows in one file")
+    texts = [part.episodes[0].action.dtype == object for part in parts]
+    if any(texts) and not all(texts):
+        one, other = (tables[texts.index(kind)].where for kind in (True, False))
+        raise InputError(f"{parts[0].action[0]!r} is text in {one}, and numbers in {other}; write it alike in both")
     units, said = _units(tables, parts)
     horizon = max(table.horizon for table in tables)
     logs = []

@@ -94,8 +94,7 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
         )
     episodes, single, lost = list[Episode](), 0, 0
     for i, (a, b) in enumerate(bounds):
-        while b > a and np.isnan(obs[b - 1]).all():  # the observation after the last action is missing
-            b -= 1
+        b -= int(np.isnan(obs[b - 1]).all())  # the observation after the last action is missing
         if b - a < 2:
             single += 1
             continue
@@ -206,7 +205,9 @@ def _numbers(table: Table, name: str) -> NDArray[np.float64]:
 def _check(table: Table, names: Sequence[str], bad: NDArray[np.bool_], offset: int, what: str) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
-        raise InputError(f"{names[column]!r} of {table.where} {what} in row {offset + row + 1}")
+        cell = table.columns[names[column]][offset + row]
+        held = f" ({cell.strip()!r})" if isinstance(cell, str) and cell.strip() else ""
+        raise InputError(f"{names[column]!r} of {table.where} {what}{held} in row {offset + row + 1}")
 
 
 def _inside(n: int, first: list[int]) -> NDArray[np.bool_]:

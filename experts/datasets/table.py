@@ -32,8 +32,8 @@ class Table:
     where: the file or folder. columns: each [N], by name. boundaries [N]: the number of each row's episode, or None
     where columns are to say it. obs, action, trial: names of columns that the format itself says are these. limits: the
     range of an action by its name, where the format declares it. discrete, horizon: the declared number of actions, T.
-    written: texts of the columns whose numbers do not tell all of them apart, such as 007 and 7, or are counted from
-    the file's first time.
+    written: texts of the columns whose numbers do not tell all of them apart, such as 007 and 7, or are `times`, which
+    are counted from the file's first. unread: the types of columns that hold neither numbers, times nor text.
     """
 
     where: str
@@ -47,6 +47,8 @@ class Table:
     horizon: int = 0
     notes: tuple[str, ...] = ()
     written: dict[str, Column] = field(default_factory=dict)
+    times: frozenset[str] = frozenset()
+    unread: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
@@ -65,6 +67,9 @@ class Table:
             matches = [pattern] if pattern in self.columns else []
             matches = matches or [name for name in self.columns if name.startswith(f"{pattern}.")]
             matches = matches or [name for name in self.columns if fnmatchcase(name, pattern)]
+            if pattern in self.unread:
+                kind = self.unread[pattern]
+                raise InputError(f"{what} {pattern!r} of {self.where} is of type {kind}; it must hold numbers or text")
             if not matches:
                 raise InputError(
                     f"{what} {pattern!r} is no column of {self.where}; {suggestion(pattern, self.columns)}"

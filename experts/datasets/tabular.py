@@ -22,12 +22,13 @@ def read_csv(file: Path) -> Table:
         names, blocks, late = *_header(file), set[str]()
         columns: dict[str, list[Column]] = {name: [] for name in names}
         written: dict[str, list[Column]] = {name: [] for name in names}
+        places: dict[str, set[int]] = {name: set() for name in names}
         for rows in blocks:
             for name, cells in zip(names, zip(*rows, strict=True), strict=True):
                 values = None if name in text else _numbers(cells)
                 for kind, of_kind in (
                     (text, values is None),
-                    (exact, values is not None and not _all_there(cells, values)),
+                    (exact, values is not None and not _all_there(cells, values, places[name])),
                 ):
                     if of_kind and name not in kind:
                         kind.add(name)
@@ -103,11 +104,19 @@ def _numbers(cells: tuple[str, ...]) -> Column | None:
         return None
 
 
-def _all_there(cells: tuple[str, ...], values: Column) -> bool:
-    """Whether whole numbers are all that is in their cells: 007, 1e1 and what float64 rounds are more."""
+def _all_there(cells: tuple[str, ...], values: Column, places: set[int]) -> bool:
+    """Whether numbers are all that is in their cells: 007, 1e1, what float64 rounds, and 3.10 beside 3.1 are more.
+
+    places: of decimals so far; this adds those of these cells, and 0 if one has a last digit that is no more than a 0.
+    """
     held = values[~np.isnan(values)]
-    if not np.isfinite(held).all() or (held != np.round(held)).any():
+    if not np.isfinite(held).all():
         return True
+    if (held != np.round(held)).any():
+        places |= {len(cell) - cell.find(".") for cell in cells if "." in cell}
+        if any(cell.endswith("0") and not cell.endswith(".0") and "e" not in cell.lower() for cell in cells):
+            places.add(0)
+        return 0 not in places or len(places) == 2
     texts = (cell.strip() for cell in {*cells})
     return all(text.lower() in EMPTY or text.removesuffix(".0") == f"{float(text):.0f}" for text in texts)
 
@@ -116,7 +125,10 @@ def read_parquet(file: Path) -> Table:
     """A parquet file."""
     arrays = _arrays(file)
     written = {name: _texts(array) for name, array in arrays.items() if not _kept(array)}
-    return Table(str(file), _columns(arrays), written=written)
+    times = frozenset(name for name, array in arrays.items() if _is_time(array))
+    columns = _columns(arrays)
+    unread = {name: str(x.type) for name, x in arrays.items() if name not in columns and f"{name}.0" not in columns}
+    return Table(str(file), columns, written=written, times=times, unread=unread)
 
 
 def parquet_columns(file: Path, parts: dict[str, list[str]] | None = None) -> dict[str, Column]:
@@ -140,6 +152,8 @@ def _arrays(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} cannot be read as parquet: {' '.join(str(error).split())}") from None
     if not len(data):
         raise InputError(f"{file} holds no rows")
+    if twice := {name for name in data.column_names if data.column_names.count(name) > 1}:
+        raise InputError(f"{file} has two columns that are called {min(twice)!r}; every name must be its own")
     columns = zip(data.column_names, map(_plain, data.columns), strict=True)
     return {name: pyarrow.concat_arrays(column.chunks) for name, column in columns}
 
@@ -175,7 +189,13 @@ def _kept(array: Any) -> bool:
         return all(end is None or abs(end) <= WHOLE for end in ends)
     if types.is_decimal(array.type):
         return array.type.precision <= DIGITS
-    return not (types.is_timestamp(array.type) or types.is_duration(array.type))
+    return not _is_time(array)
+
+
+def _is_time(array: Any) -> bool:
+    from pyarrow import types
+
+    return types.is_timestamp(array.type) or types.is_duration(array.type)
 
 
 def _texts(array: Any) -> Column:
@@ -193,7 +213,7 @@ def _values(column: Any) -> Column | None:
     kind = column.type
     if types.is_dictionary(kind):
         return _values(column.dictionary_decode())
-    if types.is_timestamp(kind) or types.is_duration(kind):
+    if _is_time(column):
         per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[kind.unit]
         first = compute.min(column.cast("int64"))  # so that float64 keeps nanoseconds
         return np.asarray(compute.subtract(column.cast("int64"), first).to_numpy(False), float) / per_second

@@ -65,6 +65,14 @@ def test_a_file_of_other_settings_expert_or_salt_is_made_again(tmp_path: Path, m
     assert replace(job, preset=job.preset.configured("blind_bc", updates=4)).load(0) is None
 
 
+def test_a_run_replaces_no_files_of_others(tmp_path: Path) -> None:
+    """Neither results nor notes that are in its folder, which no run left there."""
+    (tmp_path / "results.json").write_text("mine")
+    with pytest.raises(envs.InputError, match=r"holds results.json, and no run whose file that could be; give --out"):
+        job_files.prepare(tmp_path, {}, resume=False)
+    assert (tmp_path / "results.json").read_text() == "mine"
+
+
 @pytest.mark.parametrize("key", ["settings", "versions", "expert", "salt", "preset", "set", "task_version"])
 def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -> None:
     described = {**dict.fromkeys(("settings", "versions", "expert", "salt", "preset", "set", "task_version"), "a")}

@@ -345,12 +345,55 @@ def test_an_expert_need_not_know_zeros(tmp_path: Path) -> None:
         ("return np.full((len(obs), 1), np.nan)", "gave NaN or infinity"),
         ("theta *= 0; return np.full((len(obs) + 1, 1), 0.0)", r"gave shape \(3, 1\)"),
         ("return obs.nonsuch", r"nonsuch' \(AttributeError, mine.py:3\)"),
+        (
+            "return np.zeros((len(obs), 1)), None",
+            "gave a tuple; .* of what `predict` of Stable-Baselines3 returns, the f",
+        ),
+        ("return None", r"gave shape \(1,\) for 2 observations"),
     ],
 )
 def test_a_bad_expert_is_one_line(tmp_path: Path, code: str, says: str) -> None:
     (tmp_path / "mine.py").write_text(f"import numpy as np\ndef control(obs, theta):\n    {code}\n")
     with pytest.raises(envs.InputError, match=says):
         policy.load(envs.get(CONTROL), f"{tmp_path}/mine.py:control")
+
+
+@pytest.mark.parametrize("name", ["mine.py", "model.zip"])
+def test_a_file_that_is_no_expert(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("")
+    with pytest.raises(envs.InputError, match=r"it must be weights.safetensors, or path/file.py:name of a callable"):
+        policy.load(envs.get(CONTROL), tmp_path / name)
+
+
+def test_a_plug_in_s_own_packages_come_before_ours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`benchmarks` of its folder is what it imports by that name, though a checkout of ours may be on the path."""
+    (tmp_path / "benchmarks").mkdir()
+    (tmp_path / "benchmarks" / "__init__.py").write_text("")
+    (tmp_path / "benchmarks" / "gains.py").write_text("K = -3.0\n")
+    text = "from benchmarks.gains import K\ndef control(obs, theta): return K * obs[:, :1]\n"
+    (tmp_path / "mine.py").write_text(text)
+    monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
+    monkeypatch.setattr(outside, "FOLDERS", set())
+    try:
+        control = outside.find("expert", f"{tmp_path}/mine.py:control")
+    finally:
+        for name in ("benchmarks", "benchmarks.gains"):
+            sys.modules.pop(name, None)
+    assert control(np.ones((2, 3)), None).tolist() == [[-3.0], [-3.0]]
+
+
+def test_a_method_that_died_while_it_was_answered() -> None:
+    """Its end is said, as where it is listened to."""
+
+    class Broken:
+        def send(self, message: object) -> None:
+            raise BrokenPipeError
+
+    ended = subprocess.Popen([sys.executable, "-c", "import os; os._exit(3)"])
+    guest = object.__new__(Guest)
+    guest.name, guest.channel, guest.process = "mine", Broken(), ended  # type: ignore[assignment]
+    with pytest.raises(envs.InputError, match=r"^method mine: its process ended with status 3$"):
+        guest._do("act")
 
 
 HEAD = """

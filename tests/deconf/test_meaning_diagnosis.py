@@ -117,6 +117,8 @@ def test_printed_lines_explore_by_the_log_of_exploration() -> None:
     lines = page._code(made, about | {"explore": None})
     assert "trials = datasets.read('expert.npz')\n" in lines
     assert "    return trials\n" in lines
+    lines = page._code(made, about | {"units": units | {"obs": ("speed\n(m/s)", "slope")}})
+    assert "; obs: speed (m/s), slope\n" in lines
 
 
 @pytest.mark.parametrize(

@@ -219,6 +219,16 @@ class TestRequests:
         with pytest.raises(envs.InputError, match="it must be finite numbers"):
             self.given()[0].progress(share, imitation=loss)
 
+    @pytest.mark.parametrize("loss", [np.float32(2.0), np.array(2.0), torch.tensor(2.0)])
+    def test_a_loss_is_any_number(self, loss: Any) -> None:
+        """Kept as Python's, which goes through json and to other processes."""
+        given, _ = self.given()
+        kept = list[Any]()
+        given.monitor.update = lambda *report: kept.append(report)  # type: ignore[method-assign]
+        given.progress(np.float32(0.5), imitation=loss)  # type: ignore[arg-type]
+        assert kept == [(500, 1000, {"imitation": 2.0})]
+        assert type(kept[0][2]["imitation"]) is float
+
 
 class TestMemories:
     """A chunk of trials begins with the memory with which the one before it ended."""

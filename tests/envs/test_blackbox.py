@@ -517,6 +517,10 @@ def half_empty(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"action_space": spaces.Box(low, high)})(0.0)
 
 
+def of_no_numbers(self: Any, theta: Any) -> Any:
+    return type("Odd", (Slide,), {"observation_space": spaces.Box(-1, 1, (0,))})(0.0)
+
+
 def unbounded(self: Any, theta: Any) -> Any:
     return type("Odd", (Slide,), {"action_space": spaces.Box(-np.inf, np.inf, (1,))})(0.0)
 
@@ -573,6 +577,7 @@ class TestErrors:
         ("make", lambda self, theta: 3, "make of Sliding gave 3; it must be a gymnasium.Env"),
         ("make", lambda self, theta: 1 / 0, r"make of Sliding: division by zero \(ZeroDivisionError, test_bl"),
         ("make", dict_obs, "observation_space of Sliding was Dict.*; it must be a Box of one axis: wrap"),
+        ("make", of_no_numbers, r"observation_space of Sliding was Box.*; it must be of one number or more"),
         ("make", half_empty, r"action_space of Sliding was Box.*; it must be bounded"),
         ("make", unbounded, r"action_space of Sliding was Box\(-inf.*; it must be bounded"),
         ("make", four, "step of sliding returned 4 values; it must return obs, reward, terminated, truncated, info"),
@@ -589,6 +594,7 @@ class TestErrors:
         ("sample_theta", lambda self, rng: [1] * rng.integers(1, 3), "it must be . finite numbers, as at first"),
         ("expert", lambda self, obs, theta: np.zeros(3), r"expert of sliding gave .* must be of shape \(1,\)"),
         ("expert", lambda self, obs, theta: None, "expert of sliding gave None for an observation; it must be of"),
+        ("expert", lambda self, obs, theta: ([0.0], None), "expert of sliding gave a tuple; .* of what `predict` of "),
         ("expert", lambda self, obs, theta: UNSURE.random(1), "expert of sliding gave two actions for one observat"),
         ("steps", 0, "the number of steps of Sliding was 0"),
         *(("noise", x, rf"noise of Sliding was {x}; it must be a number from 0 up") for x in (-1, np.nan, np.inf)),

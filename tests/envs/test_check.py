@@ -603,6 +603,16 @@ def test_the_card_of_an_expert_that_was_trained(
     assert warnings == [better] * bool(better)
 
 
+def test_a_card_replaces_no_file_of_others(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Before anything is trained."""
+    (tmp_path / "x.json").write_text('{"my": "parameters"}')
+    command = ["train", "--task", "slippery_cartpole", "--out", str(tmp_path / "x.safetensors")]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(envs.InputError, match=r"x\.json, where the card of the weights belongs, is none; give another"):
+        train.main()
+    assert [file.name for file in tmp_path.iterdir()] == ["x.json"]
+
+
 def test_an_expert_trained_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Weights in place of others of the same name are not held to the card of those."""
     task, file = envs.get("slippery_cartpole"), tmp_path / "x.safetensors"

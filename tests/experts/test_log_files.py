@@ -217,3 +217,98 @@ def test_up_to_32_whole_numbers_are_discrete_actions(count: int, values: tuple[i
 @pytest.mark.parametrize("cell", ["", " ", "NA", "n/a", "NaN", "NULL", "None "])
 def test_an_empty_cell_is_no_number_however_it_is_written(cell: str) -> None:
     assert np.isnan(number(cell))
+
+
+@pytest.mark.parametrize("column", ["run", "lap"])
+def test_decimals_of_other_digits_are_other_names(column: str, tmp_path: Path) -> None:
+    """3.1 and 3.10, as of a numbering; numbers of equally many digits are read as numbers, whose zeros are no more."""
+    names = [f"3.{i}" for i in range(1, 13)]
+    made = [{"run": "a", column: name, "x": f"{t / 4:.2f}", "u": 0.5} for name in names for t in range(3)]
+    log = datasets.read(
+        write_csv(tmp_path / "x.csv", made),
+        trial="run",
+        episode="lap" if column == "lap" else None,
+        obs=["x"],
+        action=["u"],
+    )
+    assert log.mask.any(2).sum() == 12
+    if column == "run":
+        assert log.names == tuple(names)
+    np.testing.assert_array_equal(log.obs[0, 0, :3, 0], [0, 0.25, 0.5])
+
+
+def test_one_row_alone_may_lack_its_observation(tmp_path: Path) -> None:
+    """The last of an episode; of more rows none is dropped."""
+    made = [{"run": run, "x": float(t), "u": 0.5} for run in "ab" for t in range(5)]
+    made[4]["x"] = ""
+    log = datasets.read(write_csv(tmp_path / "x.csv", made), "run", None, ["x"], ["u"])
+    assert log.mask.sum(2).ravel().tolist() == [3, 4]
+    made[3]["x"] = ""
+    with pytest.raises(envs.InputError, match=r"'x' of .*x.csv holds no number in row 4"):
+        datasets.read(write_csv(tmp_path / "x.csv", made), "run", None, ["x"], ["u"])
+
+
+def test_flags_of_d4rl_are_a_row_a_step(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "x.hdf5", "w") as file:
+        file["observations"], file["actions"] = np.zeros((8, 2)), np.zeros((8, 1))
+        file["terminals"], file["timeouts"] = np.zeros(8), np.arange(7) % 4 == 3
+    with pytest.raises(
+        envs.InputError, match=r"timeouts of .*x.hdf5 has shape \(7,\); it must be \(8,\), a row an action"
+    ):
+        datasets.read(tmp_path / "x.hdf5")
+
+
+def test_two_columns_of_one_name_in_parquet(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    columns = [pyarrow.array([1.0, 2.0]), pyarrow.array([9.0, 9.0])]
+    parquet.write_table(pyarrow.Table.from_arrays(columns, names=["x", "x"]), tmp_path / "x.parquet")
+    with pytest.raises(envs.InputError, match="two columns that are called 'x'"):
+        datasets.read(tmp_path / "x.parquet", None, None, ["x"], ["u"])
+
+
+def test_columns_of_parquet_that_are_not_read(tmp_path: Path) -> None:
+    """They are there, and the message names their type."""
+    pyarrow = pytest.importorskip("pyarrow")
+    columns = {"run": [0, 0], "x": pyarrow.nulls(2), "u": [0.5, 0.5]}
+    with pytest.raises(envs.InputError, match=r"obs 'x' of .* is of type null; it must hold numbers or text"):
+        datasets.read(write_parquet(tmp_path / "x.parquet", columns), "run", None, ["x"], ["u"])
+
+
+def test_times_are_counted_from_the_first_of_one_file(tmp_path: Path) -> None:
+    """Which other files do not share: as observations they are of one file alone."""
+    pyarrow = pytest.importorskip("pyarrow")
+    files = []
+    for i in range(2):
+        clock = pyarrow.array([86400 * i + t for t in range(3)], pyarrow.timestamp("s"))
+        columns = {"run": [i] * 3, "x": [0.0, 1.0, 2.0], "clock": clock, "u": [0.5] * 3}
+        files.append(write_parquet(tmp_path / f"{i}.parquet", columns))
+    assert datasets.read(files[1], "run", None, ["clock"], ["u"]).obs[0, 0, :, 0].tolist() == [0, 1, 2]
+    for sources in ([files], [[files[0]], [files[1]]]):
+        with pytest.raises(
+            envs.InputError, match=r"'clock' of .* is a time, which each file counts from its own first"
+        ):
+            datasets.read_together(sources, "run", None, ["clock"], ["u"])
+    assert len(datasets.read(files, "run", None, ["x"], ["u"]).names) == 2
+
+
+def test_actions_are_texts_in_all_files_or_in_none(tmp_path: Path) -> None:
+    for name, actions in (("texts", ["left", "right", ""]), ("numbers", [0, 1, ""])):
+        made = [{"run": name, "x": float(t), "u": actions[t]} for t in range(3)]
+        write_csv(tmp_path / f"{name}.csv", made)
+    files = [tmp_path / "numbers.csv", tmp_path / "texts.csv"]
+    with pytest.raises(envs.InputError, match=r"'u' is text in .*texts.csv, and numbers in .*numbers.csv"):
+        datasets.read(files, "run", None, ["x"], ["u"])
+
+
+def test_words_for_columns_and_files_that_are_none(tmp_path: Path) -> None:
+    file = write_csv(tmp_path / "x.csv", rows())
+    for name in ("", " "):
+        with pytest.raises(envs.InputError, match=r"trial was .*; it must be the name of a column"):
+            datasets.read(file, name, None, ["x"], ["u"])
+    with pytest.raises(envs.InputError, match=r"obs was \[3\]; it must be a list of columns"):
+        datasets.read(file, None, None, [3], ["u"])  # type: ignore[list-item]
+    with pytest.raises(envs.InputError, match=r"they must be a list of logs, \['.*x.csv'\]"):
+        datasets.read_together(str(file))  # type: ignore[arg-type]
