@@ -372,7 +372,8 @@ def test_a_plug_in_s_own_packages_come_before_ours(tmp_path: Path, monkeypatch: 
     (tmp_path / "benchmarks" / "gains.py").write_text("K = -3.0\n")
     text = "from benchmarks.gains import K\ndef control(obs, theta): return K * obs[:, :1]\n"
     (tmp_path / "mine.py").write_text(text)
-    monkeypatch.setattr(sys, "path", [str(ROOT), *sys.path])
+    elsewhere = [entry for entry in sys.path if not (Path(entry) / "benchmarks").is_dir()]
+    monkeypatch.setattr(sys, "path", [str(ROOT), *elsewhere])
     monkeypatch.setattr(outside, "FOLDERS", set())
     try:
         control = outside.find("expert", f"{tmp_path}/mine.py:control")
