@@ -129,10 +129,13 @@ class LinearModel(LatentModel):
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
         terms = self._terms(step)
-        precision, weighted, squares = self._sums(terms)
-        log_expected = self.gaussian.log_expected(self.belief(memory), precision, weighted)
         constant = step.mask * self.dynamics.log_std.shape[-1] * math.log(2 * math.pi) / 2
-        return log_expected - squares.float() / 2 - terms[..., -2] - constant
+        return self.log_expected(memory, terms) - self._sums(terms)[2].float() / 2 - terms[..., -2] - constant
+
+    def log_expected(self, memory: Tensor, terms: Tensor) -> Tensor:
+        """log E exp(b^T theta_hat - theta_hat^T P theta_hat / 2) [...] of the evidence in terms, given a memory."""
+        precision, weighted, _ = self._sums(terms)
+        return self.gaussian.log_expected(self.belief(memory), precision, weighted)
 
     def loss(self, batch: Batch, steps: int | None, beta: float, draws: Draws) -> Tensor:
         terms, total = Evidence.apply(*self._effects(batch))
@@ -165,6 +168,15 @@ class LinearModel(LatentModel):
         precision, weighted, _ = self._sums(after)
         log_likelihood = self.gaussian.log_expected(self.belief(before), precision, weighted)
         return -log_likelihood.sum(-1) / after[..., -1].sum(-1).clamp(min=1)
+
+
+class ExactLinearModel(LinearModel):
+    """The same dynamics, believed in: what a memory predicts is by the posterior itself, and by no network."""
+
+    def log_expected(self, memory: Tensor, terms: Tensor) -> Tensor:
+        sums = self._sums(memory), self._sums(memory + terms)
+        before, after = (log_expected_of_normal(precision, weighted[..., None]) for precision, weighted, _ in sums)
+        return (after - before).float()
 
 
 def weigh(gains: Tensor, innovation: Tensor, noise: Tensor, error: Tensor, mask: Tensor) -> tuple[Tensor, ...]:

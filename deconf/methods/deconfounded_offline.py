@@ -22,7 +22,7 @@ from deconfounded.deconf.core.drift import choose_kept, split_episodes
 from deconfounded.deconf.core.dynamics import LinearDynamicsHead
 from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.latent_model import final_belief
-from deconfounded.deconf.core.linear_model import LinearModel
+from deconfounded.deconf.core.linear_model import ExactLinearModel, LinearModel
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -144,7 +144,7 @@ def starts_of(trials: Trials) -> NDArray[np.float32]:
 def exact(model: VariationalModel, draws: Draws) -> LinearModel:
     """The model with the same dynamics, which are linear in the latent, and exact inference in them."""
     assert isinstance(model.dynamics, LinearDynamicsHead)
-    linear = LinearModel(model.latent, model.width, model.inputs.scales, draws)
+    linear = ExactLinearModel(model.latent, model.width, model.inputs.scales, draws)
     linear.dynamics, linear.inputs = model.dynamics, model.inputs
     return linear
 
@@ -195,7 +195,7 @@ class Synthesis:
 
 @uses(
     "demonstrations",
-    version=5,
+    version=6,
     cost=3,
     on_control=OfflineConfig(),
     on_bandit=OfflineConfig(

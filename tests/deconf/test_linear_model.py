@@ -11,7 +11,7 @@ from deconfounded.deconf.core.correlated import Correlated, posterior_root
 from deconfounded.deconf.core.data import Batch, Signature
 from deconfounded.deconf.core.drift import choose_kept
 from deconfounded.deconf.core.latent_model import final_belief
-from deconfounded.deconf.core.linear_model import ALIKE, ERROR, Evidence, LinearModel, weigh
+from deconfounded.deconf.core.linear_model import ALIKE, ERROR, Evidence, ExactLinearModel, LinearModel, weigh
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.core.online import OnlineBelief
@@ -135,6 +135,29 @@ def test_likelihood_of_the_next_step() -> None:
             error = 5 * likelihood.std().item() / count**0.5
             assert error < 0.01 * exact[i].item()
             assert exact[i].item() == pytest.approx(likelihood.mean().item(), abs=error)
+
+
+def test_likelihoods_of_steps_are_that_of_their_trial() -> None:
+    """By exact inference, one step after another; a belief that a network gives predicts otherwise."""
+    data, _ = pushed(3, np.random.default_rng(1))
+    draws = streams()
+    for kind, same in ((ExactLinearModel, True), (LinearModel, False)):
+        model = kind(2, 16, Scales.of(Signature(1, 1, 0, False), data), draws).eval()
+        with torch.no_grad():
+            memory, total = model.start(3), torch.zeros(1, 3)
+            for t in range(STEPS):
+                total += model.log_next(memory, data[:, :, t], draws)
+                memory = model.update(memory, data[:, :, t])
+            whole = -3 * STEPS * (model.surprise(memory) + np.log(2 * np.pi) / 2)
+        assert (total.sum().item() == pytest.approx(whole.item(), rel=1e-4)) == same
+
+
+def test_exact_dynamics_are_believed() -> None:
+    """With the latents' stds that the posterior states: no network stands between."""
+    data, _ = pushed(3, np.random.default_rng(1))
+    scales, draws = Scales.of(Signature(1, 1, 0, False), data), streams()
+    model = exact(VariationalModel("innovations", 2, 16, scales, draws), draws)
+    assert isinstance(model, ExactLinearModel)
 
 
 def test_inference_in_dynamics_that_are_given() -> None:
