@@ -248,10 +248,10 @@ class Particles:
         if self._categorical.any():
             category = self.theta[rows][..., self._categorical]
             share = share * (category[:, :, None] == category[:, None]).all(-1)
-        share = share / np.maximum(share.sum(-1, keepdims=True), 1e-300)
-        mean = share @ z
+        total = np.maximum(share.sum(-1, keepdims=True), 1e-300)
+        mean = share @ z / total
         products = (z[..., None] * z[..., None, :]).reshape(*z.shape[:2], -1)
-        spread = (share @ products).reshape(*mean.shape, -1) - mean[..., None] * mean[..., None, :]
+        spread = (share @ products / total).reshape(*mean.shape, -1) - mean[..., None] * mean[..., None, :]
         return mean, np.linalg.cholesky(spread + 1e-12 * np.eye(z.shape[-1]))
 
 
