@@ -33,7 +33,7 @@ def moments(x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
 def medians(x: Tensor, kept: Tensor) -> Tensor:
     """Medians [S, F] of x [S, N, F] where kept [S, N]; 0 of a seed that has no step."""
     return torch.stack(
-        [rows[own].median(0).values if own.any() else rows[0] * 0 for rows, own in zip(x, kept, strict=True)]
+        [rows[steps].median(0).values if steps.any() else rows[0] * 0 for rows, steps in zip(x, kept, strict=True)]
     )
 
 

@@ -130,8 +130,9 @@ def trials_of(sources: list[list[Table]], roles: Roles) -> list[Log]:
             raise InputError(f"{what}; leave it out, or give all rows in one file")
     texts = [part.episodes[0].action.dtype == object for part in parts]
     if any(texts) and not all(texts):
-        one, other = (tables[texts.index(kind)].where for kind in (True, False))
-        raise InputError(f"{parts[0].action[0]!r} is text in {one}, and numbers in {other}; write it alike in both")
+        of_text, of_numbers = (tables[texts.index(kind)].where for kind in (True, False))
+        what = f"{parts[0].action[0]!r} is text in {of_text}, and numbers in {of_numbers}"
+        raise InputError(f"{what}; write it alike in both")
     units, said = _units(tables, parts)
     horizon = max(table.horizon for table in tables)
     logs = []

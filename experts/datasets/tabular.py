@@ -116,7 +116,7 @@ def _all_there(cells: tuple[str, ...], values: Column, places: set[int]) -> bool
         places |= {len(cell) - cell.find(".") for cell in cells if "." in cell}
         if any(cell.endswith("0") and not cell.endswith(".0") and "e" not in cell.lower() for cell in cells):
             places.add(0)
-        return 0 not in places or len(places) == 2
+        return 0 not in places or len(places) == 2  # all of as many digits
     texts = (cell.strip() for cell in {*cells})
     return all(text.lower() in EMPTY or text.removesuffix(".0") == f"{float(text):.0f}" for text in texts)
 
