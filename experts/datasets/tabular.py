@@ -51,9 +51,13 @@ def _header(file: Path) -> tuple[list[str], Iterator[list[list[str]]]]:
     names = [name.strip() for name in heads[separator][0]]
     if not any(names):
         raise InputError(f"{file} has no header; its first line must name the columns")
+    _check_names(file, names)
+    return names, _blocks(file, separator, len(names))
+
+
+def _check_names(file: Path, names: list[str]) -> None:
     if twice := {name for name in names if names.count(name) > 1}:
         raise InputError(f"{file} has two columns that are called {min(twice)!r}; every name must be its own")
-    return names, _blocks(file, separator, len(names))
 
 
 def _first_rows(file: Path, separator: str) -> tuple[list[str], list[str]]:
@@ -152,8 +156,7 @@ def _arrays(file: Path) -> dict[str, Any]:
         raise InputError(f"{file} cannot be read as parquet: {' '.join(str(error).split())}") from None
     if not len(data):
         raise InputError(f"{file} holds no rows")
-    if twice := {name for name in data.column_names if data.column_names.count(name) > 1}:
-        raise InputError(f"{file} has two columns that are called {min(twice)!r}; every name must be its own")
+    _check_names(file, data.column_names)
     columns = zip(data.column_names, map(_plain, data.columns), strict=True)
     return {name: pyarrow.concat_arrays(column.chunks) for name, column in columns}
 
