@@ -225,34 +225,34 @@ class Particles:
     def _move(self, rows: NDArray[np.int64]) -> None:
         """Draw particles of trials `rows` anew by their weights, and move them, but for categorical latents."""
         z, weight = ndtri(self._u[rows].clip(min=EDGE)), np.exp(self.log_weight[rows])
-        mean, root = self._moments(rows, z, weight)
+        mean, root, category = self._moments(rows, z, weight)
         draws = Streams([self._rngs[i] for i in rows.tolist()])
         level = (draws.random((len(rows), 1)) + np.arange(PARTICLES)) / PARTICLES  # systematic resampling
         level = level * weight.sum(-1, keepdims=True)
         index = np.stack([np.searchsorted(*each) for each in zip(weight.cumsum(-1), level, strict=True)])
         index = index.clip(0, PARTICLES - 1)[..., None]
-        if mean.shape[1] > 1:
-            mean, root = np.take_along_axis(mean, index, 1), np.take_along_axis(root, index[..., None], 1)
+        row, of = np.arange(len(rows))[:, None], np.take_along_axis(category, index[..., 0], 1)
+        mean, root = mean[row, of], root[row, of]
         normal = draws.standard_normal((z[..., 0].size, z.shape[-1])).reshape(z.shape)
         kept = np.take_along_axis(z, index, 1)
         moved = mean + np.sqrt(1 - KERNEL**2) * (kept - mean) + KERNEL * (root @ normal[..., None])[..., 0]
         self.log_weight[rows] = -np.log(PARTICLES)
         self._set(rows, np.where(self._categorical, np.take_along_axis(self._u[rows], index, 1), ndtr(moved)))
 
-    def _moments(self, rows: NDArray[np.int64], z: Array, weight: Array) -> tuple[Array, Array]:
-        """Means [M, 1, L] of z [M, K, L], and roots of covariances; or, of each particle, its category's [M, K, ..].
+    def _moments(self, rows: NDArray[np.int64], z: Array, weight: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Means [M, C, L] of z [M, K, L] in each category, roots of covariances, and categories of particles [M, K].
 
         So other latents go on depending on a category as they do: by moments over categories they would forget it.
         """
-        share = weight[:, None]
-        if self._categorical.any():
-            category = self.theta[rows][..., self._categorical]
-            share = share * (category[:, :, None] == category[:, None]).all(-1)
+        values = self.theta[rows][..., self._categorical]
+        categories, category = np.unique(values.reshape(weight.size, values.shape[-1]), axis=0, return_inverse=True)
+        category = category.reshape(weight.shape)
+        share = weight[:, None] * (category[:, None] == np.arange(len(categories))[:, None])
         total = np.maximum(share.sum(-1, keepdims=True), 1e-300)
         mean = share @ z / total
         products = (z[..., None] * z[..., None, :]).reshape(*z.shape[:2], -1)
         spread = (share @ products / total).reshape(*mean.shape, -1) - mean[..., None] * mean[..., None, :]
-        return mean, np.linalg.cholesky(spread + 1e-12 * np.eye(z.shape[-1]))
+        return mean, np.linalg.cholesky(spread + 1e-12 * np.eye(z.shape[-1])), category
 
 
 def quadratic(x: Array) -> Array:

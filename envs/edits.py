@@ -1,6 +1,7 @@
 """Edits of MuJoCo models by a latent: in a compiled model, and in a specification before compilation."""
 
 from abc import ABC, abstractmethod
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -16,7 +17,7 @@ def _uphill(gravity: Array, angle: float) -> list[float]:
 class Edit(ABC):
     """Changes that a latent may make to a named element; a value is absolute, a scale multiplies the MJCF's value."""
 
-    def __init__(self, target: mujoco.MjModel | mujoco.MjSpec, option: mujoco.MjOption) -> None:
+    def __init__(self, target: "Elements | mujoco.MjSpec", option: mujoco.MjOption) -> None:
         self.target, self._option, self._gravity, self._stale = target, option, option.gravity.copy(), False
 
     def body_tilt(self, name: str, angle: float) -> None:
@@ -66,6 +67,14 @@ class Edit(ABC):
         """Coulomb friction of a tendon; N, or N m for a tendon over hinges."""
 
 
+class Elements:
+    """Named elements of a compiled model, each of which is looked up once: that takes longer than an edit."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self.body, self.geom, self.joint = cache(model.body), cache(model.geom), cache(model.joint)
+        self.actuator, self.tendon = cache(model.actuator), cache(model.tendon)
+
+
 class ModelEdit(Edit):
     """Edits of a compiled model in place. Scales multiply the nominal model's values, so that they never compound.
 
@@ -73,13 +82,13 @@ class ModelEdit(Edit):
     """
 
     def __init__(self, model: mujoco.MjModel, nominal: mujoco.MjModel, data: mujoco.MjData) -> None:
-        super().__init__(model, model.opt)
-        self.model, self._nominal, self._gravity, self._data = model, nominal, nominal.opt.gravity, data
+        super().__init__(Elements(model), model.opt)
+        self.model, self._nominal, self._gravity, self._data = model, Elements(nominal), nominal.opt.gravity, data
 
     def body_mass(self, name: str, scale: float) -> None:
         self._stale = True
-        self.model.body(name).mass[:] = self._nominal.body(name).mass * scale
-        self.model.body(name).inertia[:] = self._nominal.body(name).inertia * scale
+        self.target.body(name).mass[:] = self._nominal.body(name).mass * scale
+        self.target.body(name).inertia[:] = self._nominal.body(name).inertia * scale
 
     def geom_friction(self, name: str, value: float) -> None:
         try:
@@ -88,10 +97,10 @@ class ModelEdit(Edit):
             self._nominal.geom(name)
 
     def actuator_gain(self, name: str, scale: float) -> None:
-        self.model.actuator(name).gainprm[0] = self._nominal.actuator(name).gainprm[0] * scale
+        self.target.actuator(name).gainprm[0] = self._nominal.actuator(name).gainprm[0] * scale
 
     def tendon_friction(self, name: str, value: float) -> None:
-        self.model.tendon_frictionloss[self.model.tendon(name).id] = value
+        self.model.tendon_frictionloss[self.target.tendon(name).id] = value
 
     def finish(self) -> None:
         """Recompute what MuJoCo derives from positions and masses (subtree masses, invweight0), if those changed."""
