@@ -53,6 +53,8 @@ def check(args: argparse.Namespace, allowed: Sequence[str], default: Sequence[st
         methods = [catalogue.add(name) if outside.is_outside(name) else name for name in methods]
         allowed = [*allowed, *METHODS.outside]
     catalogue.check(args.preset, methods, args.seeds, allowed)
+    if args.seeds and (given := [change for change in args.set if change.partition("=")[0] == "seeds"]):
+        raise envs.InputError(f"--set had {given[0]}, and --seeds is {args.seeds}; give --seeds alone")
     check_methods(args.protocol, methods)
     if args.cluster is None:
         check_device(args.device)

@@ -60,5 +60,8 @@ def main() -> None:
         print(f"note: runs of {given} trials a seed, the package's of {kept}: a seed's are the same only in part")
     if len(salts := sorted({record["salt"] or "none" for record in every})) > 1:
         print(f"note: runs of salts {', '.join(salts)}: a seed has other thetas in each, and nothing is paired")
+    for key in () if package else ("preset", "set"):
+        if len(kinds := sorted({str(record[key] or "none") for record in every})) > 1:
+            print(f"note: runs of {key} {' and '.join(kinds)}: differences may come of that")
     for line in comparison.outdated(every, against):
         print(f"note: {line}")

@@ -79,6 +79,9 @@ class GymSimulator(Simulator):
                     raise InputError(
                         f"step of {self.box.name} gave the reward {reward!r}; it must be a number"
                     ) from None
+                for name, flag in (("terminated", over), ("truncated", cut)):
+                    if np.size(flag) != 1 or np.asarray(flag).dtype.kind not in "biu":
+                        raise InputError(f"step of {self.box.name} gave {name} {flag!r}; it must be True or False")
                 after[k] = self._state("step", obs, paid, over, cut)
         return after
 

@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine.catalogue import METHODS, label
 from deconfounded.benchmarks.engine.identity import named as named_protocol
 from deconfounded.benchmarks.engine.job_files import Finished
 from deconfounded.benchmarks.engine.protocols import STANDARD
-from deconfounded.envs.support.files import check_folder, sealed, unsealed, write_atomically
+from deconfounded.envs.support.files import check_folder, sealed, sweep, unsealed, write_atomically
 from deconfounded.envs.task import InputError
 
 Record = dict[str, Any]
@@ -154,13 +154,15 @@ def _parse(line: bytes, where: str) -> Record:
 def read(file: Path) -> list[Record]:
     """The records of a file, in its order.
 
-    Raises InputError if it is missing, or if a line is damaged, no record, of another task than the file's name says,
-    or a second one of the same preset, method and seed.
+    Raises InputError if it is missing or empty, or if a line is damaged, no record, of another task than the file's
+    name says, or a second one of the same preset, method and seed.
     """
     try:
         content = file.read_bytes()
     except OSError as error:
         raise InputError(f"records {file} cannot be read: {error.strerror}") from None
+    if not content:
+        raise InputError(f"records {file} are empty; restore the file, or delete it if there are to be none")
     return list(_records(content, file))
 
 
@@ -203,10 +205,10 @@ def grouped(records: Sequence[Record], key: Callable[[Record], str]) -> dict[str
 def write(folder: Path, records: Sequence[Record]) -> None:
     """Add records to the files of their tasks in a folder, each file atomically.
 
-    A record takes the place of the one in its slot. One that was made of something else is kept in the folder
-    `superseded`, and so are those of an older version or of another text from outside, of all seeds, which no table
-    shows any more; without their training curves, which no page draws. Raises InputError for what is no record, before
-    anything is written.
+    A record takes the place of the one in its slot, unless that is of a newer version. One that was made of something
+    else is kept in the folder `superseded`, and so are those of an older version or of another text from outside, of
+    all seeds, which no table shows any more; without their training curves, which no page draws. Raises InputError for
+    what is no record, before anything is written.
     """
     from filelock import FileLock
 
@@ -214,11 +216,15 @@ def write(folder: Path, records: Sequence[Record]) -> None:
         check(record, f"{record.get('method')}, seed {record.get('seed')}")
     check_folder(folder)
     with FileLock(folder / ".lock"):
+        sweep(folder)
         for task, new in grouped(records, lambda record: record["task"]).items():
             file = folder / place(task)
             kept = {_slot(record): record for record in held(file)}
             superseded = []
             for record in new:
+                if outdone(record, kept.get(_slot(record))):
+                    superseded.append(record)
+                    continue
                 before = kept.pop(_slot(record), None)
                 if before is not None and stale(before, record):
                     superseded.append(before)
@@ -229,6 +235,12 @@ def write(folder: Path, records: Sequence[Record]) -> None:
             if superseded:
                 _append(folder / "superseded" / place(task), superseded)
             write_atomically(file, "".join(map(_line, today)))
+
+
+def outdone(record: Record, by: Record | None) -> bool:
+    """Whether a record is of an older version than another, of the task or else of the method."""
+    versions = "task_version", "method_version"
+    return by is not None and [record[key] for key in versions] < [by[key] for key in versions]
 
 
 def _of_one_text(records: Sequence[Record], new: Sequence[Record]) -> list[Record]:

@@ -219,7 +219,9 @@ def csv_rows(task: envs.Task, results: dict[str, Any], finished: Sequence[tuple[
 
 INTERVALS = (
     "Intervals: percentile bootstrap over seeds. In brackets: how often an interval of that many seeds contains the"
-    " true mean, if scores are normally distributed and the returns that have score 0 and 1 are known exactly."
+    " true mean, if scores are normally distributed and the returns that have score 0 and 1 are known exactly. Which"
+    " thetas seeds draw makes differences of some hundredths between methods of five and of ten seeds; compare them by"
+    " the same seeds (`deconf compare`)."
 )
 DROPPED = (
     *("data, a seed", "theta R2 of each episode", "CPU s, a seed", "Eq. (1)", "return", "tier"),

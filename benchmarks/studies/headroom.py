@@ -27,7 +27,11 @@ BLIND = {"123": "of all theta-blind methods", "12": "of those without queries"} 
 
 
 class Headroom(NamedTuple):
-    """Of a task and an episode: the exact reference, and the best methods of some tiers, in their best deployments."""
+    """Of a task and an episode: the exact reference, and the best methods of some tiers, in their best deployments.
+
+    A method's score is the ceiling's less what it leaves to gain by the same seeds: which thetas seeds draw makes
+    differences of some hundredths.
+    """
 
     ceiling: tuple[str, float]
     best: list[tuple[str, float]]  # at most BEST, best first
@@ -51,17 +55,27 @@ class Headroom(NamedTuple):
 
 def headroom(methods: dict[str, Any], end: str, tiers: str = "123") -> Headroom | None:
     """From the `methods` of results.json, of the score of an episode of ENDS; None without reference or methods."""
-    ceiling, best = _ranked(methods, end, lambda entry: entry["method"] == EXACT), best_of(methods, end, tiers)
-    if not ceiling or not best:
+    exact = _ranked(methods, end, lambda entry: entry["method"] == EXACT)
+    if not exact:
         return None
-    by_seed = index.measured(methods, end)
-    gap = statistics.paired(by_seed[ceiling[0][0]], by_seed[best[0][0]])
-    return Headroom(ceiling[0], best[:BEST], gap) if gap else None
+    ceiling, by_seed, gaps = exact[0], index.measured(methods, end), dict[str, tuple[str, Figure]]()
+    for name, entry in methods.items():
+        if _learns(entry, tiers) and (gap := statistics.paired(by_seed[ceiling[0]], by_seed[name])):
+            agent = (name, gap)
+            gaps[entry["method"]] = min(gaps.get(entry["method"], agent), agent, key=lambda agent: agent[1].value)
+    ranked = sorted(gaps.values(), key=lambda agent: agent[1].value)
+    best = [(name, round(ceiling[1] - float(gap.value), 9)) for name, gap in ranked[:BEST]]
+    return Headroom(ceiling, best, ranked[0][1]) if ranked else None
 
 
 def best_of(methods: dict[str, Any], end: str, tiers: str = "123") -> list[tuple[str, float]]:
     """The learners of some tiers, each in its best deployment, and their scores in an episode of ENDS; best first."""
-    return _ranked(methods, end, lambda entry: entry["method"] != EXACT and entry["tier"] in tiers)
+    return _ranked(methods, end, lambda entry: _learns(entry, tiers))
+
+
+def _learns(entry: dict[str, Any], tiers: str) -> bool:
+    """Whether an agent is a learner of one of these tiers."""
+    return entry["method"] != EXACT and entry["tier"] in tiers
 
 
 def _ranked(methods: dict[str, Any], end: str, chosen: Callable[[dict[str, Any]], bool]) -> list[tuple[str, float]]:
@@ -84,21 +98,22 @@ def page(found: index.Found, certified: dict[str, Any], others: Mapping[str, ind
     """docs/headroom.md; others: found under other protocols, by name."""
     head = f"""# Headroom
 
-What is left to gain on the tasks of the suite. Made by `deconf publish` from the [records](records)
-alone, of the tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best
-deployment (after the comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the
-best method without theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the
-score of the fifth best method, each in its best deployment, if there are as many. What is *left* is the difference,
-over the seeds that both have. A task is *solved* where that is {NEAR:g} or less. A question mark says that its 95%
-interval, paired by seed, leaves that *open*. The ceiling is no bound: posterior sampling is not the best use of a
-belief. Nor can it always be reached: exact policies read the state, of which observations may hide a part that tells of
-theta ([concepts](concepts.md#exact-policies)).
+What is left to gain on the tasks of the suite. Made by `deconf publish` from the [records](records) alone, of the
+tasks whose certificate is passed. The *ceiling* is the exact interventional policy, in its best deployment (after the
+comma, if not a draw at each step): a posterior over theta, by the true dynamics. *Best* is the best method without
+theta in training (its tier in brackets), chosen after the fact, task by task; *fifth* is the fifth best method, each
+in its best deployment, if there are as many. What is *left* is the difference from the ceiling, over the seeds that
+both have; a method's score is the ceiling's less that, so that methods of five and of ten seeds can be compared. A
+task is *solved* where {NEAR:g} or less is left. A question mark says that the 95% interval of that, paired by seed,
+leaves it *open*; the interval does not allow for the choice of the best among many. The ceiling is no bound:
+posterior sampling is not the best use of a belief. Nor can it always be reached: exact policies read the state, of
+which observations may hide a part that tells of theta ([concepts](concepts.md#exact-policies)).
 
 The rule of this suite: where {SHARE:.0%} of its tasks are solved in the last episode without queries, it no longer
 separates the best methods, and is to be made harder."""
     parts = [head, *_measured(found, certified)]
     if len(parts) > 1:
-        older = any(outdated(*of) for of in found)
+        older = any(outdated(*of) for of in (*found, *(of for more in others.values() for of in more)))
         note = " Some records are of older versions than today's; [results](results.md) says which." if older else ""
         solved = np.mean([one.solved for one in of_tasks(found, certified, "last", "12").values()])
         parts[2:2] = [(REACHED if solved >= SHARE else "That is not so yet.") + note, PICTURE]

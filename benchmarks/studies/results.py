@@ -163,18 +163,23 @@ def gaps(found: index.Found) -> list[gap.Gap]:
 
 
 def by_task(found: index.Found) -> str:
-    """The part of docs/results.md with a row for each task: scores in the last episode."""
-    rows, column = [], scoring.COLUMNS.index("last")
+    """The part of docs/results.md with a row for each task: scores in the last episode, by the same seeds in a row."""
+    rows = []
     for task, results in found:
-        last = {row[0]: row[column] for row in scoring.rows(results["methods"])}
-        row = (*(last.get(name, "") for name in BY_TASK), f"{results['wall_s']:,.0f}")
+        by_seed = index.last_scores(results["methods"])
+        last = {name: by_seed[name] for name in BY_TASK if name in by_seed}
+        seeds = set.intersection(*map(set, last.values())) if last else set()
+        means = {name: float(np.mean([of[seed] for seed in seeds])) for name, of in last.items() if seeds}
+        row = (*(scoring.two_decimals(means[name]) if name in means else "" for name in BY_TASK),)
+        row += (str(len(seeds)), f"{results['wall_s']:,.0f}")
         rows.append((f"[{task.name}](#{task.name})", task.tier_name, *row))
     methods = (f"{name} ({METHODS[name].tier})" for name in BY_TASK)
-    table = markdown_table(("task", "tier needed", *methods, "seconds"), rows)
-    text = """A *tier* is what a method may use: 1, demonstrations; 2, also exploration that is blind to theta; 3, also
-an expert to query. Methods have theirs in brackets; *tier needed* is the lowest that suffices on a task, if one does.
-Seconds are wall-clock time in which jobs of the task ran, mostly two at a time (counted once) and with other work on
-both cores."""
+    table = markdown_table(("task", "tier needed", *methods, "seeds", "seconds"), rows)
+    text = """Scores are of the *seeds* that all methods of a row have: which thetas seeds draw makes differences of
+some hundredths, so that a task's part, of all seeds of each method, may have other figures. A *tier* is what a method
+may use: 1, demonstrations; 2, also exploration that is blind to theta; 3, also an expert to query. Methods have
+theirs in brackets; *tier needed* is the lowest that suffices on a task, if one does. Seconds are wall-clock time in
+which jobs of the task ran, mostly two at a time (counted once) and with other work on both cores."""
     older = " Some records are of older versions than today's; each task's part says which."
     return f"## Last episode, by task\n\n{table}\n\n{text}{older * any(outdated(*of) for of in found)}"
 

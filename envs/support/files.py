@@ -31,11 +31,17 @@ def check_file(file: Path) -> None:
 
 
 def write_atomically(file: Path, data: str | bytes) -> None:
-    """Write a file in one step: it holds all of the data, or what it held before. A link is followed."""
+    """Write a file in one step: it holds all of the data, or what it held before. A link is followed.
+
+    Data are on the disk before the file has its name, so that a loss of power leaves no empty file.
+    """
     target = file.resolve()
     partial = target.with_name(f".{target.name}.{os.getpid()}{PARTIAL}")
     try:
-        partial.write_bytes(data.encode("utf-8", "surrogateescape") if isinstance(data, str) else data)
+        with partial.open("wb") as out:
+            out.write(data.encode("utf-8", "surrogateescape") if isinstance(data, str) else data)
+            out.flush()
+            os.fsync(out.fileno())
         os.replace(partial, target)
     except BaseException as error:
         with contextlib.suppress(OSError):

@@ -75,6 +75,7 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--out", ""), "argument --out: it must be a name"),
     (("run", "--task", "bandit", "--seeds", "1000000000"), "at most 1,000"),
     (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
+    (("table", "--list", "--set", "seeds=2"), "--set had seeds=2, and --seeds is 10; give --seeds alone"),
     (("run", "--task", "bandit", "--set", "random.updates=5"), "method 'random' has no config"),
     (("run", "--task", "bandit", "--methods", "my.py"), "one of your own is my.py:FUNCTION"),
     (("run", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
@@ -524,6 +525,11 @@ def test_publish_keeps_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert kept() == ["bandit.webp"]
     publish.keep(run)
     assert kept() == ["certificates/bandit.json", "records/.lock", "records/bandit.jsonl"]
+    assert (docs / "records" / "bandit.jsonl").read_text() == whole
+    older = [{**one, "method_version": 0} for one in shown if one["method"] in ("naive_rnn", "random", "expert")]
+    records.write(tmp_path / "old" / "records", older)
+    with pytest.raises(envs.InputError, match=r"old has .*naive_rnn.* of older versions than docs/; run it again"):
+        publish.keep(tmp_path / "old")
     assert (docs / "records" / "bandit.jsonl").read_text() == whole
     with pytest.raises(envs.InputError, match="holds no records"):
         publish.keep(tmp_path)

@@ -415,6 +415,15 @@ class TestComparison:
         noted = [f"note: runs of {kind}" for kind in kinds]
         fewer = "note: runs of 128 and 16 trials a seed, the package's of 128: a seed's are the same only in part"
         assert [line.partition(";")[0] for line in lines] == ["written"] * 2 + [*noted, fewer, unpaired]
+        monkeypatch.setattr(comparison, "published", lambda *_: [])
+        compare.main()  # of which the package has no part
+        lines = capsys.readouterr().out.splitlines()
+        unlike = ["preset default and paper and smoke", "set ['seeds=2'] and none"]
+        assert lines == [
+            "written",
+            unpaired,
+            *(f"note: runs of {kinds}: differences may come of that" for kinds in unlike),
+        ]
 
     def test_bad_input(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         twice = [record("mine", 0, 0.5), record("mine", 0, 0.6)]

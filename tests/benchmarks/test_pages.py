@@ -365,9 +365,23 @@ class TestHeadroom:
         own = {"seeds": [*returns], "return": [[x] for x in returns.values()]}
         methods = {**self.METHODS, "interventional": {**self.METHODS["interventional"], **exact}}
         methods["b"] = {**self.METHODS["b"], **own}
+        methods["a"] = methods["a_mode"] = scored("a", 0.1, 0.2)
         made = headroom.headroom(methods, "last")
         assert made is not None
         assert (round(made.left, 9), made.solved, made.sure) == (left, solved, sure)
+
+    def test_best_is_by_the_same_seeds(self) -> None:
+        """What a method of ten seeds loses by thetas of the last five does not put it behind one of five."""
+        long, short = {"seeds": [*range(10)]}, {"seeds": [*range(5)]}
+        returns = [[1.0]] * 5 + [[0.8]] * 5
+        exact = {**self.METHODS["interventional"], **long, "return": returns, "score_last": 0.9}
+        ours = {**scored("a", 0, 0.88), **long, "return": [[x - 0.02] for (x,) in returns]}
+        theirs = {**scored("b", 0, 0.95), **short, "return": [[0.95]] * 5}
+        ends = {name: self.METHODS[name] for name in ("random", "expert")}
+        made = headroom.headroom({**ends, "interventional": exact, "a": ours, "b": theirs}, "last")
+        assert made is not None
+        assert made.best == [("a", pytest.approx(0.88)), ("b", pytest.approx(0.85))]
+        assert made.left == pytest.approx(0.02)
 
     def test_page(self) -> None:
         """Certified tasks alone are counted; and it is time when enough are solved without queries."""
@@ -1034,6 +1048,22 @@ def test_the_summary_has_the_first_and_the_last_episode() -> None:
     rows = [[cell.strip() for cell in line.split("|")] for line in text.splitlines()[4:]]
     assert rows[0][1].startswith("[rma]")
     assert {tuple(cell.partition(" (")[0] for cell in row[4:6]) for row in rows[1:]} == {("0.25", "0.75")}
+
+
+def test_methods_of_more_seeds_are_compared_by_the_same() -> None:
+    """In the table of tasks: of ten seeds and of five, the five."""
+    long = {**scored("deconfounded", 0, 0.5), "seeds": [*range(10)], "return": [[1.0]] * 5 + [[0.0]] * 5}
+    short = {**scored("dagger", 0, 0.9), "seeds": [*range(5)], "return": [[0.9]] * 5}
+    ends = {name: scored(name, of, of, "reference") for name, of in (("random", 0), ("expert", 1))}
+    task = envs.get("curling")
+    about = {"wall_s": 7.0, "task_version": task.version}
+    text = results.by_task([(task, {**about, "methods": {**ends, "deconfounded": long, "dagger": short}})])
+    head, _, row = ([cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:5])
+    assert dict(zip(head, row, strict=True)) == {
+        **dict.fromkeys(head, ""),
+        **{"task": "[curling](#curling)", "tier needed": task.tier_name, "seeds": "5", "seconds": "7"},
+        **{"deconfounded (2)": "1.00", "dagger (3)": "0.90"},
+    }
 
 
 def test_costs_stand_under_their_tasks() -> None:

@@ -328,6 +328,31 @@ class TestRecords:
         assert records.read(tmp_path / "superseded" / "bandit.jsonl") == without_curve(two, {**one, "cpu_s": 9.0})
         assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
 
+    def test_an_older_version_takes_no_place(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        """Of the method or of the task, of one seed or of all: it is kept with what is superseded."""
+        one, two = kept(job)
+        newer = [{**one, "method_version": 7, "task_version": 3}, {**two, "method_version": 7, "task_version": 3}]
+        records.write(tmp_path, newer)
+        older = [{**two, "method_version": 6, "task_version": 3}, {**one, "method_version": 8, "task_version": 2}]
+        records.write(tmp_path, older)
+        assert records.read(tmp_path / "bandit.jsonl") == newer
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == without_curve(*older)
+        records.write(tmp_path, [{**two, "method_version": 6, "task_version": 3, "seed": 9}])
+        assert records.read(tmp_path / "bandit.jsonl") == newer
+
+    def test_half_written_files_are_swept(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        """What a killed program left is gone after the next write."""
+        (half := tmp_path / ".bandit.jsonl.999.partial").write_text("half")
+        records.write(tmp_path, kept(job))
+        assert not half.exists()
+
+    def test_an_empty_file(self, job: BenchmarkJob, tmp_path: Path) -> None:
+        """As a loss of power may leave it: nothing is added to it as if there had been no records."""
+        (tmp_path / "bandit.jsonl").write_text("")
+        with pytest.raises(envs.InputError, match=r"records .*bandit.jsonl are empty; restore the file, or delete it"):
+            records.write(tmp_path, kept(job))
+        assert (tmp_path / "bandit.jsonl").read_text() == ""
+
     def test_a_kill_before_the_last_write(
         self, job: BenchmarkJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

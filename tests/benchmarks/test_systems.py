@@ -397,6 +397,16 @@ for line in sys.argv[1:]:
         assert (tmp_path / "text").read_bytes() == name
         assert stream(3, 0, lacking) == stream(3, 0, name.decode())
 
+    def test_data_are_on_the_disk_before_their_name(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """So that a loss of power leaves what a file held before, and no empty file."""
+        done = list[str]()
+        for name in ("fsync", "replace"):
+            real = getattr(os, name)
+            monkeypatch.setattr(os, name, lambda *given, name=name, real=real: (done.append(name), real(*given)))
+        write_atomically(tmp_path / "file", "text")
+        assert done == ["fsync", "replace"]
+        assert (tmp_path / "file").read_text() == "text"
+
     @pytest.mark.parametrize(
         "start", [b"\xef\xbb\xbf# caf\xc3\xa9\n", b"# -*- coding: latin-1 -*-\n# caf\xe9\n"], ids=["bom", "cookie"]
     )

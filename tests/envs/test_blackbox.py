@@ -563,6 +563,16 @@ def paid(reward: Any) -> Callable[..., Any]:
     return lambda self, theta: type("Odd", (Slide,), {"step": step})(0.0)
 
 
+def over(*flags: Any) -> Callable[..., Any]:
+    """`make` of an environment that gives these as `terminated` and `truncated`."""
+
+    def step(self: Slide, action: Any) -> Any:
+        obs, reward, *_ = Slide.step(self, action)
+        return obs, reward, *flags, {}
+
+    return lambda self, theta: type("Odd", (Slide,), {"step": step})(0.0)
+
+
 def lost(self: Sliding, obs: Any, theta: Any) -> Any:
     """An expert that goes where it has no plan; others do not."""
     if obs[0] > 3:
@@ -588,6 +598,9 @@ class TestErrors:
         ("make", other_actions, r"make of sliding gave spaces .* for another theta$"),
         ("make", paid(None), "step of sliding gave the reward None; it must be a number"),
         ("make", paid(np.ones(2)), r"step of sliding gave the reward array\(\[1., 1.\]\); it must be a number"),
+        ("make", over(None, False), "step of sliding gave terminated None; it must be True or False$"),
+        ("make", over(False, "no"), "step of sliding gave truncated 'no'; it must be True or False$"),
+        ("make", over(np.zeros(2, bool), False), r"gave terminated array\(\[False, False\]\); it must be True"),
         ("sample_theta", lambda self, rng: 0.5, "sample_theta of Sliding gave 0.5; it must be one axis"),
         ("sample_theta", lambda self, rng: [np.nan], "sample_theta of Sliding gave .nan.; it must be"),
         ("sample_theta", lambda self, rng: UNSURE.random(1), "sample_theta of sliding gave two thetas for one state"),
