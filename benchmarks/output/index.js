@@ -125,7 +125,7 @@ function learning(box, kind, rows, o) {
   const high = all[Math.floor(all.length * 0.97)], low = all[0], room = (high - low) * 0.06 || 1;
   lines(box, series, {
     ...o, x: [0, 1], y: [low - room, high + room], xformat: (x) => `${Math.round(100 * x)}%`, label: `${kind} loss`,
-    xlabel: o.still ? "" : "share of training", said: (s, k) => `update ${s.updates[k].toLocaleString("en")}: ${s.points[k][1]}, ${seeds(s.r.n)}`,
+    xlabel: o.still ? "" : "share of training", said: (s, k) => `update ${s.updates[k].toLocaleString("en")}: ${s.points[k][1]}, ${seeds(s.r.curve[kind].seeds)}`,
   });
 }
 
@@ -142,7 +142,7 @@ function fill(r) {
       <tr><td>regret<td>${two(r.regret.value)}<td class="soft">${range(r.regret.interval)}</tr>${minus.join("")}</table>
     <p class="soft">score by episode${r.trained > 1 ? ", beside the exact policies" : ""}</p><div class="a"></div>
     ${Object.keys(r.curve).map((kind, i) => `<p class="soft">${text(kind)} loss, over the share of training</p><div class="l${i}"></div>`).join("")}
-    <p class="soft">${text(r.data || "no data")}; ${r.cpu === null ? "trained on a GPU" : r.cpu + " s of CPU a seed"}</p><p><code class="run">${text(r.command)}</code></p>`;
+    <p class="soft">${r.version ? text(r.version) + "; " : ""}${text(r.data || "no data")}; ${r.cpu === null ? "trained on a GPU" : r.cpu + " s of CPU a seed"}</p><p><code class="run">${text(r.command)}</code></p>`;
   const beside = D.rows.filter((x) => x.task === r.task && D.methods[x.method].kind === "exact" && !D.methods[x.method].deployment && x !== r);
   adaptation(card.querySelector(".a"), [...beside, r], { still: true, h: 120, strong: r.method });
   Object.keys(r.curve).forEach((kind, i) => learning(card.querySelector(`.l${i}`), kind, [r], { still: true, h: 90 }));
@@ -224,13 +224,15 @@ function matrix({ tasks, methods, tier, measure }) {
     out += o ? `<td class="first${whole(m) ? "" : " soft"}">${two(iqm(o, measure).value)}<small>${whole(m) ? range(iqm(o, measure).interval) : `${o.tasks} of ${D.over[tier].tasks.length} tasks`}</small></td>` : `<td class="first"></td>`;
     for (const t of tasks) {
       const r = where(t, m), f = measured(r, measure);
-      out += r ? `<td class="open ${first(t)}" tabindex="0" data-task="${text(t)}" data-method="${text(m)}" style="background:color-mix(in srgb, var(--accent) ${Math.round(38 * Math.min(Math.max(share(r), 0), 1))}%, transparent)">${two(f.value)}<small>${f.interval ? range(f.interval) : "one seed"}</small></td>` : `<td class="${first(t)}"></td>`;
+      out += r ? `<td class="open ${first(t)}" tabindex="0" data-task="${text(t)}" data-method="${text(m)}" style="background:color-mix(in srgb, var(--accent) ${Math.round(38 * Math.min(Math.max(share(r), 0), 1))}%, transparent)">${two(f.value)}${older(r)}<small>${f.interval ? range(f.interval) : "one seed"}</small></td>` : `<td class="${first(t)}"></td>`;
     }
     out += "</tr>";
   }
   at("what").textContent = MEASURES[measure];
   at("matrix").innerHTML = out + "</tbody>";
 }
+
+const older = (r) => (r.version.includes("now") ? "*" : "");
 
 const COLUMNS = [
   ["task", "task", (r) => r.task, (r) => text(r.task), "left"],
@@ -243,6 +245,7 @@ const COLUMNS = [
   ["regret", "regret", (r) => r.regret.value, (r) => two(r.regret.value)],
   ["regret low", "interval", (r) => r.regret.interval && r.regret.interval[0], (r) => range(r.regret.interval)],
   ["n", "seeds", (r) => r.n, (r) => r.n],
+  ["version", "version", (r) => r.version, (r) => text(r.version), "left"],
   ...D.compared.map((other) => [`vs ${other}`, `vs ${other}`, (r) => r.minus[other]?.value, (r) => (r.minus[other] ? `${signed(r.minus[other].value)} <span class="soft">(${range(r.minus[other].interval)}${r.minus[other].interval && r.minus[other].n < r.n ? `, ${seeds(r.minus[other].n)}` : ""})</span>` : "")]),
   ["r2", "theta R2", (r) => r.r2.at(-1), (r) => (r.r2.length ? two(r.r2.at(-1)) : "")],
   ["return", "return", (r) => r.return, (r) => r.return.toFixed(1)],
@@ -266,10 +269,12 @@ function overTasks({ methods, tier, measure }) {
   const { tasks, methods: over } = D.over[tier], whole = (f) => f.tasks === tasks.length;
   const names = Object.keys(D.methods).filter((m) => methods.includes(m) && over[m] && D.methods[m].kind !== "reference");
   const entry = (m, f, k) => ({ name: m + (k < tasks.length ? ` (${k})` : ""), colour: D.methods[m].colour, value: f.value, interval: f.interval, faint: k < tasks.length, said: `${m} ${two(f.value)}, ${range(f.interval)}, ${f.n} runs on ${k} of ${tasks.length} tasks` });
+  const mixed = names.filter((m) => D.rows.some((r) => r.method === m && tasks.includes(r.task) && older(r)));
   const few = names.filter((m) => !whole(over[m])).length, runs = extent(names.map((m) => over[m].iqm.n));
   at("over-what").textContent = `${tasks.length} task${tasks.length > 1 ? "s" : ""}${tier ? ` of tier ${tier}` : ""}` + (names.length ? "" : ".");
   if (names.length) at("over-what").textContent += `, ${runs[0] === runs[1] ? runs[0] : runs.join(" to ")} runs a method, a run being a seed of a task.` +
-    (few ? " A method that was run on some of the tasks is faint, with their number in brackets, and not to be compared with the others." : "");
+    (few ? " A method that was run on some of the tasks is faint, with their number in brackets, and not to be compared with the others." : "") +
+    (mixed.length ? ` Some records of ${mixed.join(", ")} are of older versions.` : "");
   const best = names.slice().sort((a, b) => whole(over[b]) - whole(over[a]) || over[b].iqm.value - over[a].iqm.value);
   const means = best.map((m) => entry(m, iqm(over[m], measure), over[m].tasks)), high = Math.max(1, ...means.map((r) => r.value));
   at("iqm").previousElementSibling.textContent = `Interquartile mean: ${MEASURES[measure].toLowerCase()}`;

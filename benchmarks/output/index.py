@@ -68,6 +68,7 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "task": task.name,
         "method": name,
         "n": len(entry["seeds"]),
+        "version": of_versions(entry["method"], {entry["version"]}),
         "value": entry["score_last"],
         "interval": entry["ci95"] and _short(entry["ci95"]),
         "first": {"value": entry["score_first"], "interval": entry["ci95_first"] and _short(entry["ci95_first"])},
@@ -84,6 +85,14 @@ def row(task: envs.Task, name: str, entry: dict[str, Any], last: dict[str, dict[
         "cpu": entry["cpu_s"],
         "curve": entry.get("curve", {}),
     }
+
+
+def of_versions(method: str, versions: set[int]) -> str:
+    """Versions of a method's records, and today's if these are of another: `v1 (now v2)`; empty if from outside."""
+    if method not in METHODS:
+        return ""
+    now = "" if versions <= {METHODS[method].version} else f" (now v{METHODS[method].version})"
+    return ", ".join(f"v{version}" for version in sorted(versions)) + now
 
 
 def _runs(scores: Scores, tasks: Sequence[str]) -> dict[str, dict[str, Array]]:

@@ -82,21 +82,24 @@ def fewest_to_most(counts: Sequence[int]) -> str:
     return f"{fewest} to {most}" if fewest < most else str(most)
 
 
-def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, dict[str, list[Any]]]:
-    """The mean over seeds of training curves, by kind of loss; of those that were noted at the same updates.
+def mean_curve(curves: Sequence[dict[str, dict[str, list[Any]]]]) -> dict[str, dict[str, Any]]:
+    """The mean over seeds of training curves, by kind of loss, and of how many `seeds`.
 
-    Where the method did something else for a while, the loss is None at one update in between: not to be bridged.
+    Of those that were noted at the same updates as the first. Where the method did something else for a while, the loss
+    is None at one update in between: not to be bridged.
     """
     means = {}
     for kind in dict.fromkeys(kind for curve in curves for kind in curve):
         same = [curve[kind] for curve in curves if kind in curve]
         update = np.array(same[0]["update"])
-        loss = np.mean([curve["loss"] for curve in same if curve["update"] == same[0]["update"]], 0)
+        alike = [curve["loss"] for curve in same if curve["update"] == same[0]["update"]]
+        loss = np.mean(alike, 0)
         steps = np.diff(update)
         gaps = 1 + np.flatnonzero(steps > 1.5 * np.median(steps)) if len(steps) else np.zeros(0, int)
         means[kind] = {
             "update": np.insert(update, gaps, update[gaps - 1] + 1).tolist(),
             "loss": [None if np.isnan(x) else float(f"{x:.4g}") for x in np.insert(loss, gaps, np.nan)],
+            "seeds": len(alike),
         }
     return means
 

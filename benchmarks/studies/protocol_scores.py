@@ -8,11 +8,12 @@ from deconfounded.benchmarks.engine import protocols, published
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.protocols import COMPARED, PROTOCOLS, STANDARD
 from deconfounded.benchmarks.output import index, statistics
+from deconfounded.benchmarks.output.index import of_versions
 from deconfounded.benchmarks.output.pictures import panels
 from deconfounded.benchmarks.output.scoring import coverage, two_decimals
 from deconfounded.benchmarks.studies.cards import markdown_table
 from deconfounded.benchmarks.studies.headroom import ENDS
-from deconfounded.benchmarks.studies.results import of_versions, with_interval
+from deconfounded.benchmarks.studies.results import with_interval
 
 SHOWN = (COMPARED[0], "deconfounded_mode", *COMPARED[1:])  # agents in the tables
 INTERVALS = {"first": "ci95_first", "last": "ci95"}  # of an entry of results.json, by episode

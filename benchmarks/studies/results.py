@@ -10,7 +10,7 @@ from deconfounded.benchmarks.engine.catalogue import DEFAULT, METHODS, REFERENCE
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.protocols import PROTOCOLS, STANDARD
 from deconfounded.benchmarks.output import aggregation, index, records, scoring, statistics
-from deconfounded.benchmarks.output.index import NOTE, PEER, answers
+from deconfounded.benchmarks.output.index import NOTE, PEER, answers, of_versions
 from deconfounded.benchmarks.studies import gap
 from deconfounded.benchmarks.studies.cards import DOCS, markdown_table
 from deconfounded.deconf import methods as registry
@@ -182,12 +182,6 @@ theirs in brackets; *tier needed* is the lowest that suffices on a task, if one 
 which jobs of the task ran, mostly two at a time (counted once) and with other work on both cores."""
     older = " Some records are of older versions than today's; each task's part says which."
     return f"## Last episode, by task\n\n{table}\n\n{text}{older * any(outdated(*of) for of in found)}"
-
-
-def of_versions(method: str, versions: set[int]) -> str:
-    """Versions of a method's records, and today's if these are of another one: `v1 (now v2)`."""
-    now = "" if versions <= {METHODS[method].version} else f" (now v{METHODS[method].version})"
-    return ", ".join(f"v{version}" for version in sorted(versions)) + now
 
 
 def summary(found: index.Found, certified: dict[str, Any]) -> str:

@@ -160,7 +160,7 @@ def test_intervals_over_tasks_are_of_95_percent() -> None:
 
 
 def seeds_of_records(episode: int) -> dict[str, dict[str, tuple[Array, Array]]]:
-    """By task and method, the scores and returns of seeds, in their order, in an episode: from the lines of docs/records alone."""
+    """By task and method, the scores and returns of seeds, in their order, in an episode: from docs/records alone."""
     by_task: dict[str, dict[str, tuple[Array, Array]]] = {}
     for file in (ROOT / "docs" / "records" / f"{name}.jsonl" for name in envs.SUITE):
         lines = sorted(map(json.loads, file.read_text().splitlines()), key=lambda line: line["seed"])

@@ -255,15 +255,17 @@ class TestCurves:
         """Where a curve goes without for longer than it is used to, there is a gap; seeds are averaged."""
         seed_0 = {"a": {"update": [10, 20, 30, 90, 100], "loss": [1.0, 2.0, 3.0, 4.0, 5.0]}}
         seed_1 = {"a": {"update": [10, 20, 30, 90, 100], "loss": [3.0, 2.0, 1.0, 4.0, 5.0]}}
-        mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5]}
+        mean = {"update": [10, 20, 30, 31, 90, 100], "loss": [2, 2, 2, None, 4, 5], "seeds": 2}
         assert scoring.mean_curve([seed_0, seed_1]) == {"a": mean}
-        assert scoring.mean_curve([{"b": {"update": [5], "loss": [1.0]}}]) == {"b": {"update": [5], "loss": [1.0]}}
+        lone = {"update": [5], "loss": [1.0]}
+        assert scoring.mean_curve([{"b": lone}]) == {"b": {**lone, "seeds": 1}}
 
     def test_losses_of_other_updates_are_not_averaged(self) -> None:
         """Of seeds whose losses were noted at other updates, the curve is that of the first and those like it."""
         seed_0, seed_1 = ({"a": {"update": [10, 20], "loss": loss}} for loss in ([1.0, 2.0], [3.0, 6.0]))
         fewer, apart = ({"a": {"update": update, "loss": [9.0] * len(update)}} for update in ([10], [11, 21]))
-        assert scoring.mean_curve([seed_0, fewer, apart, seed_1]) == {"a": {"update": [10, 20], "loss": [2, 4]}}
+        of_two = {"update": [10, 20], "loss": [2, 4], "seeds": 2}
+        assert scoring.mean_curve([seed_0, fewer, apart, seed_1]) == {"a": of_two}
 
     def test_records(self) -> None:
         """A record has a curve of its training, and needs none."""
@@ -608,7 +610,7 @@ class TestIndex:
             **{"seeds": [0, 1], "score": [0.1, 0.6], "score_beyond": [0.7], "budget": {}, "theta_r2": [0.2, 0.3]},
             **{"score_first": 0.1, "score_last": 0.6, "regret": 1.3, "objective": [-9.0, -5.0], "cpu_s": 7.0},
             **{"ci95": [0.5, 0.7], "ci95_first": [0.0, 0.2], "ci95_regret": [1.2, 1.4], "band": None},
-            **{"return": [[1.0, 6.0], [1.0, 8.0]]},
+            **{"return": [[1.0, 6.0], [1.0, 8.0]], "method": "gail", "version": 1},
         }
         last = {"x": {0: 0.5, 1: 0.7}, "deconfounded": {0: 0.9, 1: 0.9}, "naive_rnn": {0: 0.0, 1: 0.0}}
         row = index.row(envs.get("curling"), "x", entry, last)
@@ -618,6 +620,8 @@ class TestIndex:
         assert (row["scores"], row["trained"]) == ([0.1, 0.6, 0.7], 2)
         assert (row["return"], row["objective"], row["r2"], row["cpu"]) == (7.0, -5, [0.2, 0.3], 7.0)
         assert row["held"] == round(100 * scoring.coverage(2))
+        assert row["version"] == f"v1 (now v{METHODS['gail'].version})"
+        assert index.row(envs.get("curling"), "x", {**entry, "method": "mine"}, last)["version"] == ""
         assert {other: each["value"] for other, each in row["minus"].items()} == {"deconfounded": -0.3}
 
     def test_links_and_size(self) -> None:
