@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from deconfounded import envs
 from deconfounded.benchmarks import commands
-from deconfounded.benchmarks.engine.catalogue import METHODS
+from deconfounded.benchmarks.engine.catalogue import EXACT, METHODS
 from deconfounded.benchmarks.engine.protocols import STANDARD, applied
 from deconfounded.envs.support.files import write_json
 
@@ -60,12 +60,13 @@ def run(
 
 
 def certificate(task: envs.Task, expert: str | None, folder: Path) -> dict[str, Any]:
-    """The task's certificate, made with that expert; kept in the folder as long as neither has a new version."""
+    """The task's certificate, made with that expert; kept in the folder while both and its methods keep their versions."""
     from deconfounded.benchmarks.certify import certify
     from deconfounded.benchmarks.engine import identity
     from deconfounded.experts import policy
 
     file, of = folder / "certificate.json", {"task_version": task.version, **identity.expert(task, expert)}
+    of["methods"] = {name: METHODS[name].version for name in (*EXACT, "blind_bc")}
     held: dict[str, Any] = json.loads(file.read_bytes()) if file.is_file() else {}
     if held.get("made_of") != of:
         folder.mkdir(parents=True, exist_ok=True)

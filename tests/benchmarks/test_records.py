@@ -549,7 +549,8 @@ class TestVerify:
         record = {**kept(job)[0], "eval_trials": 100, "returns": [20.0], "returns_sd": [4.0]}
         for off, said in ((1.0, "inside the interval"), (2.0, "not the same")):  # three standard errors are 1.7
             again = {**record, "returns": [20.0 + off], "bits": "1" * 64, "machine": "another"}
-            assert verify.verdict(record, again) == (said, [f"machine: {record['machine']}, now another"])
+            apart = f"mean returns: up to {off:.3g} apart, where the interval allows 1.7"
+            assert verify.verdict(record, again) == (said, [f"machine: {record['machine']}, now another", apart])
         two = {**record, "returns": [20.0, 20.0], "returns_sd": [4.0, 4.0]}  # of two episodes, one of which agrees
         assert verify.verdict(two, {**two, "returns": [20.0, 22.0], "bits": "1" * 64})[0] == "not the same"
 

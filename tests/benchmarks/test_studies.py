@@ -238,7 +238,7 @@ def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert (tmp_path / "docs" / "tuning.json").read_text() == kept
 
 
-def test_a_certificate_is_kept_while_task_and_expert_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_certificate_is_kept_while_what_made_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = list[int]()
 
     def certify(task: envs.Task, expert: Any) -> dict[str, Any]:
@@ -251,3 +251,7 @@ def test_a_certificate_is_kept_while_task_and_expert_stay(tmp_path: Path, monkey
         task.version = version
         assert runs.certificate(task, None, tmp_path) == {"verdict": "passed"}
     assert made == [1, 2]
+    newer = {name: SimpleNamespace(version=99) for name in ("conditional", "interventional", "blind_bc")}
+    monkeypatch.setattr(runs, "METHODS", newer)
+    runs.certificate(task, None, tmp_path)
+    assert made == [1, 2, 2]
