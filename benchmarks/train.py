@@ -42,6 +42,7 @@ def main() -> None:
     if not policy.has_card(file):
         what = f"{file.with_suffix('.json')}, where the card of the weights belongs, is none"
         raise envs.InputError(f"{what}; give another --out")
+    from deconfounded.benchmarks.engine.context import EVALUATION, stream
     from deconfounded.experts.train import PPO_SETTINGS, train
 
     start = time.time()
@@ -52,7 +53,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:  # what is there already stays until all is ready
         (aside := Path(scratch) / file.name).write_bytes(content)
         agents = ExpertAgent(env, policy.load(task, aside)), RandomAgent(task.action_space)
-    returns, random = (run_trials(env, agent, 1, seed=args.seed).returns for agent in agents)
+    fresh = stream(EVALUATION, args.seed)  # thetas and noise that training has not seen
+    returns, random = (run_trials(env, agent, 1, seed=fresh).returns for agent in agents)
     number = policy.version(task, file) + 1
     file.with_suffix(".json").unlink(missing_ok=True)  # the card of other weights, which would call these damaged
     write_atomically(file, content)

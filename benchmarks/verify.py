@@ -1,8 +1,8 @@
 """Run the seed of a record again, and compare: `deconf verify slippery_cartpole deconfounded 0`
 
 Says `same bits`, `inside the interval` (the mean return of every episode within three standard errors of the trials) or
-`not the same`, and what differs. Exit code 1 for `not the same`. The interval is wide, as thetas differ among trials: it
-shows a wrong return, and not a method a little worse.
+`not the same`, and what differs. Exit code 1 for `not the same`. The interval is wide, as thetas differ among trials:
+it shows a wrong return, and not a method a little worse.
 """
 
 import tempfile

@@ -49,7 +49,7 @@ class Latent:
             "loguniform": ("0 < low < high", self.low > 0),
             "categorical": ("whole numbers low < high", self.low % 1 == 0 == self.high % 1),
         }
-        if self.distribution not in rules:
+        if not isinstance(self.distribution, str) or self.distribution not in rules:
             right = f"one of {', '.join(rules)}"
             raise InputError(f"distribution of {self.name} was {self.distribution!r}; it must be {right}")
         right, holds = rules[self.distribution]

@@ -22,6 +22,8 @@ GROUP = "deconfounded.tasks"  # group of entry points of installed packages: nam
 
 def register(cls: type[Task]) -> type[Task]:
     """Add a task to the registry and to gymnasium; usable as a decorator. Raises InputError for an invalid class."""
+    if not isinstance(cls, type):
+        raise InputError(f"register was given {cls!r}; it takes a class of tasks, not one of its tasks")
     name, where = getattr(cls, "name", None), _where(cls)
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         right = "it must be of a-z, 0-9 and _, from a letter on"

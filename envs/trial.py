@@ -16,10 +16,11 @@ Info = dict[str, Any]
 class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
     """Ends (terminated or truncated) with the last episode of a trial; `env` is made with `episodes`.
 
-    The step that ends an earlier episode returns the first observation of the next, under the same theta, and info then
-    has `final_obs`, the ended episode's last. `reset` starts a new trial. Observations [O + F + 1]: the environment's;
-    the action before, one-hot if discrete, without which what the world does tells little of theta; and 1 where an
-    episode starts, which has no such action. Raises InputError for an environment without `episodes`.
+    After an earlier episode's end the next step takes no action: it returns the first observation of the next episode,
+    under the same theta, and reward 0, as Gymnasium's vector environments do by AutoresetMode.NEXT_STEP. So a memory
+    sees every transition. `reset` starts a new trial. Observations [O + F + 1]: the environment's; the action before,
+    one-hot if discrete, without which what the world does tells little of theta; and 1 where an episode starts, which
+    has no such action. Raises InputError for an environment without `episodes`.
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
@@ -33,22 +34,24 @@ class TrialEnv(gym.Wrapper[Any, Any, Any, Any]):
         low = np.concatenate([inner.low, self._range[0].clip(max=0), [0]])  # 0 where there is no action before
         high = np.concatenate([inner.high, self._range[1].clip(min=0), [1]])
         self.observation_space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
-        self._left = 0
+        self._left, self._over = 0, False
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Obs, Info]:
         given = {} if options is None else options
         if isinstance(given, dict):
             given = {"keep_theta": False, **given}  # else `env` might go on with an earlier trial
         obs, info = self.env.reset(seed=seed, options=given)
-        self._left = int(self.env.unwrapped.episodes) - 1  # type: ignore[attr-defined]
+        self._left, self._over = int(self.env.unwrapped.episodes) - 1, False  # type: ignore[attr-defined]
         return self._started(obs), info
 
     def step(self, action: Any) -> tuple[Obs, SupportsFloat, bool, bool, Info]:
+        if self._over:
+            self._left, self._over = self._left - 1, False
+            following, info = self.env.reset(options={"keep_theta": True})
+            return self._started(following), 0.0, False, False, info
         obs, reward, terminated, truncated, info = self.env.step(action)
         if self._left and (terminated or truncated):
-            self._left -= 1
-            following, _ = self.env.reset(options={"keep_theta": True})
-            return self._started(following), reward, False, False, {**info, "final_obs": obs}
+            self._over, terminated, truncated = True, False, False
         taken = np.asarray(action).reshape(-1)
         before = np.eye(self._actions)[int(taken[0])] if self._actions else taken.clip(*self._range)
         return np.concatenate([obs, before, [0]], dtype=np.float32), reward, terminated, truncated, info

@@ -60,7 +60,7 @@ def run(
 
 
 def certificate(task: envs.Task, expert: str | None, folder: Path) -> dict[str, Any]:
-    """The task's certificate, made with that expert; kept in the folder while both and its methods keep their versions."""
+    """The task's certificate, made with that expert; kept while both and its methods keep their versions."""
     from deconfounded.benchmarks.certify import certify
     from deconfounded.benchmarks.engine import identity
     from deconfounded.experts import policy

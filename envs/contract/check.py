@@ -37,6 +37,8 @@ def _part(task: Task, name: str) -> Iterator[None]:
 
 def check_task(task: Task) -> None:
     """Build a task, take a step, then an episode of random actions. Raises InputError that names what does not fit."""
+    if not isinstance(task, Task):
+        raise InputError(f"task was {task!r}; it must be a Task, such as envs.get('tilted_cartpole')")
     _check_numbers(task)
     if isinstance(task, BlackBox):
         return _check_world(task)

@@ -9,7 +9,8 @@ FALLEN = 1.2  # rad
 
 
 class Cartpole(MujocoTask):
-    """Joints `slider` (m) and `hinge` (rad, 0 is upright); action: the drive's force in units of its gear.
+    """Joints `slider` (m) and `hinge` (rad; at 0 the pole is at right angles to the rail, tilted or not); action: the
+    drive's force in units of its gear.
 
     Noise a step, where a task does not say otherwise: std .004 m and .1 m/s of the cart, .004 rad and .1 rad/s of the
     pole. Reward: (1 + cos pole) / 2 (.3 + .7 exp(-8 x^2)), at x m from the mark; a fallen pole ends the episode, of

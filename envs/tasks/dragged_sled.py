@@ -3,7 +3,7 @@
 Tier 2. Sliding friction is the same at any speed, and stretches the cord by friction / 10 m, .3 m to 1.8 m: an agent
 that expects less friction lags behind, one that expects more overtakes the target. The hand acts on the sled only
 through the cord, on which the sled bounces, so that feedback is slow and the stretch must be known in advance. A
-control step shows the friction only through process noise.
+control step shows the friction only through process noise. The cord's damping, .2 N s/m, acts on a slack cord, too.
 
 Latent: friction of the runners, N, log-uniform: Coulomb's, of a tendon along the ground. Noise a step: std .004 m and
 .4 m/s of the sled, .004 m and .05 m/s of the hand; none of the target, which theta does not touch.

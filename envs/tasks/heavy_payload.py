@@ -8,6 +8,8 @@ process noise.
 Latent: mass, kg, log-uniform, set with its inertia (a cube of that mass). Noise a step: std .004 m and .45 m/s of the
 load, .004 m and .05 m/s of the hook; none of the target, which theta does not touch.
 
+The stretch is observed up to 4 m: beyond, where a heavy load is being lost, nobody sees how far it hangs.
+
 Action: the hook's speed, in units of 3 m/s. Reward: .8 exp(-12.5 d^2) + .2 exp(-d), d m off the target. An episode ends
 with a load dropped or thrown, 1.2 m off the target.
 """

@@ -4,6 +4,9 @@ Tier 2. As in `windy_drone`, what it does not know it has to compensate in advan
 in all directions, and five unknowns at once, of which several act alike. A weak rotor turns the drone as a load near it
 does; what tells them apart is a slow turn about the vertical.
 
+No command holds every drone level: with a weak rotor and a load off its centre, a fifth of all thetas take more torque
+than the action has, about the vertical above all. The drone turns then, and the expert loses it in many episodes.
+
 Latents: wind_x and wind_y, m/s, uniform; load_x and load_y, m from the middle at which .6 kg hang, uniform; rotor, the
 strength of the front left rotor in units of the others', uniform. Drone, noise, action, reward and end are those of
 `windy_drone`.

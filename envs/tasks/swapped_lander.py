@@ -16,7 +16,8 @@ rad and .16 rad/s of the pitch.
 Action: main engine, from off (-1) to 5 N (1), about twice the weight on this moon; side engine at the top, 1 is .7 N to
 the right. Reward: (1 + cos pitch) / 2 (.2 exp(-d / 2) + .8 exp(-(d / .5)^2 / 2)), d m from standing on the pad,
 less .05 times the mean square of both thrusts, in units of the largest. An episode ends with a crash: tilted by more
-than .8 rad, near the ground at more than 1 m/s, or 5 m off.
+than .8 rad, less than .1 m above the pad at more than 1 m/s, or 5 m off. The speed is that at the end of a step: a
+foot that touches the ground before takes of it, so that a tilted lander may come down harder.
 """
 
 import numpy as np

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
+from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.envs.contract.core import CONTRACT, STARTS
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.edits import Edit, ModelEdit
@@ -577,6 +578,15 @@ def test_commands_check_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         assert not out.parent.exists()
 
 
+def test_what_is_no_task() -> None:
+    with pytest.raises(envs.InputError, match=r"^task was 'tilted_cartpole'; it must be a Task, such as envs.get"):
+        envs.check_task("tilted_cartpole")  # type: ignore[arg-type]
+    with pytest.raises(envs.InputError, match=r"^register was given 3; it takes a class of tasks"):
+        envs.register(3)  # type: ignore[arg-type]
+    with pytest.raises(envs.InputError, match=r"^distribution of x was \['uniform'\]; it must be one of uniform, "):
+        envs.Latent("x", "", 0.0, 1.0, ["uniform"])  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("returns", "better"), [((4.0, 8.0), ""), ((1.5, 2.5), "hardly"), ((0.0, 1.0), "not")])
 def test_the_card_of_an_expert_that_was_trained(
     returns: tuple[float, float],
@@ -588,7 +598,8 @@ def test_the_card_of_an_expert_that_was_trained(
     """Its returns, those of random actions, and a warning if these deviate by half of what lies between."""
     held = {"ExpertAgent": np.array(returns), "RandomAgent": np.array([0.0, 2.0])}
 
-    def rolled_out(env: envs.BatchEnv, agent: object, *_: Any, **__: Any) -> Any:
+    def rolled_out(env: envs.BatchEnv, agent: object, episodes: int, seed: int) -> Any:
+        assert seed == stream(EVALUATION, 0)  # whose thetas are not those of training, which begins with seed 0
         return SimpleNamespace(returns=held[type(agent).__name__])
 
     monkeypatch.setattr(train, "run_trials", rolled_out)

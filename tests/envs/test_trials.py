@@ -106,22 +106,23 @@ def test_a_trial_as_one_episode(name: str) -> None:
             same([ours[:width]], [theirs])
             assert (batch.theta == theta).all()
             action = whole.action_space.sample()
-            ours, reward, *flags, info = whole.step(action)
+            ours, reward, *flags, _ = whole.step(action)
             theirs, expected, *ends, _ = plain.step(action)
             assert whole.observation_space.contains(ours)
+            same([ours[:width]], [theirs])  # an episode's last transition, too
             assert reward == expected
+            assert ours[-1] == 0
+            before = np.arange(discrete.n) == action if discrete else action.clip(-1, 1)
+            np.testing.assert_allclose(ours[width:-1], before, rtol=1e-6)
             over, ended = any(flags), ended + any(ends)
             assert over == (ended == 3)
-            assert ours[-1] == (any(ends) and not over) == ("final_obs" in info)
             if over:
                 assert flags == ends
-            elif any(ends):
-                same([info["final_obs"]], [theirs])
-                assert not ours[width:-1].any()
+            elif any(ends):  # the next step takes no action
+                ours, reward, *flags, _ = whole.step(action)
                 theirs = plain.reset()[0]
-            else:
-                before = np.arange(discrete.n) == action if discrete else action.clip(-1, 1)
-                np.testing.assert_allclose(ours[width:-1], before, rtol=1e-6)
+                assert (reward, any(flags), ours[-1]) == (0, False, 1)
+                assert not ours[width:-1].any()
     with pytest.raises(envs.InputError, match="TrialEnv was given an environment of one episode a trial"):
         envs.TrialEnv(envs.make(name))
 
@@ -134,6 +135,17 @@ def test_a_reset_in_the_middle_starts_a_new_trial() -> None:
     whole.step(whole.action_space.sample())
     whole.reset()
     assert (batch.theta != first).all()
+
+
+def test_a_reset_between_two_episodes_starts_a_new_trial() -> None:
+    """Whose first step takes its action."""
+    whole = envs.TrialEnv(envs.make("bandit", episodes=2))
+    whole.reset(seed=0)
+    batch = whole.unwrapped.batch  # type: ignore[attr-defined]
+    while batch.alive.any():
+        whole.step(0)
+    whole.reset(seed=1)
+    np.testing.assert_array_equal(whole.step(1)[0][-6:], [0, 1, 0, 0, 0, 0])
 
 
 def test_options_of_a_trial_are_a_dictionary() -> None:
