@@ -5,28 +5,27 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from deconfounded.deconf.core.data import Draws
-from deconfounded.deconf.core.layers import Mlp
+from deconfounded.deconf.core.layers import Mlp, affine
 from deconfounded.deconf.core.nets import Inputs, gaussian_log_prob, per_seed
 
 
 class DynamicsHead(nn.Module):
     """p_psi(s' | s, a, theta_hat): Bernoulli, or Gaussian with mean s + change and a learned std for each coordinate.
 
-    `inputs` may be shared with other networks. copies: the number of models of the dynamics, in one network.
+    `inputs` may be shared with other networks.
     """
 
-    def __init__(self, latent: int, width: int, inputs: Inputs, draws: Draws, copies: int = 1) -> None:
+    def __init__(self, latent: int, width: int, inputs: Inputs, draws: Draws) -> None:
         super().__init__()
-        self.inputs, self.change, self.copies = inputs, inputs.scales.change, copies
+        self.inputs, self.change = inputs, inputs.scales.change
         self.signature = inputs.signature
-        self.net = Mlp(inputs.obs_width + inputs.action_width + latent, width, copies * self.signature.obs, draws)
+        self.net = Mlp(inputs.obs_width + inputs.action_width + latent, width, self.signature.obs, draws)
         self.log_std = nn.Parameter(torch.zeros(len(draws), self.signature.obs, device=draws.device))
 
     def forward(self, obs: Tensor, action: Tensor, theta_hat: Tensor | None = None) -> Tensor:
-        """Logits, or means of the scaled change: [S, ..., copies, O]."""
+        """Logits, or means of the scaled change: [S, ..., 1, O]; of K models [S, ..., K, O]."""
         inputs = [self.inputs.obs(obs), self.inputs.action(action)]
-        out = self.net(torch.cat(inputs if theta_hat is None else [*inputs, theta_hat], -1))
-        return out.unflatten(-1, (self.copies, self.signature.obs))
+        return self.net(torch.cat(inputs if theta_hat is None else [*inputs, theta_hat], -1))[..., None, :]
 
     def mean(self, obs: Tensor, action: Tensor, theta_hat: Tensor) -> Tensor:
         """The mean of the scaled change [S, ..., O]."""
@@ -34,7 +33,7 @@ class DynamicsHead(nn.Module):
         return self.change(torch.sigmoid(out) - obs) if self.signature.binary else out
 
     def log_prob(self, obs: Tensor, action: Tensor, next_obs: Tensor, theta_hat: Tensor | None = None) -> Tensor:
-        """log p_psi [S, ..., copies] of next observations [S, ..., O], in units of the scaled change if Gaussian."""
+        """log p_psi [S, ..., 1 or K] of next observations [S, ..., O], in units of the scaled change if Gaussian."""
         out = self(obs, action, theta_hat)
         if self.signature.binary:
             target = next_obs[..., None, :].expand_as(out)
@@ -73,3 +72,22 @@ class LinearDynamicsHead(DynamicsHead):
         assert theta_hat is not None
         expected, gains = self.parts(obs, action)
         return (expected + (gains * theta_hat[..., None, :]).sum(-1))[..., None, :]
+
+
+class CodedDynamicsHead(LinearDynamicsHead):
+    """K models of the dynamics that differ by a code e_k [D] each: s + f(s, a) + sum_d g_d(s, a) e_kd.
+
+    Models with an output layer each differ by more than theta's effect while they are learned, so that the same one
+    fits every trial best, and no other learns any more. Here f and g are common to all.
+    """
+
+    def __init__(self, models: int, code: int, width: int, inputs: Inputs, draws: Draws) -> None:
+        super().__init__(code, width, inputs, draws)
+        self.codes = nn.Parameter(draws.normal(code, models))
+
+    def forward(self, obs: Tensor, action: Tensor, theta_hat: Tensor | None = None) -> Tensor:
+        expected, gains = self.parts(obs, action)
+        rows = gains.flatten(1, -2)
+        none = rows.new_zeros(len(rows), 1, self.codes.shape[-1])
+        effect = affine(none, rows, self.codes).reshape(*gains.shape[:-1], -1)
+        return expected[..., None, :] + effect.transpose(-1, -2)

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, take
-from deconfounded.deconf.core.dynamics import DynamicsHead, LinearDynamicsHead
+from deconfounded.deconf.core.dynamics import CodedDynamicsHead, DynamicsHead, LinearDynamicsHead
 from deconfounded.deconf.core.gru import GruBelief
 from deconfounded.deconf.core.latent_model import LatentModel
 from deconfounded.deconf.core.linear_model import LinearModel
@@ -122,16 +122,18 @@ class VariationalModel(LatentModel):
 class DiscreteModel(LatentModel):
     """A mixture of K models: theta_hat is one-hot, and p_psi(s' | s, a, k) maximises the exact marginal likelihood.
 
-    The memory is the log-belief, updated by Bayes' rule: Eq. (5) with a learned model, without encoder or bound.
-    p(k) is uniform, so that each k stands for an equal share of p(theta); a fitted prior lets one k take over.
+    The models differ by a code of a few numbers (CodedDynamicsHead). The memory is the log-belief, updated by Bayes'
+    rule: Eq. (5) with a learned model, without encoder or bound. p(k) is uniform, so that each k stands for an equal
+    share of p(theta); a fitted prior lets one k take over.
     """
 
     kind = "discrete"
+    code = 8  # numbers by which models differ
 
     def __init__(self, latent: int, width: int, scales: Scales, draws: Draws) -> None:
         super().__init__(draws)
         self.latent, self.width, self.inputs = latent, width, Inputs(scales)
-        self.dynamics = DynamicsHead(0, width, self.inputs, draws, copies=latent)
+        self.dynamics = CodedDynamicsHead(latent, self.code, width, self.inputs, draws)
 
     def _evidence(self, batch: Batch) -> Tensor:
         log_next = self.dynamics.log_prob(batch.obs, batch.action, batch.next_obs)
@@ -160,7 +162,8 @@ class DiscreteModel(LatentModel):
         return belief
 
     def forget(self, memory: Tensor, share: Tensor | None = None) -> Tensor:
-        return super().forget(memory, share).log_softmax(-1)
+        left = super().forget(memory, share)
+        return torch.where((left == memory).all(-1, keepdim=True), memory, left.log_softmax(-1))
 
     def log_next(self, memory: Tensor, step: Batch, draws: Draws) -> Tensor:
         return torch.logsumexp(memory + self._evidence(step), -1)

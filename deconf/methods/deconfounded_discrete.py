@@ -10,7 +10,7 @@ from deconfounded.deconf.methods import deconfounded
 from deconfounded.deconf.methods.deconfounded import SHARED, USES, DeconfoundedConfig
 
 ON_CONTROL = DeconfoundedConfig(
-    model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=1e-2
+    model="discrete", latent=16, inference_updates=800, inference_batch=8, inference_rate=3e-3
 )
 ON_BANDIT = DeconfoundedConfig(
     model="discrete",
@@ -28,7 +28,7 @@ PAPER = replace(ON_BANDIT, rounds=40, inference_updates=40, imitation_updates=40
 DEPLOYED = {**SHARED, "deployments": deployments("episode", "mode", "mean")}
 
 
-@uses(*USES, version=2, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **DEPLOYED)
+@uses(*USES, version=3, cost=7, on_control=ON_CONTROL, on_bandit=ON_BANDIT, paper=PAPER, **DEPLOYED)
 def fit(given: Given) -> DeconfoundedAgent:
     """Train by Algorithm 1 with the discrete model."""
     return deconfounded.fit(given)

@@ -15,7 +15,7 @@ from tests.tools import tiny_preset
 SAVED: dict[str, tuple[str, str]] = {
     "deconfounded": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
     "deconfounded_gru": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "1ae427793226"),
-    "deconfounded_discrete": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "67edd957d851"),
+    "deconfounded_discrete": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "e14921aa44d9"),
     "deconfounded_forgetting": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3e2082a00457"),
     "deconfounded_large": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
     "deconfounded_offline": ("deconfounded.deconf.core.latent_agent:DeconfoundedAgent", "3075fbb73bbb"),
