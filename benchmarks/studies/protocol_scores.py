@@ -46,7 +46,8 @@ def _part(protocol: str, found: index.Found, over: "Mapping[str, Sequence[Mean]]
         rows = [(task.name, *_cells(of["methods"], end)) for task, of in found]
         if of_agents := over.get(said):
             beside = f"the same, {STANDARD}" + ", first episode" * (protocol == "once")
-            rows.append(("interquartile mean", *(two_decimals(mean.value) for mean in of_agents)))
+            over_how_many = f"interquartile mean, tasks: {of_agents[0].tasks}"
+            rows.append((over_how_many, *(two_decimals(mean.value) for mean in of_agents)))
             rows.append((beside, *("" if mean.standard is None else two_decimals(mean.standard) for mean in of_agents)))
         parts.append(markdown_table(head, [*rows, ("version", *_versions(found))]))
     tasks = published.tasks(["suite", "hard"])

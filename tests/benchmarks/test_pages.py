@@ -475,7 +475,7 @@ class TestProtocols:
         assert cells(last, "curling")[dagger] == "0.50 (0.40 to 0.60)"
         assert cells(last, "curling")[1] == "0.75 (0.65 to 0.85)"
         assert "| icy_road |  |  |  | 0.50 (0.40 to 0.60) |" in last
-        means = [cells(last, row)[dagger] for row in ("interquartile mean", "the same, standard")]
+        means = [cells(last, row)[dagger] for row in ("interquartile mean, tasks: 1", "the same, standard")]
         assert means == ["0.50", ""]  # over curling alone, where both have all; records of another version of dagger
         assert [cells(last, "the same, standard")[1], cells(last, "version")[dagger]] == ["0.75", "v7 (now v2)"]
         missing = last.partition("Not yet made: ")[2].partition(".")[0].split(", ")
@@ -491,7 +491,7 @@ class TestProtocols:
         assert once.count("| curling |") == 1
         assert "interquartile mean" not in once
         both = protocol_scores.page(curling, {"once": curling}).partition("## once")[2]
-        assert "| interquartile mean | 0.75 |" in both
+        assert "| interquartile mean, tasks: 1 | 0.75 |" in both
         assert "| the same, standard, first episode | 0.50 |" in both
 
     def test_means_are_over_shared_seeds(self) -> None:
