@@ -92,7 +92,8 @@ def keep(run: Path) -> None:
     if results["task_version"] != task.version:
         raise envs.InputError(f"{run} is of {task.name} v{results['task_version']}, which v{task.version} supersedes")
     newest = {records.named(record): record for record in records.of_task(DOCS / "records", task.name)}
-    if older := [of for record in made if records.outdone(record, newest.get(of := records.named(record)))]:
+    by_name = [(records.named(record), record) for record in made]
+    if older := [name for name, record in by_name if records.outdone(record, newest.get(name))]:
         raise envs.InputError(f"{run} has {', '.join(dict.fromkeys(older))} of older versions than docs/; run it again")
     certificates = [file for file in (run.parent / "certificates").glob(f"{task.name}.*") if not file.is_symlink()]
     for file in certificates:

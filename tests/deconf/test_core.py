@@ -21,6 +21,7 @@ from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.agents import LearnedAgent
 from deconfounded.deconf.core.beliefs import Belief, EvidenceBelief, ForgettingBelief, InnovationBelief
 from deconfounded.deconf.core.data import Batch, Draws, Signature
+from deconfounded.deconf.core.dynamics import CodedDynamicsHead
 from deconfounded.deconf.core.gru import GruBelief, GruMemory
 from deconfounded.deconf.core.latent_model import final_belief
 from deconfounded.deconf.core.layers import Linear
@@ -228,6 +229,22 @@ def test_discrete_belief_one_step_at_a_time(name: str) -> None:
             memory = model.update(memory, data[:, :, t])
         torch.testing.assert_close(memory, model.final_memory(data), rtol=1e-3, atol=1e-3)
         assert (memory - model.start(len(data))).abs().max() > 0.1
+
+
+def test_discrete_models_differ_by_their_codes_alone() -> None:
+    """Of model k the mean is f + G e_k: of an empty code it is f, and of two codes the mean is in the middle."""
+    trials, _ = demonstrations("slippery_cartpole", 4)
+    data = Batch.of(trials, 2)
+    draws = Draws([np.random.default_rng(i) for i in range(2)], "cpu")
+    head = DiscreteModel(4, 16, Scales.of(Signature.of(trials), data), draws).dynamics
+    assert isinstance(head, CodedDynamicsHead)
+    with torch.no_grad():
+        head.codes[..., 0] = 0
+        head.codes[..., 1] = (head.codes[..., 2] + head.codes[..., 3]) / 2
+        mean, (common, _) = head(data.obs, data.action), head.parts(data.obs, data.action)
+    torch.testing.assert_close(mean[..., 0, :], common)
+    torch.testing.assert_close(mean[..., 1, :], (mean[..., 2, :] + mean[..., 3, :]) / 2)
+    assert (mean[..., 2, :] - mean[..., 3, :]).abs().max() > 0.1
 
 
 def test_discrete_loss_splits_trials_into_histories() -> None:
