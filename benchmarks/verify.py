@@ -36,7 +36,8 @@ def verdict(record: records.Record, again: records.Record) -> tuple[str, list[st
         return "not the same", differs
     mean, sd = (np.array([record[key], again[key]]) for key in ("returns", "returns_sd"))
     error = np.sqrt((sd**2).sum(0) / record["eval_trials"]) + 1e-9
-    apart, worst = np.abs(mean[0] - mean[1]), np.argmax(np.abs(mean[0] - mean[1]) / error)
+    apart = np.abs(mean[0] - mean[1])
+    worst = np.argmax(apart / error)
     differs.append(f"mean returns: up to {apart[worst]:.3g} apart, where the interval allows {3 * error[worst]:.3g}")
     return ("inside the interval" if (apart <= 3 * error).all() else "not the same"), differs
 

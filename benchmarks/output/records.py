@@ -222,13 +222,14 @@ def write(folder: Path, records: Sequence[Record]) -> None:
             kept = {_slot(record): record for record in held(file)}
             superseded = []
             for record in new:
-                if outdone(record, kept.get(_slot(record))):
+                slot = _slot(record)
+                if outdone(record, kept.get(slot)):
                     superseded.append(record)
                     continue
-                before = kept.pop(_slot(record), None)
+                before = kept.pop(slot, None)
                 if before is not None and stale(before, record):
                     superseded.append(before)
-                kept[_slot(record)] = record
+                kept[slot] = record
             today = _of_one_text(_newest(list(kept.values())), new)
             slots = set(map(_slot, today))
             superseded += [record for slot, record in kept.items() if slot not in slots]

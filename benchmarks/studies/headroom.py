@@ -1,6 +1,6 @@
 """docs/headroom.md: what the best methods leave to gain on each task, and how many tasks are solved."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,35 +55,32 @@ class Headroom(NamedTuple):
 
 def headroom(methods: dict[str, Any], end: str, tiers: str = "123") -> Headroom | None:
     """From the `methods` of results.json, of the score of an episode of ENDS; None without reference or methods."""
-    exact = _ranked(methods, end, lambda entry: entry["method"] == EXACT)
+    exact = {name: entry[f"score_{end}"] for name, entry in methods.items() if entry["method"] == EXACT}
     if not exact:
         return None
-    ceiling, by_seed, gaps = exact[0], index.measured(methods, end), dict[str, tuple[str, Figure]]()
-    for name, entry in methods.items():
-        if _learns(entry, tiers) and (gap := statistics.paired(by_seed[ceiling[0]], by_seed[name])):
-            agent = (name, gap)
-            gaps[entry["method"]] = min(gaps.get(entry["method"], agent), agent, key=lambda agent: agent[1].value)
-    ranked = sorted(gaps.values(), key=lambda agent: agent[1].value)
-    best = [(name, round(ceiling[1] - float(gap.value), 9)) for name, gap in ranked[:BEST]]
-    return Headroom(ceiling, best, ranked[0][1]) if ranked else None
+    ceiling, by_seed = _ranked(methods, exact)[0], index.measured(methods, end)
+    pairs = {name: statistics.paired(by_seed[ceiling[0]], by_seed[name]) for name in _learners(methods, tiers)}
+    gaps = {name: gap for name, gap in pairs.items() if gap}
+    best = _ranked(methods, {name: round(ceiling[1] - float(gap.value), 9) for name, gap in gaps.items()})
+    return Headroom(ceiling, best[:BEST], gaps[best[0][0]]) if best else None
 
 
 def best_of(methods: dict[str, Any], end: str, tiers: str = "123") -> list[tuple[str, float]]:
     """The learners of some tiers, each in its best deployment, and their scores in an episode of ENDS; best first."""
-    return _ranked(methods, end, lambda entry: _learns(entry, tiers))
+    return _ranked(methods, {name: methods[name][f"score_{end}"] for name in _learners(methods, tiers)})
 
 
-def _learns(entry: dict[str, Any], tiers: str) -> bool:
-    """Whether an agent is a learner of one of these tiers."""
-    return entry["method"] != EXACT and entry["tier"] in tiers
+def _learners(methods: dict[str, Any], tiers: str) -> list[str]:
+    """Agents that learn, of these tiers."""
+    return [name for name, entry in methods.items() if entry["method"] != EXACT and entry["tier"] in tiers]
 
 
-def _ranked(methods: dict[str, Any], end: str, chosen: Callable[[dict[str, Any]], bool]) -> list[tuple[str, float]]:
+def _ranked(methods: dict[str, Any], scores: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Of agents with these scores, the best deployment of each method; best first."""
     best: dict[str, tuple[str, float]] = {}
-    for name, entry in methods.items():
-        if chosen(entry):
-            agent = (name, entry[f"score_{end}"])
-            best[entry["method"]] = max(best.get(entry["method"], agent), agent, key=lambda agent: agent[1])
+    for agent in scores.items():
+        method = methods[agent[0]]["method"]
+        best[method] = max(best.get(method, agent), agent, key=lambda agent: agent[1])
     return sorted(best.values(), key=lambda agent: -agent[1])
 
 

@@ -167,11 +167,13 @@ def by_task(found: index.Found) -> str:
     rows = []
     for task, results in found:
         by_seed = index.last_scores(results["methods"])
-        last = {name: by_seed[name] for name in BY_TASK if name in by_seed}
-        seeds = set.intersection(*map(set, last.values())) if last else set()
-        means = {name: float(np.mean([of[seed] for seed in seeds])) for name, of in last.items() if seeds}
-        row = (*(scoring.two_decimals(means[name]) if name in means else "" for name in BY_TASK),)
-        row += (str(len(seeds)), f"{results['wall_s']:,.0f}")
+        made = [name for name in BY_TASK if name in by_seed]
+        matched = statistics.matched(*({"": by_seed[name]} for name in made)) if made else ()
+        last = dict(zip(made, matched, strict=True))
+        means = {name: scoring.two_decimals(float(of[""].mean())) for name, of in last.items() if of}
+        row = (*(means.get(name, "") for name in BY_TASK),)
+        seeds = min((len(scores) for of in last.values() for scores in of.values()), default=0)
+        row += (str(seeds), f"{results['wall_s']:,.0f}")
         rows.append((f"[{task.name}](#{task.name})", task.tier_name, *row))
     methods = (f"{name} ({METHODS[name].tier})" for name in BY_TASK)
     table = markdown_table(("task", "tier needed", *methods, "seeds", "seconds"), rows)
