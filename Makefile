@@ -8,8 +8,8 @@ unexport PYTHONDONTWRITEBYTECODE  # modules are compiled once, not by each of th
 
 setup: $(VENV)/installed
 
-demo: $(VENV)/installed
-	$(VENV)/bin/python benchmarks/run.py --task slippery_cartpole --resume
+demo: $(VENV)/installed  # the README's
+	$(VENV)/bin/deconf run --task curling --methods naive_rnn deconfounded --seeds 1 --resume
 
 test: $(VENV)/installed  # side by side, since mypy uses one core
 	$(MAKE) -j2 lint pytest
