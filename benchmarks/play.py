@@ -19,20 +19,26 @@ from deconfounded.experts.agent import Agent
 def ready(folder: Path, task: envs.Task) -> Agent:
     """The agent of a folder. Raises InputError if it does not fit the task, or sees theta."""
     about = saved_agents.describe(folder)
-    theirs, trained = about.get("spaces"), about.get("task", task.name)
     from deconfounded.benchmarks.engine.benchmark import (
         spaces,
     )  # torch takes seconds; bad input is refused at once
     from deconfounded.benchmarks.engine.guest_host import ReseededAgent
     from deconfounded.deconf.core.agents import LearnedAgent
     from deconfounded.deconf.methods.memoryless_bc import MemorylessAgent
+    from deconfounded.experts.datasets.units import RawAgent
 
-    agent, ours = deconfounded.load(folder), spaces(task)
+    agent, ours, theirs = deconfounded.load(folder), spaces(task), about.get("spaces")
+    if isinstance(agent, RawAgent):
+        raise envs.InputError(f"the agent in {folder} acts in the units of a log; save the agent without them")
+    if theirs is None and isinstance(agent, LearnedAgent):
+        signature = agent.policy.signature
+        theirs = {"observations": signature.obs, "action": signature.action, "actions": signature.actions}
     if theirs not in (None, ours):
         raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
-    if trained.rpartition(":")[2] != (task.reference or task.name).rpartition(":")[2]:
+    trained = about.get("task")
+    if trained and trained.rpartition(":")[2] != (task.reference or task.name).rpartition(":")[2]:
         print(f"note: the agent in {folder} was trained on {trained}")
     return agent if isinstance(agent, LearnedAgent) else ReseededAgent(agent)
 

@@ -27,7 +27,7 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
         return task
     if not task.draws_by_latents:
         raise envs.InputError(f"--range was {ranges[0]!r}; {task.name} draws theta by its own sample_theta alone")
-    latents = {latent.name: latent for latent in task.latents}
+    latents, ranged = {latent.name: latent for latent in task.latents}, set[str]()
     for text in ranges:
         name, _, bounds = text.partition("=")
         try:
@@ -35,6 +35,9 @@ def with_ranges(task: envs.Task, ranges: list[str]) -> envs.Task:
         except ValueError:
             raise envs.InputError(f"--range was {text!r}; it must be like {task.latents[0].name}=0.1:0.2") from None
         check_names("latent", [name], list(latents))
+        if name in ranged:
+            raise envs.InputError(f"--range had {name} twice; give each latent one range")
+        ranged.add(name)
         latent = latents[name]
         if not low < high:
             raise envs.InputError(f"--range was {text!r}; {low:g} must be less than {high:g}")

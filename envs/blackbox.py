@@ -72,7 +72,7 @@ class GymSimulator(Simulator):
                 raise InputError(f"step of {self.box.name} was called after close; reset once")
             with part(self.box.name, "step"):
                 values = "obs, reward, terminated, truncated, info"
-                obs, reward, over, cut, _ = self._values("step", env.step(self.box.raw(action[k])), values)
+                obs, reward, over, cut, _ = self._values("step", env.step(self.box.in_units(action[k])), values)
                 try:
                     paid = float(reward)
                 except (TypeError, ValueError):
@@ -171,7 +171,11 @@ class BlackBox(Task):
         return env
 
     def raw(self, action: Array) -> Any:
-        """Action [A] in the environment's units."""
+        """An agent's action [A] in the environment's units. Raises InputError for one that is not of `action_space`."""
+        return self.in_units(self.check_action(np.asarray(action)[None], 1)[0])
+
+    def in_units(self, action: Array) -> Any:
+        """As `raw`, of an action that has been checked."""
         space = self.facts.space
         if isinstance(space, spaces.Discrete):
             return int(action[0]) + int(space.start)

@@ -49,6 +49,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     about["versions"] = {"deconfounded-imitation": __version__, "numpy": np.__version__}
     try:
         about["settings"], named = agent.state()
+        named = {key: x.copy() for key, x in named.items()}  # in C's order: safetensors writes memory as it lies
         content = to_bytes(named)
         described = as_json(file, sealed({**about, "arrays": _sha256(content)}))
     except InputError:
@@ -56,7 +57,7 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     except Exception as error:  # any error of the class's own `state`
         right = "its state() must return a dictionary for json and one of arrays"
         raise InputError(f"{cls.__qualname__} cannot be saved ({error_line(error)}); {right}") from None
-    _check_loadable(cls, json.dumps(about["settings"]), content)
+    _check_loadable(cls, json.dumps(about["settings"]), named, content)
     if "spaces" in about:
         _check_alike(
             agent, cls.from_state(json.loads(json.dumps(about["settings"])), from_bytes(content)), about["spaces"]
@@ -68,13 +69,12 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
     write_atomically(file, described)
 
 
-def _check_loadable(cls: type[Agent], settings: str, content: bytes) -> None:
-    """Raises InputError unless `from_state` makes an agent of the same settings, as JSON, and arrays."""
+def _check_loadable(cls: type[Agent], settings: str, named: dict[str, NDArray[Any]], content: bytes) -> None:
+    """Raises InputError unless `from_state` makes an agent of the same settings, as JSON, and arrays, from its file."""
     try:
-        again, named = cls.from_state(json.loads(settings), from_bytes(content)).state()
-        saved = from_bytes(content)
-        same = json.loads(json.dumps(again)) == json.loads(settings) and named.keys() == saved.keys()
-        same = same and all(np.array_equal(named[key], x, equal_nan=True) for key, x in saved.items())
+        again, made = cls.from_state(json.loads(settings), from_bytes(content)).state()
+        same = json.loads(json.dumps(again)) == json.loads(settings) and made.keys() == named.keys()
+        same = same and all(np.array_equal(made[key], x, equal_nan=True) for key, x in named.items())
         why = "" if same else "it makes an agent of another state"
     except Exception as error:  # any error of the class's own methods
         why = error_line(error)
@@ -147,8 +147,9 @@ def load(folder: Path | str) -> Agent:
     if not isinstance(folder, str | Path):
         raise InputError(f"the folder of an agent was {folder!r}; it must be a path")
     about = describe(folder := Path(folder))
+    stored = arrays(folder, about)
     try:
-        content = from_bytes(arrays(folder, about))
+        content = from_bytes(stored)
         where, _, name = about["class"].rpartition(":")
         cls, settings = outside.find("agent", f"{folder / where if where == CODE else where}:{name}"), about["settings"]
     except InputError as error:

@@ -21,6 +21,7 @@ from deconfounded.deconf.core.monitor import Monitor, Training
 from deconfounded.deconf.given import Given
 from deconfounded.deconf.method import ENVIRONMENT, Method
 from deconfounded.envs.streams import Array, unseeded
+from deconfounded.envs.support.numbers import is_seed
 from deconfounded.experts.agent import Agent
 from deconfounded.experts.rollout import trial_seeds
 
@@ -72,7 +73,7 @@ class Provider:
                 return context.query(agent, self.rngs, _number(*what))
             case "environments":
                 seed, n = what
-                if not isinstance(seed, int) or not 0 <= seed < len(self.rngs):
+                if not is_seed(seed) or seed >= len(self.rngs):
                     right = f"it has {len(self.rngs)}, numbered from 0"
                     raise envs.InputError(f"it asked for environments of seed {seed!r}; {right}")
                 self._vectors.append(Vector(context, seed, n, int(self.rngs[seed].integers(2**31))))
@@ -87,7 +88,7 @@ class Provider:
                 return context.env, context.expert
 
     def _vector(self, number: Any) -> "Vector":
-        if not isinstance(number, int) or not 0 <= number < len(self._vectors):
+        if not is_seed(number) or number >= len(self._vectors):
             raise envs.InputError(f"it asked for environments number {number!r}; it was given {len(self._vectors)}")
         return self._vectors[number]
 
@@ -99,7 +100,7 @@ class Provider:
 
 
 def _number(trials: Any) -> int | None:
-    if trials is not None and not (isinstance(trials, int) and trials > 0):
+    if trials is not None and not (is_seed(trials) and trials > 0):
         raise envs.InputError(f"it asked for {trials!r} trials; it must be a number from 1 up")
     return trials
 

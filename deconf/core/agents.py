@@ -19,6 +19,7 @@ from deconfounded.envs.support.errors import InputError
 from deconfounded.envs.support.numbers import is_seed
 from deconfounded.experts import saved_agents
 from deconfounded.experts.agent import Agent, State
+from deconfounded.experts.arrays import LARGEST
 
 ROUNDING = 1e-6  # of an action at an end of its range
 
@@ -65,7 +66,8 @@ def ramp(done: int, until: float) -> float:
 class LearnedAgent(Agent):
     """An agent of S seeds: it acts in S equal groups of trials, each with its seed's networks and random numbers.
 
-    Calls go in the order `begin`, `reset`, `act`, `observe`; otherwise they raise InputError.
+    Calls go in the order `begin`, `reset`, then `act` and `observe`, which raise InputError before. Where somebody else
+    acts, `observe` alone takes in the steps.
     """
 
     def __init__(self, policy: ActionHead) -> None:
@@ -96,9 +98,13 @@ class LearnedAgent(Agent):
         if not len(self._draws):
             raise InputError("act was called before begin and reset; begin(n) trials, reset([generator]), then act")
         seen = self._tensor(obs)
-        if not np.isfinite(obs).all():
-            raise InputError("observations held NaN or infinity, of which no action follows")
-        return self.choose(seen).double().cpu().numpy().reshape(len(obs), -1)
+        if not (np.abs(obs) <= LARGEST).all():
+            raise InputError(f"observations held NaN or infinity, or more than {LARGEST:g}, of which no action follows")
+        action = self.choose(seen).double().cpu().numpy().reshape(len(obs), -1)
+        if not np.isfinite(action).all():
+            wrong = "an action was NaN: an observation far from those of training has overflowed the agent's memory"
+            raise InputError(f"{wrong}; leave out such observations, and begin again")
+        return action
 
     def _tensor(self, obs: NDArray[np.float32]) -> Tensor:
         shape, width = np.shape(obs), self.policy.signature.obs
@@ -125,8 +131,9 @@ class LearnedAgent(Agent):
                 f" ({len(obs)}, {signature.action}) and ({len(obs)},), a row a trial"
             )
         before, after = self._tensor(obs), self._tensor(next_obs)
-        if not np.isfinite(np.concatenate([obs, action, next_obs], 1)).all():
-            raise InputError("observations or actions held NaN or infinity, which a memory would never lose")
+        if not (np.abs(np.concatenate([obs, action, next_obs], 1)) <= LARGEST).all():
+            wrong = f"observations or actions held NaN or infinity, or more than {LARGEST:g}"
+            raise InputError(f"{wrong}, which a memory would never lose")
         if signature.actions and (action.min() < 0 or action.max() >= signature.actions or (action % 1).any()):
             raise InputError(f"an action was none of 0 to {signature.actions - 1}")
         if not signature.actions and (most := np.abs(action).max()) > 1 + ROUNDING:

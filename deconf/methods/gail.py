@@ -113,7 +113,7 @@ class GailAgent(LearnedAgent):
     def begin(self, n: int) -> None:
         super().begin(n)
         self._state = torch.zeros(self.seeds, self._n, 2 * self.width, device=self.device)
-        self._next = self._state
+        self._next, self._has_read = self._state, False
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
@@ -121,11 +121,18 @@ class GailAgent(LearnedAgent):
         self._before = torch.zeros(self.seeds, self._n, before + 1, device=self.device)
         self._before[..., -1] = 1  # flags the start of an episode
 
+    def _read(self, obs: Tensor) -> None:
+        """The state after an observation, which is kept if the step takes place."""
+        self._next, self._has_read = self.lstm(torch.cat([self.scales.obs(obs), self._before], -1), self._state), True
+
     def choose(self, obs: Tensor) -> Tensor:
-        self._next = self.lstm(torch.cat([self.scales.obs(obs), self._before], -1), self._state)
+        self._read(obs)
         return self.policy.sample(self._next[..., : self.width], self._draws)
 
     def remember(self, step: Batch) -> None:
+        if not self._has_read:
+            self._read(step.obs)
+        self._has_read = False
         alive = step.mask[..., None] > 0
         action = self.policy.signature.encode_action(step.action)
         self._state = torch.where(alive, self._next, self._state)

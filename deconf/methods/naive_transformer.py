@@ -94,19 +94,29 @@ class TransformerAgent(LearnedAgent):
         width = signature.action_features + signature.obs + 1
         self._before = torch.zeros(self.seeds, self._n, width, device=self.device)
         self._features = torch.zeros(self.seeds, self._n, net.width, device=self.device)
+        self._has_read = False
 
     def choose(self, obs: Tensor) -> Tensor:
         """Act on the next token. It stays in the cache if the step takes place, and is overwritten otherwise."""
         scaled = self.scales.obs(obs)
-        return self.act_on(torch.cat([scaled, self._before], -1), scaled)
+        return self.act_on(self._next_tokens(scaled), scaled)
+
+    def _next_tokens(self, scaled: Tensor) -> Tensor:
+        return torch.cat([scaled, self._before], -1)
 
     def act_on(self, tokens: Tensor, scaled: Tensor) -> Tensor:
         """Action [S, N, A], given each trial's next token [S, N, I] and its scaled observation [S, N, O]."""
-        steps = zip(tokens, self._layers, self._caches, strict=True)
-        self._features = stacked([self.net.step(*of_seed) for of_seed in steps])
+        self._read(tokens)
         return self.policy.sample(torch.cat([self._features, scaled], -1), self._draws)
 
+    def _read(self, tokens: Tensor) -> None:
+        steps = zip(tokens, self._layers, self._caches, strict=True)
+        self._features, self._has_read = stacked([self.net.step(*of_seed) for of_seed in steps]), True
+
     def remember(self, step: Batch) -> None:
+        if not self._has_read:
+            self._read(self._next_tokens(self.scales.obs(step.obs)))
+        self._has_read = False
         for cache, mask in zip(self._caches, step.mask, strict=True):
             cache.advance(mask)
         self._before = torch.where(step.mask[..., None] > 0, self.before(step), self._before)

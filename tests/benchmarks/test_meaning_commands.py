@@ -12,12 +12,15 @@ from deconfounded import envs
 from deconfounded.benchmarks import play
 from deconfounded.benchmarks.console import whole
 from deconfounded.benchmarks.engine import catalogue, guest_host, job_files, local, sources
+from deconfounded.benchmarks.engine.context import Context
+from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.benchmarks.output import records
 from deconfounded.benchmarks.studies import cards, table
 from deconfounded.experts.agent import RandomAgent
+from deconfounded.experts.datasets.units import Units
 from deconfounded.experts.rollout import run_trials
 from tests import toys
-from tests.tools import deconf
+from tests.tools import deconf, tiny_preset
 
 METHOD = """
 from deconfounded.deconf.method import uses
@@ -203,15 +206,30 @@ def test_an_agent_of_another_class_gets_numbers_as_in_its_run(monkeypatch: pytes
     np.testing.assert_array_equal(ready.act(obs), agent.act(obs))
 
 
-@pytest.mark.parametrize(("trained", "noted"), [("push", False), ("elsewhere/toys.py:Push", True), ("curling", True)])
+@pytest.mark.parametrize(
+    ("trained", "noted"), [("push", False), ("elsewhere/toys.py:Push", True), ("curling", True), (None, False)]
+)
 def test_an_agent_on_another_task_than_it_was_trained_on(
-    trained: str, noted: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trained: str | None, noted: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is played, if its spaces fit, but not without a word."""
-    monkeypatch.setattr(play.saved_agents, "describe", lambda folder: {"task": trained})
+    """It is played, if its spaces fit, but not without a word; a folder may name no task."""
+    monkeypatch.setattr(play.saved_agents, "describe", lambda folder: {"task": trained} if trained else {})
     monkeypatch.setattr(play.deconfounded, "load", lambda folder: RandomAgent(toys.Push.action_space))
     play.ready(Path("mine"), toys.Push())
     assert capsys.readouterr().out == f"note: the agent in mine was trained on {trained}\n" * noted
+
+
+def test_an_agent_of_other_units_or_actions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a folder that states no spaces: `agent.save` and `units.agent(agent).save` write such."""
+    units = Units(("x", "velocity"), ("push",), (-100.0,), (100.0,))
+    monkeypatch.setattr(play.saved_agents, "describe", lambda folder: {})
+    monkeypatch.setattr(play.deconfounded, "load", lambda folder: units.agent(RandomAgent(toys.Push.action_space)))
+    with pytest.raises(envs.InputError, match="acts in the units of a log"):
+        play.ready(Path("mine"), toys.Push())
+    context = Context(envs.get("bandit"), tiny_preset(), [0])
+    monkeypatch.setattr(play.deconfounded, "load", lambda folder: fit(context, "blind_bc"))
+    with pytest.raises(envs.InputError, match=r"is for .*'actions': 5.*; push has .*'actions': 0"):
+        play.ready(Path("mine"), toys.Push())
 
 
 def test_what_a_guest_hears_at_a_reset_does_not_tell_the_seed_of_theta() -> None:

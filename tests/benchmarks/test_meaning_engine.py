@@ -14,7 +14,7 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import certify
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import jobs, progress, scheduler
+from deconfounded.benchmarks.engine import jobs, progress, provider, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
@@ -268,3 +268,11 @@ def test_progress_of_a_training_is_its_share_of_the_job(tmp_path: Path, monkeypa
         assert sum(ticks.queue) == pytest.approx(sum_of_ticks * job.ticks, abs=1)
     monitor.close()
     assert sum(ticks.queue) == job.ticks
+
+
+def test_numbers_of_trials_that_a_method_asks_for() -> None:
+    """Of numpy too, with `--debug` as without."""
+    assert [provider._number(trials) for trials in (None, 3, np.int64(3))] == [None, 3, 3]
+    for trials in (True, 0, 2.0, "3"):
+        with pytest.raises(envs.InputError, match="it must be a number from 1 up"):
+            provider._number(trials)

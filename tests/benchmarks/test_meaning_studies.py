@@ -356,6 +356,10 @@ class TestCommands:
         with pytest.raises(envs.InputError, match=r"--range was 'force=\.5:\.5'; 0\.5 must be less than 0\.5"):
             score_command.with_ranges(PUSH, ["force=.5:.5"])
 
+    def test_a_latent_has_one_range(self) -> None:
+        with pytest.raises(envs.InputError, match="--range had force twice"):
+            score_command.with_ranges(PUSH, ["force=0:.1", "force=.9:1"])
+
     def test_salt_of_a_score(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         seeds: list[int] = []
         scored = {"score": [0.0], "ci95_last": None}

@@ -886,6 +886,23 @@ def test_environments_of_no_seed(seed: Any) -> None:
             provider(kind, seed, *rest)
 
 
+class Weighted(Agent):
+    """Actions are weights [A, O] times observations."""
+
+    def __init__(self, weights: Any) -> None:
+        self.weights = weights
+
+    def act(self, obs: Any) -> Any:
+        return obs @ self.weights.T
+
+    def state(self) -> Any:
+        return {}, {"weights": self.weights}
+
+    @classmethod
+    def from_state(cls, settings: Any, arrays: Any) -> "Weighted":
+        return cls(arrays["weights"])
+
+
 class TestSaved:
     """Agents that are kept: `deconfounded.load` in another process gives the same bits."""
 
@@ -921,6 +938,14 @@ class TestSaved:
             agent = outside.find("agent", f"{tmp_path / f'{number}.py'}:Same")
             saved_agents.save(agent(), tmp_path / "agent")
             assert deconfounded.load(tmp_path / "agent").act(np.zeros((1, 1))) == number
+
+    @pytest.mark.parametrize("order", ["C", "F", "reversed"])
+    def test_arrays_in_any_order_of_memory(self, order: str, tmp_path: Path) -> None:
+        """As `lstsq(...)[0].T` and `w[::-1]` are."""
+        weights = np.arange(6.0).reshape(2, 3)
+        weights = weights[::-1] if order == "reversed" else np.array(weights, order=order)  # type: ignore[call-overload]
+        saved_agents.save(Weighted(weights), tmp_path)
+        np.testing.assert_array_equal(deconfounded.load(tmp_path).act(np.ones((1, 3))), weights.sum(1)[None])
 
     def test_an_agent_of_a_script(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Another process has another script."""

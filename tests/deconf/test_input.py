@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from deconfounded import envs
 from deconfounded.benchmarks.engine import presets
@@ -70,6 +71,7 @@ def step(task: str, **changed: Any) -> list[Any]:
     ("task", "changed", "says"),
     [
         (CONTROL, {"next_obs": np.full((2, 5), np.nan, np.float32)}, "observations or actions held NaN or infinity"),
+        (CONTROL, {"next_obs": np.full((2, 5), 2e15, np.float32)}, r"or more than 1e\+15"),
         (CONTROL, {"next_obs": np.zeros((2, 4), np.float32)}, r"had shape \(2, 4\); they must be \(2, 5\)"),
         (CONTROL, {"action": np.zeros(2)}, r"had shapes \(2,\) and \(2,\); they must be \(2, 1\) and \(2,\)"),
         (CONTROL, {"action": np.full((2, 1), np.inf)}, "observations or actions held NaN or infinity"),
@@ -253,6 +255,18 @@ def test_an_agent_takes_no_nan(agents: dict[str, Agent]) -> None:
     agent.reset([np.random.default_rng(0)])
     with pytest.raises(envs.InputError, match="observations held NaN or infinity"):
         agent.act(np.array([[0.0], [np.nan]], np.float32))
+    with pytest.raises(envs.InputError, match="or more than 1e"):
+        agent.act(np.array([[0.0], [1e16]], np.float32))
+
+
+def test_an_agent_whose_memory_has_overflowed(agents: dict[str, Agent], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says so, and gives no NaN to a robot."""
+    agent = agents["bandit"]
+    agent.begin(2)
+    agent.reset([np.random.default_rng(0)])
+    monkeypatch.setattr(agent, "choose", lambda obs: torch.tensor([[[0.0], [torch.nan]]]))
+    with pytest.raises(envs.InputError, match=r"an action was NaN: .* begin again"):
+        agent.act(np.zeros((2, 1), np.float32))
 
 
 def test_the_expert_of_other_environments() -> None:

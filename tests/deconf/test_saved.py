@@ -75,3 +75,23 @@ def test_a_memory_stays_where_an_episode_is_over(agent: LearnedAgent) -> None:
         memories.append(agent.features())
     _, over, *later = memories  # a transformer reads the last transition when it acts on it
     assert all(np.array_equal(memory[0], over[0]) and (memory[1] != over[1]).any() for memory in later)
+
+
+@pytest.mark.slow
+def test_steps_in_which_somebody_else_acts(agent: LearnedAgent, method: str) -> None:
+    """`observe` alone leaves the memory that `act` and `observe` leave, if the actions are the same."""
+    if method == "oracle_bc":
+        return  # it acts on theta
+    rng, after = np.random.default_rng(0), []
+    obs = rng.standard_normal((8, 2, agent.policy.signature.obs), dtype=np.float32)
+    action = rng.uniform(-1, 1, (8, 2, agent.policy.signature.action))
+    for acts in (True, False):
+        agent.begin(2)
+        agent.reset([np.random.default_rng(0)])
+        for i in range(6):
+            if acts:
+                agent.act(obs[i])
+            agent.observe(obs[i], action[i], obs[i + 1], np.ones(2, bool))
+        agent.reset([np.random.default_rng(1)])
+        after.append(agent.act(obs[7]))
+    np.testing.assert_array_equal(*after)

@@ -123,6 +123,8 @@ def test_whole_actions() -> None:
     for number in range(6):
         other = task_of(type("Whole", (Whole,), {"expert": lambda self, obs, theta, number=number: [number]}))()
         assert other.raw(policy.load(other).mean(np.zeros((1, 1)), np.zeros((1, 1)))[0]) == [number]
+    with pytest.raises(envs.InputError, match="held NaN"):
+        task.raw(np.array([np.nan]))
 
 
 @pytest.mark.parametrize(("low", "high", "dtype"), [(-0.1, 0.3, "f8"), (-3.0, -0.8, "f4"), (0.1, 0.7, "f4")])
