@@ -113,7 +113,7 @@ class GailAgent(LearnedAgent):
     def begin(self, n: int) -> None:
         super().begin(n)
         self._state = torch.zeros(self.seeds, self._n, 2 * self.width, device=self.device)
-        self._next, self._has_read = self._state, False
+        self._next: Tensor | None = None  # the state after `act`, until the step takes place
 
     def reset(self, rngs: Sequence[np.random.Generator]) -> None:
         super().reset(rngs)
@@ -121,21 +121,18 @@ class GailAgent(LearnedAgent):
         self._before = torch.zeros(self.seeds, self._n, before + 1, device=self.device)
         self._before[..., -1] = 1  # flags the start of an episode
 
-    def _read(self, obs: Tensor) -> None:
-        """The state after an observation, which is kept if the step takes place."""
-        self._next, self._has_read = self.lstm(torch.cat([self.scales.obs(obs), self._before], -1), self._state), True
+    def _after(self, obs: Tensor) -> Tensor:
+        return self.lstm(torch.cat([self.scales.obs(obs), self._before], -1), self._state)
 
     def choose(self, obs: Tensor) -> Tensor:
-        self._read(obs)
+        self._next = self._after(obs)
         return self.policy.sample(self._next[..., : self.width], self._draws)
 
     def remember(self, step: Batch) -> None:
-        if not self._has_read:
-            self._read(step.obs)
-        self._has_read = False
+        after, self._next = self._after(step.obs) if self._next is None else self._next, None
         alive = step.mask[..., None] > 0
         action = self.policy.signature.encode_action(step.action)
-        self._state = torch.where(alive, self._next, self._state)
+        self._state = torch.where(alive, after, self._state)
         self._before = torch.where(alive, F.pad(action, (0, 1)), self._before)
 
     def remembered(self) -> NDArray[np.float32]:
