@@ -207,8 +207,9 @@ def write(folder: Path, records: Sequence[Record]) -> None:
 
     A record takes the place of the one in its slot, unless that is of a newer version. One that was made of something
     else is kept in the folder `superseded`, and so are those of an older version or of another text from outside, of
-    all seeds, which no table shows any more; without their training curves, which no page draws. Raises InputError for
-    what is no record, before anything is written.
+    all seeds, which no table shows any more; without their training curves, which no page draws, and one for each slot:
+    those of still older versions are in git's history. Raises InputError for what is no record, before anything is
+    written.
     """
     from filelock import FileLock
 
@@ -234,7 +235,7 @@ def write(folder: Path, records: Sequence[Record]) -> None:
             slots = set(map(_slot, today))
             superseded += [record for slot, record in kept.items() if slot not in slots]
             if superseded:
-                _append(folder / "superseded" / place(task), superseded)
+                _supersede(folder / "superseded" / place(task), superseded)
             write_atomically(file, "".join(map(_line, today)))
 
 
@@ -257,12 +258,13 @@ def _of_one_text(records: Sequence[Record], new: Sequence[Record]) -> list[Recor
     return [record for record in records if same(record)]
 
 
-def _append(file: Path, records: Sequence[Record]) -> None:
+def _supersede(file: Path, records: Sequence[Record]) -> None:
     check_folder(file.parent)
-    before = file.read_text("utf-8") if file.exists() else ""
-    lines = set(before.splitlines(True))  # these are there already if a kill came after this
-    small = ({key: value for key, value in record.items() if key != "curve"} for record in records)
-    write_atomically(file, before + "".join(line for line in map(_line, small) if line not in lines))
+    kept = {_slot(record): record for record in held(file)}
+    for record in records:
+        if not outdone(record, kept.get(slot := _slot(record))):
+            kept[slot] = {key: value for key, value in record.items() if key != "curve"}
+    write_atomically(file, "".join(map(_line, kept.values())))
 
 
 def _line(record: Record) -> str:

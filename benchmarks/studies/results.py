@@ -103,7 +103,7 @@ def section(task: envs.Task, results: dict[str, Any]) -> str:
     if older := outdated(task, results):
         parts.append(f"Records of an older version, not yet made again: {'; '.join(older)}.")
     if (DOCS / (link := f"records/superseded/{records.place(task.name)}")).exists():
-        parts.append(f"Superseded, and not to be compared with these: [the records of earlier versions]({link}).")
+        parts.append(f"Superseded, and not to be compared with these: [the records of the versions before]({link}).")
     if (DOCS / f"{task.name}.webp").exists():
         parts.append(f"![expert, naive and deconfounded under one theta]({task.name}.webp)")
     return "\n\n".join(parts)

@@ -327,6 +327,10 @@ class TestRecords:
         assert records.read(tmp_path / "bandit.jsonl") == [newer]
         assert records.read(tmp_path / "superseded" / "bandit.jsonl") == without_curve(two, {**one, "cpu_s": 9.0})
         assert records.of_task(tmp_path, "bandit", "smoke") == [newer]  # versions are never mixed
+        records.write(tmp_path, [{**two, "method_version": 9}])  # of versions before the last, git's history has them
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == without_curve(newer, {**one, "cpu_s": 9.0})
+        records.write(tmp_path, [{**two, "method_version": 6}])
+        assert records.read(tmp_path / "superseded" / "bandit.jsonl") == without_curve(newer, {**one, "cpu_s": 9.0})
 
     def test_an_older_version_takes_no_place(self, job: BenchmarkJob, tmp_path: Path) -> None:
         """Of the method or of the task, of one seed or of all: it is kept with what is superseded."""
