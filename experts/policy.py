@@ -13,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
 from deconfounded.envs import BatchEnv, InputError, Task
+from deconfounded.envs.contract.check import check_expert
 from deconfounded.envs.support import outside
 from deconfounded.envs.support.errors import error_line
 from deconfounded.envs.task import ASSETS, Array, Streams
@@ -161,9 +162,7 @@ def load(task: Task, source: str | Path | None = None) -> Expert:
             raise InputError(f"expert {source} is {expert.call!r}; it must be a callable (obs, theta) -> mean action")
         env = BatchEnv(task, 2)
         obs = env.reset(0)  # not of zeros, which it may never see
-        if not np.allclose(expert.mean(obs, env.theta), expert.mean(obs, env.theta), atol=1e-4):
-            right = "it must give the mean, to which the task's expert_noise is added"
-            raise InputError(f"expert {source} gave two actions for one observation; {right}")
+        check_expert(f"expert {source}", expert.mean, obs, env.theta, expert.mean(obs, env.theta))
         return expert
     if source is None and task.has_closed_expert:
         return CallableExpert(task, task.expert_mean, f"of {task.name}")

@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Set
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -17,6 +17,7 @@ from deconfounded.benchmarks.console import escape_output
 from deconfounded.benchmarks.engine import progress
 from deconfounded.benchmarks.engine.scheduler import Engine, Some, run_job
 from deconfounded.envs.physics import cores
+from deconfounded.envs.support import outside
 
 
 def die_with_parent() -> None:
@@ -32,9 +33,13 @@ def die_with_parent() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def start_worker(ticks: "Queue[int]") -> None:
-    """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that."""
+def start_worker(ticks: "Queue[int]", folders: Set[str]) -> None:
+    """Prepare a worker process: progress to `ticks`, Ctrl-C left to the main process; it dies with that.
+
+    folders: those of plug-in files, which are on the import path that it has from there.
+    """
     die_with_parent()
+    outside.FOLDERS |= folders
     escape_output()
     progress.tell(ticks)
 
@@ -75,7 +80,8 @@ class Local(Engine):
 
     def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
         if self._executor is None:
-            self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, (self._ticks,))
+            ours = self._ticks, {*outside.FOLDERS}
+            self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, ours)
         with self._ended():
             with inherited():
                 futures = {self._executor.submit(run_job, job): job for job in jobs}

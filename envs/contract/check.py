@@ -1,6 +1,6 @@
 """A quick check of a task, before anything is trained or measured: a slip in a task file is reported in one line."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -94,11 +94,22 @@ def _check_world(task: BlackBox) -> None:
                 break
         env.close()
         check_rounding(task.name, np.stack([task.observe(state) for state in states], 1), np.stack(masks, 1))
-        obs, theta, once = (np.concatenate(each) for each in zip(*asked, strict=True))
-        order = np.random.default_rng(0).permutation(len(obs))
-        if not np.allclose(acted(obs[order], theta[order]), once[order], atol=1e-4):
-            right = "it must give the action without noise, to which `noise` is added, by its arguments alone"
-            raise InputError(f"expert of {task.name} gave two actions for one observation; {right}")
+        check_expert(f"expert of {task.name}", acted, *(np.concatenate(each) for each in zip(*asked, strict=True)))
+
+
+Acted = Callable[[Array, Array], Array | None]  # actions [N, A] for observations [N, O] under thetas [N, L]
+
+
+def check_expert(name: str, acted: Acted, obs: Array, theta: Array, once: Array) -> None:
+    """Raise InputError unless an expert's actions `once` are those that it gives if rows come in another order.
+
+    Then it draws no random numbers, remembers nothing, and heeds nothing of other rows.
+    """
+    order = slice(None, None, -1)
+    again = acted(obs[order].copy(), theta[order].copy())
+    if again is None or not np.allclose(again, once[order], atol=1e-4):
+        right = "it must give the action without noise, by that row of its arguments alone"
+        raise InputError(f"{name} gave two actions for one observation; {right}")
 
 
 def _check_independence(task: BlackBox) -> None:
@@ -153,30 +164,43 @@ def _check_actions(task: Task) -> None:
 
 
 def _check_episodes(task: Task) -> None:
-    """Rewards and observations are within their bounds, in an episode of 16 environments with random actions."""
-    env = BatchEnv(task, 16)
-    obs = env.reset(0)
-    for action in actions(task, 16, task.horizon):
-        if task.n_actions:
-            _check_probs(task, obs[env.alive], env.theta[env.alive])
-        if beyond := beyond_bounds(task, env.state[env.alive]):
-            raise InputError(beyond)
-        obs, reward, *_ = env.step(action)
-        if (most := reward.max()) > 1 + 1e-9:
-            raise InputError(f"reward of {task.name} was {most:g}; it must be at most 1 a step")
-        if not env.alive.any():
-            return
+    """Rewards and observations are within their bounds, in episodes of 16 environments.
+
+    One is of random actions, another of the expert's if that is a closed form, which must act by its arguments alone.
+    """
+    name, acted = ("expert_probs", task.expert_probs) if task.n_actions else ("expert_mean", task.expert_mean)
+    for by_expert in (False, True)[: 1 + task.has_closed_expert]:
+        env, asked = BatchEnv(task, 16), list[tuple[Array, Array, Array]]()
+        obs = env.reset(0)
+        for action in actions(task, 16, task.horizon):
+            if beyond := beyond_bounds(task, env.state[env.alive]):
+                raise InputError(beyond)
+            if by_expert:
+                asked.append((obs, env.theta, _of_expert(task, name, acted, obs, env.theta)))
+                by_it = asked[-1][-1]
+                action = by_it.argmax(-1)[:, None].astype(float) if task.n_actions else by_it.clip(-1, 1)
+            obs, reward, *_ = env.step(action)
+            if (most := reward.max()) > 1 + 1e-9:
+                raise InputError(f"reward of {task.name} was {most:g}; it must be at most 1 a step")
+            if not env.alive.any():
+                break
+        if by_expert:
+            check_expert(f"{name} of {task.name}", acted, *map(np.concatenate, zip(*asked, strict=True)))
 
 
-def _check_probs(task: Task, obs: Array, theta: Array) -> None:
-    """The expert of a task with discrete actions takes each of them sometimes, or log-likelihoods are infinite."""
-    given = task.expert_probs(obs, theta)
-    probs = np.empty(0) if given is None else np.asarray(given, float)
-    if probs.ndim != 2 or probs.shape[0] not in (1, len(obs)) or probs.shape[1] != task.n_actions:
-        right = f"({len(obs)}, {task.n_actions}), a row for each observation"
-        raise InputError(f"expert_probs of {task.name} had shape {probs.shape}; it must be {right}")
-    fits = (probs > 0).all(-1) & np.isclose(probs.sum(-1), 1)
+def _of_expert(task: Task, name: str, acted: Acted, obs: Array, theta: Array) -> Array:
+    """What a closed-form expert gives for each observation: a finite mean, or probabilities of all actions.
+
+    An action of probability 0 would make log-likelihoods infinite.
+    """
+    with _part(task, name):
+        given = acted(obs.copy(), theta.copy())
+        rows = np.empty(0) if given is None else np.asarray(given, float)
+    if rows.shape != (shape := (len(obs), task.n_actions or task.action_width)):
+        right = f"{shape}, a row for each observation"
+        raise InputError(f"{name} of {task.name} had shape {rows.shape}; it must be {right}")
+    fits = (rows > 0).all(-1) & np.isclose(rows.sum(-1), 1) if task.n_actions else np.isfinite(rows).all(-1)
     if not fits.all():
-        raise InputError(
-            f"expert_probs of {task.name} gave {probs[fits.argmin()].tolist()}; each must be above 0, and their sum 1"
-        )
+        right = "each must be above 0, and their sum 1" if task.n_actions else "it must be finite"
+        raise InputError(f"{name} of {task.name} gave {rows[fits.argmin()].tolist()}; {right}")
+    return rows

@@ -12,6 +12,23 @@ def _noise(task: Task, m: int) -> Array:
     return np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
 
 
+def _outcomes(task: Task) -> tuple[Array, Array]:
+    """The outcome [1, S] of a state, an action and a theta, and others [K, S] that are near and far.
+
+    Theta and the action are other ones, by the whole range of the first latent or the whole action, or by 1/2, 1/4, ...
+    """
+    first, parts = task.latents[0], 0.5 ** np.arange(16)
+    low, high = first.grid(9)[[0, -1]]
+    values = [high] if first.distribution == "categorical" else [low + part * (high - low) for part in parts]
+    thetas = [[value, *(lat.low for lat in task.latents[1:])] for value in (low, *values, *[low] * len(parts))]
+    batch, action = BatchEnv(task, len(thetas)), np.repeat(actions(task, 1, 1)[0], len(thetas), 0)
+    last = action[-len(parts) :]
+    last[:] = np.arange(len(parts))[:, None] % task.n_actions if task.n_actions else last * (1 - parts)[:, None]
+    batch.reset([0] * batch.n, {"theta": thetas})
+    p, others = np.split(batch.simulator.outcome(batch.state, action), [1])
+    return p, others[(others != p).any(-1)]
+
+
 def _density_ratio(what: str, fall: Array, pair: str) -> None:
     """Densities q / p = exp(-fall) at draws from p have mean 1, and are not all the same. what, pair: for messages."""
     ratio = np.exp(-fall)
@@ -23,18 +40,16 @@ def _density_ratio(what: str, fall: Array, pair: str) -> None:
 def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
     needs_likelihood(task)
-    m, (first, *rest) = 4000, task.latents
-    low, high = first.grid(9)[[0, -1]]
-    near = high if first.distribution == "categorical" else low + 0.03 * (high - low)
-    batch, action = BatchEnv(task, 2), np.repeat(actions(task, 1, 1)[0], 2, 0)
-    batch.reset([0, 0], {"theta": [[value, *(lat.low for lat in rest)] for value in (low, near)]})
-    p, q = np.split(batch.simulator.outcome(batch.state, action), 2)
-    if (p == q).all():  # theta has no effect here: use another action's outcome
-        q = batch.simulator.outcome(batch.state, 0.8 * action)[1:]
-    if isinstance(task, MujocoTask):  # at most one standard deviation off, so that the ratio's variance is finite
+    m, p, others = 4000, *_outcomes(task)
+    if not len(others):
+        raise Skipped("neither theta nor the action changes the first step's outcome")
+    drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
+    few = drawn[:100]
+    spread = [(task.log_prob(few, p) - task.log_prob(few, each[None])).std() for each in others]
+    q = others[[np.abs(np.log(np.maximum(spread, 1e-9))).argmin()]]  # about a standard deviation off
+    if isinstance(task, MujocoTask):  # at most one, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])
-    drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
     ratio = task.log_prob(drawn, p) - task.log_prob(drawn, q)
     _density_ratio(f"log_prob of {task.name}", ratio, "outcomes that differ")
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate

@@ -7,6 +7,8 @@ import importlib.util
 import inspect
 import os
 import sys
+from collections.abc import Iterator, Set
+from contextlib import contextmanager, nullcontext
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import ModuleType
@@ -29,9 +31,9 @@ def is_outside(reference: str) -> bool:
 def find(kind: str, reference: str) -> Any:
     """Import the object that a reference names. kind: what it should be, for the error.
 
-    A file is executed once, and again if it has changed; its folder is appended to the import path. Raises InputError
-    if there is no such file, module or name in it, or if executing it fails; and by `check_helpers`, but for methods,
-    which are fitted in processes of their own.
+    A file is executed once, and again if it has changed; its folder is appended to the import path. That of a method
+    imports what is beside it, whatever other plug-ins have imported by that name. Raises InputError if there is no such
+    file, module or name in it, or if executing it fails; and by `check_helpers`, but for methods.
     """
     where, _, name = reference.rpartition(":")
     if not where or not name:
@@ -39,7 +41,13 @@ def find(kind: str, reference: str) -> Any:
     if where.endswith(".py") and not here(Path(where)).is_file():
         raise InputError(f"{kind} {reference!r}: there is no file {where}")
     try:
-        module = _run(here(Path(where))) if where.endswith(".py") else importlib.import_module(where)
+        if where.endswith(".py"):
+            file = here(Path(where)).resolve()
+            _put_on_path(str(file.parent))
+            with _apart(str(file.parent)) if kind == "method" else nullcontext():
+                module = _run(file)
+        else:
+            module = importlib.import_module(where)
     except InputError as error:
         if not (line := users_line(error)):
             raise
@@ -119,15 +127,52 @@ def check_helpers(file: Path) -> None:
     named += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     for name in {each.partition(".")[0] for each in named}:
         beside = [path.parent / f"{name}.py", path.parent / name / "__init__.py"]
-        got = getattr(sys.modules.get(name), "__file__", None)
+        spec = None if name in sys.modules else importlib.util.find_spec(name)  # it is imported later
+        got = spec.origin if spec else getattr(sys.modules.get(name), "__file__", None)
         if not got or not any(file.is_file() for file in beside) or Path(got) in beside:
             continue
         if any(Path(got).is_relative_to(folder) for folder in FOLDERS):
             raise InputError(f"{path} imports {name}, and got {got} of another plug-in; rename one of the two")
 
 
-def _run(file: Path) -> ModuleType:
-    path = file.resolve()
+def _helpers(folders: Set[str]) -> dict[str, ModuleType]:
+    """The modules, by name, that plug-in files in these folders imported from beside them."""
+    top = set()
+    for name, module in sys.modules.items():
+        file = Path(getattr(module, "__file__", None) or "")
+        if "." in name or name in SCRIPTS or name.startswith(PREFIX) or not file.name:
+            continue
+        if str(file.parent.parent if file.name == "__init__.py" else file.parent) in folders:
+            top.add(name)
+    return {name: module for name, module in sys.modules.items() if name.partition(".")[0] in top}
+
+
+@contextmanager
+def _apart(folder: str) -> Iterator[None]:
+    """Meanwhile, imports find what is in this plug-in's folder, and nothing that is in those of others."""
+    path, others, own = [*sys.path], _helpers(FOLDERS - {folder}), _helpers({folder})
+    for name in others:
+        del sys.modules[name]
+    sys.path[:] = [entry for entry in path if entry == folder or entry not in FOLDERS]
+    try:
+        yield
+    finally:
+        for name in _helpers({folder}).keys() - own:
+            del sys.modules[name]
+        sys.modules.update(others)
+        sys.path[:] = [*(entry for entry in sys.path if entry not in path), *path]
+
+
+def _put_on_path(folder: str) -> None:
+    """Let plug-in files import what is beside them: their `envs`, not that of our checkouts, which come last."""
+    if folder not in sys.path:
+        ours = [entry for entry in sys.path if entry and (Path(entry) / "deconfounded" / "__init__.py").is_file()]
+        ours.sort(key=lambda entry: Path(entry).resolve() != ROOT)  # this one first, also in processes started later
+        sys.path[:] = [*(entry for entry in sys.path if entry not in ours), folder, *ours]
+        FOLDERS.add(folder)
+
+
+def _run(path: Path) -> ModuleType:
     name = _module_name(path)
     if name not in sys.modules:
         spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
@@ -135,10 +180,6 @@ def _run(file: Path) -> ModuleType:
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
-        if (folder := str(path.parent)) not in sys.path:
-            own = [entry for entry in sys.path if entry and Path(entry).resolve() == ROOT]
-            sys.path[:] = [*(entry for entry in sys.path if entry not in own), folder, *own]  # its `envs`, not ours
-            FOLDERS.add(folder)
         try:
             spec.loader.exec_module(module)
         except BaseException:

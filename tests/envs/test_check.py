@@ -21,6 +21,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import certify, check, run, train
 from deconfounded.benchmarks.engine.context import EVALUATION, stream
 from deconfounded.envs.contract.core import CONTRACT, STARTS
+from deconfounded.envs.contract.densities import log_prob_is_the_density_of_the_noise
 from deconfounded.envs.contract.probe import Skipped
 from deconfounded.envs.edits import Edit, ModelEdit
 from deconfounded.envs.streams import Array, Streams
@@ -190,6 +191,43 @@ def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -
     with pytest.raises(envs.InputError, match=f"^expert_probs of arms {says}"):
         envs.check_task(task)
     envs.check_task(Arms())
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.5, 2, 100])
+def test_a_density_of_another_width_is_noticed(factor: float) -> None:
+    """In a task without MuJoCo, too; what it states is no density of its noise."""
+    wrong = type("Wrong", (Push,), {"log_prob": lambda self, then, at: Push().log_prob(at + (then - at) / factor, at)})
+    log_prob_is_the_density_of_the_noise(Push())
+    with pytest.raises(AssertionError, match="log_prob of push: the mean ratio of densities is"):
+        log_prob_is_the_density_of_the_noise(wrong())
+
+
+UNSURE = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("mean", "says"),
+    [
+        (lambda obs: 0.1 * UNSURE.normal(size=(len(obs), 1)), "gave two actions for one observation"),
+        (lambda obs: np.repeat(-obs[:1, :1], len(obs), 0), "gave two actions for one observation"),
+        (lambda obs: -obs[:, 0], r"had shape \(16,\); it must be \(16, 1\), a row for each observation"),
+        (lambda obs: None, r"had shape \(0,\); it must be \(16, 1\)"),
+        (lambda obs: np.where(obs[:, :1] > 0, np.nan, 0), r"gave \[nan\]; it must be finite"),
+        (lambda obs: obs[:, 4, None], r"index 4.*"),
+    ],
+)
+def test_a_closed_form_expert_is_checked(mean: Any, says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"^expert_mean of push:? {says}"):
+        envs.check_task(type("Sure", (Push,), {"expert_mean": lambda self, obs, theta: mean(obs)})())
+
+
+def test_bounds_are_wide_enough_for_a_closed_form_expert() -> None:
+    """It may go where random actions do not."""
+    own = {"terminated": envs.Task.terminated, "horizon": 30, "observation": {"x": (-40, 40), "velocity": (-4.0, 4.0)}}
+    envs.check_task(type("Still", (Push,), {**own, "expert_mean": lambda self, obs, theta: 0 * obs[:, :1] - theta})())
+    away = {**own, "expert_mean": lambda self, obs, theta: np.sign(theta)}
+    with pytest.raises(envs.InputError, match=r"observation x of push was .*; its bounds, -40 to 40, must be wide"):
+        envs.check_task(type("Away", (Push,), away)())
 
 
 class Places(Push):

@@ -11,6 +11,7 @@ import pytest
 
 from deconfounded import envs
 from deconfounded.envs.support import outside
+from deconfounded.envs.support.origin import ROOT
 from deconfounded.experts import policy
 
 TASK = "from tests.toys import Push\nclass {name}(Push):\n    name = 'own_push'\n    horizon = {horizon}\n"
@@ -114,3 +115,32 @@ def test_a_registered_task_by_its_file() -> None:
     file = Path(envs.tasks.curling.__file__).resolve()
     with pytest.raises(envs.InputError, match=rf"{file} is the file of curling, which is registered; use that name$"):
         envs.get(f"{file}:Curling")
+
+
+def test_a_method_imports_what_is_beside_it(tmp_path: Path) -> None:
+    """Though another method, or the task, has a module of that name; which a function may import later."""
+    head = "from dataclasses import dataclass\nfrom deconfounded.deconf.method import uses\nimport util\n"
+    text = f"{head}@uses('demonstrations')\ndef fit(given):\n    raise NotImplementedError\nLIMIT = util.LIMIT\n"
+    for folder, limit in (("a", 1.0), ("b", 0.01), ("task", 5.0)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "util.py").write_text(f"LIMIT = {limit}\n")
+        (tmp_path / folder / f"clone_{folder}.py").write_text(text)
+    later = "def step():\n    import util\n    return util.LIMIT\n"
+    (tmp_path / "task" / "mine.py").write_text(TASK.format(name="Mine", horizon=6) + later)
+    envs.get(f"{tmp_path / 'task' / 'mine.py'}:Mine")
+    limits = [outside.find("method", f"{tmp_path}/{folder}/clone_{folder}.py:LIMIT") for folder in ("a", "b", "a")]
+    assert limits == [1.0, 0.01, 1.0]
+    assert "util" not in sys.modules
+    assert outside.find("task", f"{tmp_path / 'task' / 'mine.py'}:step")() == 5.0
+
+
+def test_of_two_checkouts_workers_have_the_code_of_this_one(tmp_path: Path) -> None:
+    """It stays the first on the import path, and a plug-in's folder comes before both."""
+    (other := tmp_path / "other" / "deconfounded").mkdir(parents=True)
+    (other / "__init__.py").write_text("")
+    (tmp_path / "mine.py").write_text(TASK.format(name="Mine", horizon=6))
+    sys.path[:0] = [str(ROOT), str(other.parent)]
+    envs.get(f"{tmp_path / 'mine.py'}:Mine")
+    places = [sys.path.index(str(place)) for place in (tmp_path, ROOT, other.parent)]
+    assert places == sorted(places)
+    assert str(ROOT) not in sys.path[: places[0]]
