@@ -168,7 +168,8 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
             main()
         return
     except (Exception, KeyboardInterrupt, SystemExit) as error:
-        from deconfounded.envs.support.errors import InputError, error_line  # here, as `deconf --help` does without
+        # imported here, since `deconf --help` does without
+        from deconfounded.envs.support.errors import InputError, error_line, users_line
 
         if isinstance(error, SystemExit):
             if not _from_outside(error):
@@ -182,6 +183,8 @@ def run_command(main: Callable[[], None], interrupted: str = "nothing was writte
             line, code = f"error: {error.filename or 'file'}: {error.strerror or error}", 2
         elif isinstance(error, MemoryError):
             line, code = f"error: not enough memory{f': {error}' if str(error) else ''}", 2
+        elif users_line(error):  # in the code of a plug-in
+            line, code = f"error: {error_line(error)}", 2
         else:
             raise
     end(line, code)

@@ -76,7 +76,8 @@ def _ratio(reference: Tensor, deviations: Tensor, by_chance: Tensor, usual: Tens
 
 def _unit(values: Tensor, usual: Tensor) -> Tensor:
     """The scaled median of usual deviations [M, ...], or 1% of the range of values [N, ...] if that is more."""
-    least = (0.01 * (values.amax(0) - values.amin(0))).clamp(min=1e-6)
+    rounding = (1e-7 * values.abs().amax(0)).clamp(min=1e-30)
+    least = torch.maximum(0.01 * (values.amax(0) - values.amin(0)), rounding)
     return torch.maximum(1.48 * usual.abs().median(0).values, least)
 
 

@@ -20,7 +20,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials, check_trials
 
-VERSION = 19  # raised when figures or verdicts of the same trials change
+VERSION = 20  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,8 @@ def diagnose(
     """Judge expert trials, and exploration if there is any. Raises InputError for data that cannot be judged."""
     if not isinstance(rng, np.random.Generator):
         raise InputError(f"rng was {rng!r}; it must be a generator: np.random.default_rng(0)")
+    if not isinstance(config, DiagnoseConfig):
+        raise InputError(f"config was {config!r}; it must be a DiagnoseConfig, such as DiagnoseConfig()")
     check(trials, explore, config)
     refits: list[Findings] = []
 
@@ -55,6 +57,7 @@ def diagnose(
 
 def conclude(refits: Sequence[Findings], trials: Trials, explore: Trials | None) -> Diagnosis:
     """The verdict on the figures of splits of these trials, with what their columns show."""
+    trials, explore = fits.distinct(trials), explore and fits.distinct(explore)  # a copy is no evidence
     if explore is None:
         return judge(refits, None, labels.named(trials, None), state.named(None))
     doubted = doubts(trials, explore) if any(refit.dynamics_differ == 0 for refit in refits) else ()
@@ -63,6 +66,7 @@ def conclude(refits: Sequence[Findings], trials: Trials, explore: Trials | None)
 
 def check(trials: Trials, explore: Trials | None, config: DiagnoseConfig) -> None:
     """Raises InputError for data that cannot be judged."""
+    check_trials("diagnose", trials)
     for kind, data in (("", trials), (" of exploration", explore)):
         if data is None:
             continue

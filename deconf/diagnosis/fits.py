@@ -9,6 +9,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
+from deconfounded.experts.datasets.logs import Log
 from deconfounded.experts.trials import Trials
 
 Array = NDArray[np.float64]
@@ -117,6 +118,20 @@ def copies(trials: Trials) -> tuple[list[list[int]], ...]:
             bits = trials.obs[b, e].tobytes() + trials.action[b, e].tobytes()
             groups[2].setdefault(hashlib.sha256(bits).digest(), []).append(b)
     return tuple([numbers for numbers in by_hash.values() if len(numbers) > 1] for by_hash in groups)
+
+
+def distinct(trials: Trials) -> Trials:
+    """One of each trial with steps: a copy would be on both sides of a split, or the "other" trial of itself."""
+    left_out = [b for same in copies(trials)[0] for b in same[1:]] + np.flatnonzero(~trials.mask.any((1, 2))).tolist()
+    return some(trials, np.delete(np.arange(len(trials)), left_out)) if left_out else trials
+
+
+def some(trials: Trials, index: Numbers) -> Trials:
+    """Those trials, by number; those of a log with their names."""
+    parts = trials.obs[index], trials.action[index], trials.mask[index], trials.actions
+    if not isinstance(trials, Log):
+        return Trials(*parts)
+    return Log(*parts, trials.units, tuple(trials.names[i] for i in index), trials.notes)
 
 
 def standardised(x: Array) -> Array:

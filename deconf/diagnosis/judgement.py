@@ -58,8 +58,11 @@ def judge(
     diagnosis = _judge(refits, explored, labels, doubts)
     alone = [_judge([refit], explored, labels, doubts) for refit in refits]
     if diagnosis.tier is not None and 2 * sum(split.tier == diagnosis.tier for split in alone) < len(refits):
-        reason = "Random splits of your trials lead to different verdicts: there are too few trials for any of them."
-        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=MORE_TRIALS)
+        reason, advice = alone[0].conclusion, alone[0].next
+        if len({split.conclusion for split in alone}) > 1:
+            reason = "Random splits of your trials lead to different verdicts: there are too few trials for any."
+            advice = MORE_TRIALS
+        diagnosis = replace(diagnosis, verdict="cannot tell", tier=None, conclusion=reason, next=advice)
     if diagnosis.next is CLONE_HABITS and incomplete and _alike(diagnosis.figures):
         diagnosis = replace(diagnosis, next=clone_with_memory(incomplete))
     dissent = [split for split in alone if split.tier != diagnosis.tier]
@@ -176,6 +179,8 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
         )
         reasons += doubts
         return _goal_or_habit(figures, doubts, conclude)
+    if "dynamics_differ" not in figures:
+        return more_exploration("Trials of exploration are too few to see whether they differ in their dynamics.")
     if max(-in_trials.low, in_trials.value, gain.high) < NEGLIGIBLE:
         return more_exploration(
             "Whether trials differ in what actions do, and what that tells of the expert's actions, is not clear from"
@@ -241,6 +246,9 @@ def _goal_or_habit(
     memory, gain = figures["memory_gain"], figures.get("trait_gain")
     if gain is None:
         return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)
+    if gain.low < -MISFIT:
+        conclusion = "What half of a trial shows of its expert could not be fitted to the other half: nothing follows."
+        return conclude("cannot tell", None, conclusion, MORE_TRIALS)
     if gain.high < max(NEGLIGIBLE, TRAIT_SHARE * memory.low):
         return conclude("nothing at stake", 1, PASSING, CLONE_HABITS)
     if doubts:

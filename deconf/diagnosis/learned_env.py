@@ -106,7 +106,7 @@ def observed_range(*data: Batch) -> tuple[Tensor, Tensor]:
 def valid_range(expert: Batch) -> tuple[Tensor, Tensor]:
     """The range [S, 1, O] in which dynamics are taken to be valid: the data's, and half of it beyond on either side."""
     low, high = observed_range(expert)
-    margin = (0.5 * (high - low)).clamp(min=1e-3)
+    margin = torch.where(high > low, 0.5 * (high - low), 1e-3)
     return low - margin, high + margin
 
 

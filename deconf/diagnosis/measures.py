@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from deconfounded.deconf.core import termination
@@ -23,7 +22,7 @@ from deconfounded.deconf.core.drift import episodes_of
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE, Configuration
 from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
-from deconfounded.deconf.diagnosis.fits import Steps, copies
+from deconfounded.deconf.diagnosis.fits import Steps, distinct, some
 from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report, typical
 from deconfounded.deconf.diagnosis.latent import Explanation
 from deconfounded.deconf.diagnosis.learned_env import (
@@ -285,14 +284,4 @@ def _explain(
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
     """Trials for training, and that share of them that is held out."""
     order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
-    return _some(trials, order[count:]), _some(trials, order[:count])
-
-
-def distinct(trials: Trials) -> Trials:
-    """One of each trial with steps: a copy would be on both sides of a split, or the "other" trial of itself."""
-    left_out = [b for same in copies(trials)[0] for b in same[1:]] + np.flatnonzero(~trials.mask.any((1, 2))).tolist()
-    return _some(trials, np.delete(np.arange(len(trials)), left_out)) if left_out else trials
-
-
-def _some(trials: Trials, index: NDArray[np.int64]) -> Trials:
-    return Trials(trials.obs[index], trials.action[index], trials.mask[index], trials.actions)
+    return some(trials, order[count:]), some(trials, order[:count])

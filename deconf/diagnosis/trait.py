@@ -27,7 +27,8 @@ NOISE = 0.3  # of traits in training, so that they do not name trials
 class Trait(NamedTuple):
     """A policy given a trait, traits [1, B, D] of the trials of training, and its gain in held-out ones.
 
-    scales: those that the policy was trained with. gain: log-likelihood of the actions of their second half, given the
+    scales: those that the policy was trained with, given the trait that the other half of a step's trial shows, since
+    halves may show different ones. gain: log-likelihood of the actions of the second half of held-out trials, given the
     trait of the first, over a policy that was trained with traits of other trials, and has as much to overfit; nats a
     step.
     """
@@ -82,12 +83,14 @@ def fit(train: Batch, held_out: Batch, signature: Signature, config: MemorylessC
         loss = imitation_loss(log_prob(policy, rest, each_step(rest, blurred(trait))).flatten(1), rest.mask.flatten(1))
         optimizer.step(loss + 1e-3 * trait.square().mean((1, 2)))
     with torch.no_grad():
-        traits = encoder(train)
-    for clone, given in ((own, traits), (other, traits.roll(1, 1))):
+        traits, (early, late) = encoder(train), halves(train)
+        of_early, of_late = (each_step(train, encoder(half)) for half in (early, late))
+        from_rest = torch.where(early.mask[..., None] > 0, of_late, of_early)
+    for clone, given in ((own, from_rest), (other, from_rest.roll(1, 1))):
         optimizer = Adam([clone], config.learning_rate, config.updates)
         for _ in range(config.updates):
             index = train.draw_steps(config.batch, draws)
-            steps, trait = train.steps(index), take(given, index // train.mask.shape[2])
+            steps, trait = train.steps(index), take(given.flatten(1, 2), index)
             optimizer.step(imitation_loss(log_prob(clone, steps, blurred(trait)), steps.mask))
     with torch.no_grad():
         early, late = halves(held_out)

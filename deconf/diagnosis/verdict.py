@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from deconfounded.deconf.diagnosis.advice import HEADLINES, IF_WRONG, Next, Verdict
-from deconfounded.deconf.diagnosis.thresholds import SMALL_COST
+from deconfounded.deconf.diagnosis.thresholds import GOOD, SMALL_COST, STAKES
 
 
 class Figure(NamedTuple):
@@ -69,6 +69,9 @@ class Diagnosis:
         if self.verdict == "cannot tell" or self.tier == 3:
             return "Not known from these data."
         if self.verdict != "confounded":
+            keeps_course = self.figures["naive"].low > GOOD
+            if not keeps_course and max(self.figures[key].high for key in ("stakes", "paired_stakes")) >= STAKES:
+                return "Not known from these data."
             return "Next to nothing, as far as the learned model of your system shows."
         naive, latent = (self.figures[key] for key in ("naive", "latent"))
         lost, rest = (Figure(1 - x.value, 1 - x.high, 1 - x.low) for x in (naive, latent))

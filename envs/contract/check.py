@@ -48,30 +48,55 @@ def check_task(task: Task) -> None:
         _check_actions(task)
     n, rng = 2, streams(0, 1)
     action = np.zeros((n, task.action_width))
+    with _part(task, "observation"):
+        _check_observation(task)
+    with _part(task, "init_state"):
+        state = np.asarray(task.init_state(rng))
+        if state.ndim != 2 or len(state) != n:
+            raise InputError(_shape(task, "init_state", state, f"({n}, S), a row for each"))
+        state.flags.writeable = False  # what is changed in place would change the trial
+    with _part(task, "sample_noise"):
+        noise = np.asarray(task.sample_noise(rng))
+        if noise.shape[:2] != (n, task.horizon):
+            raise InputError(_shape(task, "sample_noise", noise, f"({n}, {task.horizon}, ...), of each step"))
     with _part(task, "apply_latent"):
         env = BatchEnv(task, n)
-    with _part(task, "init_state"):
-        state = task.init_state(rng)
-        state.flags.writeable = False  # what is changed in place would change the trial
     with _part(task, "outcome"):
         env.simulator.outcome(state[:1], action[:1], np.arange(1))  # alone: a failure in a thread would end the process
-        noise = task.sample_noise(rng)[:, 0]
-        then = task.apply_noise(env.simulator.outcome(state, action), noise)
+        outcome = env.simulator.outcome(state, action)
+    with _part(task, "apply_noise"):
+        then = np.asarray(task.apply_noise(outcome, noise[:, 0]))
         then.flags.writeable = False
     for name, shape, ask in (
+        ("apply_noise", state.shape, lambda: then),
         ("observe", (n, len(task.observation)), lambda: task.observe(state)),
         ("reward", (n,), lambda: task.reward(state, action, then, env.theta)),
         ("terminated", (n,), lambda: task.terminated(then)),
+        *[("log_prob", (n,), lambda: task.log_prob(then, outcome))] * task.moves_state,
     ):
         with _part(task, name):
             given = np.asarray(ask())
             if given.shape != shape:
-                wrong = f"{name} of {task.name} gave an array of shape {given.shape} for {n} environments"
-                raise InputError(f"{wrong}; it must be {shape}")
+                raise InputError(_shape(task, name, given, shape))
             if not np.isfinite(given).all():
                 raise InputError(f"{name} of {task.name} gave {given.tolist()}; it must be finite")
     with _part(task, "an episode"):
         _check_episodes(task)
+
+
+def _shape(task: Task, name: str, given: Array, right: object) -> str:
+    return f"{name} of {task.name} gave an array of shape {given.shape} for two environments; it must be {right}"
+
+
+def _check_observation(task: Task) -> None:
+    """Each observation has a name, and two bounds that its readings can move between."""
+    bounds = task.observation
+    if not isinstance(bounds, dict) or not bounds or not all(isinstance(name, str) for name in bounds):
+        given = f"{bounds!r}"[:80]
+        raise InputError(f"observation of {task.name} was {given}; it must be a dict of names and bounds (low, high)")
+    for name, (low, high) in bounds.items():
+        if not low < high:
+            raise InputError(f"bounds of {name} of {task.name} were {low:g} and {high:g}; low must be below high")
 
 
 def _check_world(task: BlackBox) -> None:
@@ -152,9 +177,11 @@ def _check_model(task: MujocoTask) -> None:
 
 def _check_actions(task: Task) -> None:
     """The action space is one that all agents act in, and the expert's actions have a density."""
-    if task.n_actions:
-        return
     space = task.action_space
+    if isinstance(space, spaces.Discrete):
+        if space.start != 0:
+            raise InputError(f"action_space of {task.name} was {space}; its actions must begin at 0")
+        return
     if not isinstance(space, spaces.Box) or len(space.shape) != 1 or (space.low != -1).any() or (space.high != 1).any():
         given, right = " ".join(str(space).split()), "Box(-1, 1, (A,)), which `control` scales, or Discrete"
         raise InputError(f"action_space of {task.name} was {given}; it must be {right}")

@@ -60,7 +60,8 @@ def reported_by(checker: str) -> Iterator[None]:
             warnings.simplefilter("error")
             yield
     except Exception as error:
-        raise AssertionError(f"{checker}: {' '.join(str(error).split())} ({type(error).__name__})") from error
+        text = re.sub(r"\x1b\[\d*m", "", str(error))  # colours
+        raise AssertionError(f"{checker}: {' '.join(text.split())} ({type(error).__name__})") from error
 
 
 def actions(task: Task, n: int, steps: int) -> Array:

@@ -40,6 +40,8 @@ def find(kind: str, reference: str) -> Any:
         raise InputError(f"{kind} was {reference!r}; from outside it must be path/file.py:name or package.module:name")
     if where.endswith(".py") and not here(Path(where)).is_file():
         raise InputError(f"{kind} {reference!r}: there is no file {where}")
+    if not where.endswith(".py") and ({*where} & {"/", os.sep} or where.startswith(".")):
+        raise InputError(f"{kind} {reference!r}: a file's path must end in .py, as {where}.py:{name}")
     try:
         if where.endswith(".py"):
             file = here(Path(where)).resolve()
@@ -53,7 +55,8 @@ def find(kind: str, reference: str) -> Any:
             raise
         raise InputError(f"{error} ({line})") from error
     except (Exception, SystemExit) as error:
-        raise InputError(f"{kind} {reference!r}: {error_line(error)}") from error
+        hint = f"; a file's path must end in .py, as {where}.py" if Path(f"{where}.py").is_file() else ""
+        raise InputError(f"{kind} {reference!r}: {error_line(error)}{hint}") from error
     if where.endswith(".py") and kind != "method":
         check_helpers(here(Path(where)))
     if not hasattr(module, name):

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from deconfounded.envs.support.errors import InputError
+from deconfounded.experts.arrays import LARGEST
 from deconfounded.experts.datasets.hdf5 import read_hdf5
 from deconfounded.experts.datasets.lerobot import read_lerobot
 from deconfounded.experts.datasets.minari_sets import read_minari
@@ -165,6 +166,8 @@ def _units(tables: list[Table], parts: list[Episodes]) -> tuple[Units, str]:
         for i, name in enumerate(action):
             if name in table.limits:
                 low[i], high[i] = min(low[i], table.limits[name][0]), max(high[i], table.limits[name][1])
+    if far := [(name, x) for name, *ends in zip(action, low, high, strict=True) for x in ends if abs(x) > LARGEST]:
+        raise InputError(f"an action, {far[0][0]}, was {far[0][1]:g}; it must be at most {LARGEST:g} in size")
     ranges = "; ".join(f"{name} {a:.6g} to {b:.6g}" for name, a, b in zip(action, low, high, strict=True))
     said = f"Actions, each range taken as -1 to 1: {ranges}"
     if whole and 2 < len(held := np.unique(taken)) <= MOST_DISCRETE:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from deconfounded import envs
 from deconfounded.benchmarks import play
@@ -51,6 +52,22 @@ def test_a_return_that_is_played_is_the_sum_of_its_episode_s_rewards() -> None:
     assert max(lengths) <= env.task.horizon
     assert max(lengths) > 1
     assert len(set(lengths)) > 1
+
+
+def test_actions_that_are_remembered_are_those_that_were_taken() -> None:
+    """The environment clips them, as it does in a run; an agent may leave that to it."""
+    remembered: list[float] = []
+
+    class Strong(RandomAgent):
+        def act(self, obs: NDArray[np.float32]) -> Any:
+            return 3 * super().act(obs)
+
+        def observe(self, obs: Any, action: Any, next_obs: Any, alive: Any) -> None:
+            remembered.extend(action[0])
+
+    env = envs.GymEnv(toys.Push())
+    play.play(Strong(env.task.action_space), env, 8, 5)
+    assert max(map(abs, remembered)) == 1
 
 
 def test_what_play_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

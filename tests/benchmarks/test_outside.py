@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 import deconfounded
 from deconfounded import envs
 from deconfounded.benchmarks import certify, check, play
+from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import catalogue, identity, presets, progress, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
 from deconfounded.benchmarks.engine.context import DEMOS, EVALUATION, Context, stream
@@ -233,6 +234,30 @@ def test_an_expert_s_mean_has_no_noise(tmp_path: Path) -> None:
     (tmp_path / "noisy.py").write_text(f"{noisy}    return rng.uniform(-1, 1, (len(obs), 1))")
     with pytest.raises(envs.InputError, match=r"noisy\.py:act gave two actions for one observation"):
         policy.load(toys.Push(), f"{tmp_path}/noisy.py:act")
+
+
+def test_an_error_of_own_code_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It names the place; and a module that is missing there is none of ours."""
+    (tmp_path / "mine.py").write_text("def broken():\n    import pygletty\n")
+    broken = outside.find("task", f"{tmp_path}/mine.py:broken")
+    with pytest.raises(SystemExit) as stopped:
+        run_command(broken)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert said == "error: No module named 'pygletty' (ModuleNotFoundError, mine.py:2)\n"
+
+
+@pytest.mark.parametrize("where", ["../tank", "./tank", "here/tank"])
+def test_a_file_s_path_ends_in_py(where: str) -> None:
+    with pytest.raises(envs.InputError, match=rf"a file's path must end in \.py, as {re.escape(where)}\.py:LeakyTank"):
+        outside.find("task", f"{where}:LeakyTank")
+
+
+def test_a_file_s_name_is_no_module_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_tank.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(envs.InputError, match=r"No module named 'own_tank'.*must end in \.py, as own_tank\.py"):
+        outside.find("task", "own_tank:LeakyTank")
 
 
 def test_tasks_that_packages_offer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,6 +61,20 @@ def test_score(share: float, score: float) -> None:
     )
 
 
+@pytest.mark.parametrize("unit", [1e6, 1e-6, 1e-9])
+def test_units_of_observations_do_not_matter(unit: float) -> None:
+    """A course in kilometres or nanometres: the same score, and the same deviation of the mean square."""
+    right, *repeats, paths, wrong = (lines(400, seed) for seed in range(5))
+    walk, swing = walks(400, 0), walks(400, 0) * torch.tensor([1.0, 2.0])
+    scores, deviations = [], []
+    for scale in (1, unit):
+        scaled = [scale * x for x in (paths + 0.25 * FIRST, wrong + 0.5 * FIRST, right)]
+        scores.append(paired_score(*scaled, (scale * repeats[0], scale * repeats[1])))
+        deviations.append(deviation(*[scale * x for x in (swing, walk, walks(400, 1))]))
+    assert scores[1] == pytest.approx(scores[0], abs=1e-3)
+    torch.testing.assert_close(deviations[1], deviations[0], rtol=1e-3, atol=1e-3)
+
+
 def test_far_off_is_far_off() -> None:
     """What is further off than chance usually leads counts in full, however far wrong latents lead."""
     right, *repeats, paths, wrong = (lines(400, seed) for seed in range(5))

@@ -17,7 +17,7 @@ from deconfounded import envs
 from deconfounded.benchmarks import diagnose as command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.deconf.core.data import Batch
-from deconfounded.deconf.diagnosis import advice, diagnose, learned_env, measures
+from deconfounded.deconf.diagnosis import advice, diagnose, fits, learned_env, measures
 from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.measures import Amounts, Findings
@@ -58,12 +58,12 @@ class TestSplit:
     def test_a_trial_is_there_once(self) -> None:
         """In a split with copies, one held out would be known, and "another trial" the same."""
         data = trials(12)
-        whole = measures.distinct(repeated(data, [*range(12), *range(12), 3, 3]))
+        whole = fits.distinct(repeated(data, [*range(12), *range(12), 3, 3]))
         np.testing.assert_array_equal(whole.obs, data.obs)
-        assert measures.distinct(data) is data
+        assert fits.distinct(data) is data
         mask = data.mask.copy()
         mask[4:6] = False
-        assert len(measures.distinct(Trials(data.obs, data.action, mask))) == 10
+        assert len(fits.distinct(Trials(data.obs, data.action, mask))) == 10
 
     def test_figures_do_not_depend_on_copies(self) -> None:
         data, other = trials(24), trials(24, seed=1)
@@ -72,6 +72,13 @@ class TestSplit:
             measures.measure(*of, TINY, np.random.default_rng(0)) for of in ((data, other), (twice[0], twice[1]))
         ]
         assert figures[0] == figures[1]
+
+    @pytest.mark.parametrize("unit", [1.0, 1e6, 1e-9])
+    def test_dynamics_are_valid_near_the_data_in_any_unit(self, unit: float) -> None:
+        data = trials(24)
+        low, high = learned_env.valid_range(Batch.of(Trials(unit * data.obs, data.action, data.mask), 1))
+        least, most = learned_env.observed_range(Batch.of(data, 1))
+        torch.testing.assert_close((high - low) / unit, 2 * (most - least))
 
     def test_without_copies_the_share_is_exact(self) -> None:
         data = trials(24)
@@ -129,6 +136,10 @@ class TestBadInput:
             diagnose.diagnose(trials().obs, None, config, rng)  # type: ignore[arg-type]
         with pytest.raises(InputError, match="diagnose was given a list; it must be Trials"):
             diagnose.diagnose(trials(), [], config, rng)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="diagnose was given a NoneType; it must be Trials"):
+            diagnose.diagnose(None, None, config, rng)  # type: ignore[arg-type]
+        with pytest.raises(InputError, match="config was None; it must be a DiagnoseConfig"):
+            diagnose.diagnose(trials(), None, None, rng)  # type: ignore[arg-type]
         with pytest.raises(InputError, match="rng was 0; it must be a generator"):
             diagnose.diagnose(trials(), None, config, 0)  # type: ignore[arg-type]
 
@@ -216,9 +227,11 @@ class TestJudge:
             ({**SILENT, "dynamics_differ": None}, "cannot tell", None, advice.EXPLORE_MORE),
             ({**SILENT, "exploration_evidence": 0.8, "expert_evidence": 0.3}, "confounded", 3, advice.QUERY),
             ({**SILENT, "trait_gain": None}, "cannot tell", None, advice.MORE_TRIALS),
+            ({**SILENT, "trait_gain": -0.5}, "cannot tell", None, advice.MORE_TRIALS),
             ({**SILENT, "trait_gain": 0.05}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({**SILENT, "trait_gain": 0.09}, "nothing at stake", 1, advice.CLONE_HABITS),
             ({**SILENT, "paired_trait_stakes": 2.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"dynamics_differ": None}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"shared": 0.6}, "confounded", 2, advice.EXPLORE),
             ({"shared": 0.4}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"expert_evidence": 0.05}, "confounded", 2, advice.EXPLORE),
@@ -307,6 +320,15 @@ class TestJudge:
         assert few.dissenting == ("confounded, Tier 2",)
         assert "lead to different verdicts" in few.conclusion
 
+    def test_splits_that_agree_against_all_of_them(self) -> None:
+        """Each alone says that the memory learned too little, and all together do not: then that is what is said."""
+        splits = [CLEAR._replace(memory_gain=gain, latent_gain=1.3 * gain + 0.3) for gain in (0.5, 1.0, 1.5)]
+        diagnosis = judge(splits)
+        assert {judge([split]).verdict for split in splits} == {"cannot tell"}
+        assert (diagnosis.verdict, diagnosis.next, diagnosis.agreeing) == ("cannot tell", advice.MORE_TRIALS, 3)
+        assert diagnosis.conclusion == judge(splits[:1]).conclusion
+        assert "different verdicts" not in diagnosis.conclusion
+
     def test_harmless_verdicts_agree(self) -> None:
         """That nothing is at stake, and that a clone infers what is hidden by itself: either way it loses nothing."""
         at_rest, infers = (CLEAR._replace(naive=x, naive_by_actions=x, latent=x) for x in (1.0, 0.9))
@@ -326,6 +348,15 @@ class TestJudge:
     def test_cost(self) -> None:
         """What is lost is what the score lacks: its range is from the least loss to the most."""
         assert "by 70% (50% to 80%) of" in judge([CLEAR, CLEAR, CLEAR._replace(naive=0.5)]).cost
+
+    def test_no_cost_is_promised_against_the_figures(self) -> None:
+        """A clone that leaves the course in the learned model, where it matters, may lose by it."""
+        memoryless = CLEAR._replace(memory_gain=0.0, latent_gain=-0.1)
+        free = "Next to nothing, as far as the learned model of your system shows."
+        assert judge([memoryless]).verdict == "not confounded"
+        assert judge([memoryless]).cost == "Not known from these data."
+        assert judge([memoryless._replace(naive=0.9, naive_by_actions=0.9)]).cost == free
+        assert judge([CLEAR._replace(stakes=1.1, paired_stakes=1.4)]).cost == free
 
     def test_figures(self) -> None:
         """The mean over refits, the least, and the most of them."""

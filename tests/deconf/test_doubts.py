@@ -11,7 +11,7 @@ import pytest
 from deconfounded.deconf.diagnosis import diagnose, doubts
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.envs.streams import Array
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.trials import Trials, joined
 from tests.deconf.test_diagnose import CLEAR
 
 Kind = Literal["drift", "spread", "cliff", "goal"]
@@ -159,3 +159,13 @@ class TestVerdict:
         assert diagnose.conclude([MIXED] * 3, expert, explore).verdict == "cannot tell"
         assert diagnose.conclude([CLEAR] * 3, expert, explore).verdict == "confounded"
         assert diagnose.conclude([CLEAR, CLEAR, MIXED], expert, explore).dissenting == ("cannot tell",)
+
+    def test_copies_raise_no_doubt(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """They would count as more evidence than there is."""
+        expert, explore = roll("goal", thetas("goal", 30, 0), True, 0), roll("goal", thetas("goal", 30, 1), False, 1)
+        monkeypatch.setattr(diagnose, "doubts", lambda *of: (f"{len(of[0])} and {len(of[1])} trials.",))
+        monkeypatch.setattr(diagnose.labels, "named", lambda _, explore: [f"of {len(explore)}"])
+        diagnosis = diagnose.conclude([MIXED] * 3, joined([expert] * 4), joined([explore] * 2))
+        assert diagnosis.conclusion.endswith("30 and 30 trials.")
+        seen = diagnose.conclude([MIXED._replace(memory_gain=0.0)] * 3, joined([expert] * 4), joined([explore] * 2))
+        assert "your columns show it: of 30, constant in" in seen.conclusion

@@ -156,6 +156,21 @@ def test_a_trait_s_gain_is_over_a_policy_that_fits_as_well(size: float, least: f
     assert least < made.gain < most
 
 
+@pytest.mark.slow
+def test_a_trait_of_trials_whose_halves_differ() -> None:
+    """In the first half all experts push the other way, so that a trait of the whole trial is of neither half."""
+    rng = np.random.default_rng(0)
+    side, turn = rng.uniform(-0.5, 0.5, (96, 1, 1, 1)), np.where(np.arange(40) < 20, -0.4, 0.4)[:, None]
+    obs = np.stack([np.broadcast_to(np.arange(41) / 40, (96, 1, 41)), rng.normal(size=(96, 1, 41))], -1)
+    action = (side + turn + 0.05 * rng.standard_normal((96, 1, 40, 1))).clip(-1, 1)
+    parts = (Trials(obs[i], action[i], np.ones((len(obs[i]), 1, 40), bool)) for i in (slice(0, 72), slice(72, None)))
+    train, held_out = (Batch.of(part, 1) for part in parts)
+    config = MemorylessConfig(updates=150, batch=256, width=32, learning_rate=6e-3)
+    signature = Signature.of(Trials(obs, action, np.ones((96, 1, 40), bool)))
+    made = trait.fit(train, held_out, signature, config, Draws([rng], "cpu"))
+    assert made.gain > 0.2
+
+
 def test_a_trait_s_policy_acts_by_the_scales_of_its_training() -> None:
     """Those of the expert, whatever the dynamics were learned from."""
     rng = np.random.default_rng(0)

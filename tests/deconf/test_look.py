@@ -17,7 +17,7 @@ from deconfounded.benchmarks import look as look_command
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.output.diagnosis import WRITTEN
 from deconfounded.deconf.diagnosis import advice as advices
-from deconfounded.deconf.diagnosis import columns, diagnose, fits
+from deconfounded.deconf.diagnosis import columns, diagnose, fits, trial_dynamics
 from deconfounded.deconf.diagnosis.look import Remark, look
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import deconfounded, naive_rnn
@@ -29,7 +29,7 @@ from deconfounded.experts.datasets import Log
 from deconfounded.experts.datasets.table import Odd
 from deconfounded.experts.datasets.units import Units
 from deconfounded.experts.rollout import run_trials
-from deconfounded.experts.trials import Trials
+from deconfounded.experts.trials import Trials, joined
 from tests.deconf.test_diagnose import _tiny_init
 
 B, E, T = 48, 2, 60
@@ -445,6 +445,19 @@ def test_dynamics_of_exploration(name: str, differ: bool) -> None:
 
 
 @pytest.mark.slow
+def test_copies_do_not_differ_in_their_dynamics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A look counts each trial once, and names it as the log does."""
+    counted: list[int] = []
+    monkeypatch.setattr(trial_dynamics, "own_dynamics", lambda trials, steps: counted.append(len(trials)))
+    log = Log.of(driven())
+    look(joined([log] * 3), blind=True)
+    assert counted == [len(log)]
+    order = [0, *range(len(log) - 1)]
+    kept = fits.distinct(replace(log, obs=log.obs[order], action=log.action[order]))
+    assert isinstance(kept, Log)
+    assert kept.names == (log.names[0], *log.names[2:])
+
+
 def test_dynamics_of_an_expert() -> None:
     assert "Trials differ in their dynamics" in said(look(driven()), "dynamics")
     assert "No difference in dynamics is seen" in said(look(driven(same=True)), "dynamics")

@@ -193,6 +193,34 @@ def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -
     envs.check_task(Arms())
 
 
+def slip(**changes: Any) -> envs.Task:
+    """Push with other parts, which get the push that they replace."""
+    return type("Slip", (Push,), changes)()  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("task", "says"),
+    [
+        (slip(observation=["x"]), r"observation of push was \['x'\]; it must be a dict of names and bounds"),
+        (slip(observation={**Push.observation, "velocity": (4, -4)}), "bounds of velocity of push were 4 and -4; low "),
+        (slip(init_state=lambda self, rng: Push().init_state(rng)[:, 0]), r"init_state of push gave .* shape \(2,\) "),
+        (slip(sample_noise=lambda self, rng: rng.standard_normal((2, 1))), r"sample_noise of push gave .* \(2, 1\) "),
+        (slip(log_prob=lambda self, *at: Push().log_prob(*at)[:, None]), r"log_prob of push gave .* shape \(2, 1\) "),
+        (
+            slip(log_prob=lambda self, *at: Push().log_prob(*at) * np.nan),
+            r"log_prob of push gave \[nan, nan\]; it must",
+        ),
+        (
+            type("Late", (Arms,), {"action_space": spaces.Discrete(3, start=1)})(),
+            "action_space of arms was .*begin at 0",
+        ),
+    ],
+)
+def test_slips_without_mujoco_are_named(task: envs.Task, says: str) -> None:
+    with pytest.raises(envs.InputError, match=f"^{says}"):
+        envs.check_task(task)
+
+
 @pytest.mark.parametrize("factor", [0.1, 0.5, 2, 100])
 def test_a_density_of_another_width_is_noticed(factor: float) -> None:
     """In a task without MuJoCo, too; what it states is no density of its noise."""

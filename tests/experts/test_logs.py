@@ -768,3 +768,11 @@ class TestBadInput:
         assert datasets.read(tmp_path / "x.npz").sha256 == expected().sha256
         with pytest.raises(envs.InputError, match="has no columns to choose"):
             datasets.read(tmp_path / "x.npz", trial="vehicle")
+
+
+def test_actions_too_large_for_arithmetic(tmp_path: Path) -> None:
+    """Their squares would overflow; observations have the same limit."""
+    rows = "".join(f"{trial},{step},{step},{1e300 if step else 0}\n" for trial in range(3) for step in range(4))
+    (tmp_path / "log.csv").write_text(f"trial,x,y,torque\n{rows}")
+    with pytest.raises(envs.InputError, match=r"an action, torque, was 1e\+300; it must be at most 1e\+15 in size"):
+        datasets.read(tmp_path / "log.csv", trial="trial", obs=["x", "y"], action=["torque"])
