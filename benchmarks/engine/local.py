@@ -80,8 +80,8 @@ class Local(Engine):
 
     def run(self, jobs: list[Some], tick: Callable[[int], None], say: Callable[[Some, str | Exception], None]) -> None:
         if self._executor is None:
-            ours = self._ticks, {*outside.FOLDERS}
-            self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, ours)
+            arguments = self._ticks, {*outside.FOLDERS}
+            self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, arguments)
         with self._ended():
             with inherited():
                 futures = {self._executor.submit(run_job, job): job for job in jobs}

@@ -123,10 +123,10 @@ def copies(trials: Trials) -> tuple[list[list[int]], ...]:
 def distinct(trials: Trials) -> Trials:
     """One of each trial with steps: a copy would be on both sides of a split, or the "other" trial of itself."""
     left_out = [b for same in copies(trials)[0] for b in same[1:]] + np.flatnonzero(~trials.mask.any((1, 2))).tolist()
-    return some(trials, np.delete(np.arange(len(trials)), left_out)) if left_out else trials
+    return select(trials, np.delete(np.arange(len(trials)), left_out)) if left_out else trials
 
 
-def some(trials: Trials, index: Numbers) -> Trials:
+def select(trials: Trials, index: Numbers) -> Trials:
     """Those trials, by number; those of a log with their names."""
     parts = trials.obs[index], trials.action[index], trials.mask[index], trials.actions
     if not isinstance(trials, Log):

@@ -22,7 +22,7 @@ from deconfounded.deconf.core.drift import episodes_of
 from deconfounded.deconf.core.sizes import LARGE_LATENT, LARGE_OBSERVATION, WIDE, Configuration
 from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
-from deconfounded.deconf.diagnosis.fits import Steps, distinct, some
+from deconfounded.deconf.diagnosis.fits import Steps, distinct, select
 from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report, typical
 from deconfounded.deconf.diagnosis.latent import Explanation
 from deconfounded.deconf.diagnosis.learned_env import (
@@ -284,4 +284,4 @@ def _explain(
 def split(trials: Trials, share: float, rng: np.random.Generator) -> tuple[Trials, Trials]:
     """Trials for training, and that share of them that is held out."""
     order, count = rng.permutation(len(trials)), max(1, round(share * len(trials)))
-    return some(trials, order[count:]), some(trials, order[:count])
+    return select(trials, order[count:]), select(trials, order[:count])

@@ -203,7 +203,7 @@ def _check_episodes(task: Task) -> None:
             if beyond := beyond_bounds(task, env.state[env.alive]):
                 raise InputError(beyond)
             if by_expert:
-                asked.append((obs, env.theta, _of_expert(task, name, acted, obs, env.theta)))
+                asked.append((obs.copy(), env.theta.copy(), _of_expert(task, name, acted, obs, env.theta)))
                 by_it = asked[-1][-1]
                 action = by_it.argmax(-1)[:, None].astype(float) if task.n_actions else by_it.clip(-1, 1)
             obs, reward, *_ = env.step(action)
