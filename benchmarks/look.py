@@ -50,13 +50,12 @@ def read(data: list[Path], explore: list[Path] | None, chosen: dict[str, Any]) -
 def look(trials: "Log", explore: "Log | None") -> "list[Remark]":
     """Remarks on both."""
     from deconfounded.deconf.diagnosis.doubts import doubts
-    from deconfounded.deconf.diagnosis.fits import distinct
     from deconfounded.deconf.diagnosis.look import look as look_at
     from deconfounded.deconf.diagnosis.remark import Remark
 
     blind = [] if explore is None else look_at(explore, blind=True)
     if explore is not None and any(remark.kind == "dynamics" and remark.odd for remark in blind):
-        blind += [Remark("doubt", text, True) for text in doubts(distinct(trials), distinct(explore))]
+        blind += [Remark("doubt", text, True) for text in doubts(trials, explore)]
     return look_at(trials) + [remark._replace(text=f"Exploration: {remark.text}") for remark in blind]
 
 

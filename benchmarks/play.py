@@ -54,9 +54,11 @@ def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = 
         total, over = 0.0, False
         while not over:
             action = agent.act(obs[None])
-            if not env.task.n_actions:
+            if env.task.n_actions:
+                taken = int(action[0, 0])
+            else:
                 action = action.clip(-1, 1)  # as the environment does; an agent may remember what it took
-            taken = int(action[0, 0]) if env.task.n_actions else action[0]
+                taken = action[0]
             then, reward, terminated, truncated, _ = env.step(taken)
             agent.observe(obs[None], action, then[None], np.ones(1, bool))
             total, over, obs = total + reward, terminated or truncated, then

@@ -45,7 +45,11 @@ class Steps:
 
 
 def sample(trials: Trials) -> Trials:
-    """Evenly spaced trials of about MOST steps in all; of long ones FEWEST, and the beginnings of their episodes."""
+    """Evenly spaced trials of about MOST steps in all; of long ones FEWEST, and the beginnings of their episodes.
+
+    They are distinct, since a copy would count as more evidence than there is.
+    """
+    trials = distinct(trials)
     if (total := trials.mask.sum()) <= MOST:
         return trials
     whole, horizon = len(trials) * MOST / total, trials.mask.shape[2]

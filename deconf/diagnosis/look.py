@@ -31,7 +31,7 @@ def look(given: Trials, blind: bool = False) -> list[Remark]:
     """
     check_trials("look", given)
     log = given if isinstance(given, Log) else Log.of(given, "Trials")
-    part = fits.sample(fits.distinct(given))
+    part = fits.sample(given)
     steps, fitted = Steps.of(log), Steps.of(part)
     remarks = [Remark("size", note, isinstance(note, Odd)) for note in log.notes]
     for describe in (

@@ -112,8 +112,7 @@ def _check_world(task: BlackBox) -> None:
         for action in actions(task, env.n, task.horizon):
             masks.append(env.alive)
             asked.append((obs, env.theta, once := acted(obs, env.theta)))  # after an episode's end too, as in runs
-            own = once.argmax(-1)[:, None].astype(float) if task.n_actions else once
-            obs = env.step(own if by_expert else action)[0]
+            obs = env.step(_likeliest(task, once) if by_expert else action)[0]
             states.append(env.state)
             if not env.alive.any():
                 break
@@ -203,9 +202,9 @@ def _check_episodes(task: Task) -> None:
             if beyond := beyond_bounds(task, env.state[env.alive]):
                 raise InputError(beyond)
             if by_expert:
-                asked.append((obs.copy(), env.theta.copy(), _of_expert(task, name, acted, obs, env.theta)))
-                by_it = asked[-1][-1]
-                action = by_it.argmax(-1)[:, None].astype(float) if task.n_actions else by_it.clip(-1, 1)
+                once = _of_expert(task, name, acted, obs, env.theta)
+                asked.append((obs.copy(), env.theta.copy(), once))
+                action = _likeliest(task, once)
             obs, reward, *_ = env.step(action)
             if (most := reward.max()) > 1 + 1e-9:
                 raise InputError(f"reward of {task.name} was {most:g}; it must be at most 1 a step")
@@ -213,6 +212,11 @@ def _check_episodes(task: Task) -> None:
                 break
         if by_expert:
             check_expert(f"{name} of {task.name}", acted, *map(np.concatenate, zip(*asked, strict=True)))
+
+
+def _likeliest(task: Task, once: Array) -> Array:
+    """The actions [N, A] that an expert takes without noise, by its probabilities or means."""
+    return once.argmax(-1)[:, None].astype(float) if task.n_actions else once.clip(-1, 1)
 
 
 def _of_expert(task: Task, name: str, acted: Acted, obs: Array, theta: Array) -> Array:

@@ -25,8 +25,8 @@ def _outcomes(task: Task) -> tuple[Array, Array]:
     last = action[-len(parts) :]
     last[:] = np.arange(len(parts))[:, None] % task.n_actions if task.n_actions else last * (1 - parts)[:, None]
     batch.reset([0] * batch.n, {"theta": thetas})
-    p, others = np.split(batch.simulator.outcome(batch.state, action), [1])
-    return p, others[(others != p).any(-1)]
+    p, candidates = np.split(batch.simulator.outcome(batch.state, action), [1])
+    return p, candidates[(candidates != p).any(-1)]
 
 
 def _density_ratio(what: str, fall: Array, pair: str) -> None:
@@ -40,13 +40,13 @@ def _density_ratio(what: str, fall: Array, pair: str) -> None:
 def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     """Log_prob is the density of apply_noise: E_p[q(s') / p(s')] = 1 for another outcome's q, over 4,000 draws."""
     needs_likelihood(task)
-    m, p, others = 4000, *_outcomes(task)
-    if not len(others):
+    m, p, candidates = 4000, *_outcomes(task)
+    if not len(candidates):
         raise Skipped("neither theta nor the action changes the first step's outcome")
     drawn = task.apply_noise(np.repeat(p, m, 0), _noise(task, m))
     few = drawn[:100]
-    spread = [(task.log_prob(few, p) - task.log_prob(few, each[None])).std() for each in others]
-    q = others[[np.abs(np.log(np.maximum(spread, 1e-9))).argmin()]]  # about a standard deviation off
+    spread = [(task.log_prob(few, p) - task.log_prob(few, each[None])).std() for each in candidates]
+    q = candidates[[np.abs(np.log(np.maximum(spread, 1e-9))).argmin()]]  # about a standard deviation off
     if isinstance(task, MujocoTask):  # at most one, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])

@@ -130,9 +130,11 @@ def check_helpers(file: Path) -> None:
     named += [node.module for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
     for name in {each.partition(".")[0] for each in named}:
         beside = [path.parent / f"{name}.py", path.parent / name / "__init__.py"]
+        if not any(file.is_file() for file in beside):
+            continue
         spec = None if name in sys.modules else importlib.util.find_spec(name)  # it is imported later
         got = spec.origin if spec else getattr(sys.modules.get(name), "__file__", None)
-        if not got or not any(file.is_file() for file in beside) or Path(got) in beside:
+        if not got or Path(got) in beside:
             continue
         if any(Path(got).is_relative_to(folder) for folder in FOLDERS):
             raise InputError(f"{path} imports {name}, and got {got} of another plug-in; rename one of the two")
@@ -153,16 +155,16 @@ def _helpers(folders: Set[str]) -> dict[str, ModuleType]:
 @contextmanager
 def _apart(folder: str) -> Iterator[None]:
     """Meanwhile, imports find what is in this plug-in's folder, and nothing that is in those of others."""
-    path, others, own = [*sys.path], _helpers(FOLDERS - {folder}), _helpers({folder})
-    for name in others:
+    path, foreign, before = [*sys.path], _helpers(FOLDERS - {folder}), _helpers({folder})
+    for name in foreign:
         del sys.modules[name]
     sys.path[:] = [entry for entry in path if entry == folder or entry not in FOLDERS]
     try:
         yield
     finally:
-        for name in _helpers({folder}).keys() - own:
+        for name in _helpers({folder}).keys() - before.keys():
             del sys.modules[name]
-        sys.modules.update(others)
+        sys.modules.update(foreign)
         sys.path[:] = [*(entry for entry in sys.path if entry not in path), *path]
 
 
