@@ -1,5 +1,6 @@
 """Saved agents: folders with agent.json and agent.safetensors, without pickle."""
 
+import contextlib
 import hashlib
 import inspect
 import json
@@ -63,10 +64,27 @@ def save(agent: Agent, folder: Path, **about: Any) -> None:
             agent, cls.from_state(json.loads(json.dumps(about["settings"])), from_bytes(content)), about["spaces"]
         )
     check_folder(folder)
-    if code is not None:
-        write_atomically(folder / CODE, code)
-    write_atomically(folder / ARRAYS, content)
-    write_atomically(file, described)
+    files = {ARRAYS: content} if code is None else {CODE: code, ARRAYS: content}
+    for name, data in files.items():
+        write_atomically(_saved_aside(folder, name, _sha256(data)), data)
+    write_atomically(file, described)  # from here on the folder holds this agent, before that the one it held
+    for name, data in files.items():
+        _put_in_place(folder, name, _sha256(data))
+        for left in folder.glob(_saved_aside(Path(), name, "[0-9a-f]" * 64).name):  # of a save that was interrupted
+            left.unlink(missing_ok=True)
+
+
+def _saved_aside(folder: Path, name: str, sha: str) -> Path:
+    """Where a file of an agent is until agent.json names it by its hash."""
+    return folder / f".{name}.{sha}"
+
+
+def _put_in_place(folder: Path, name: str, sha: str) -> None:
+    """Give a file that `save` wrote aside its name: as the end of saving, or where an interrupt left that undone."""
+    aside = _saved_aside(folder, name, sha)
+    with contextlib.suppress(FileNotFoundError):
+        if _sha256(aside.read_bytes()) == sha:
+            aside.replace(folder / name)
 
 
 def _check_loadable(cls: type[Agent], settings: str, named: dict[str, NDArray[Any]], content: bytes) -> None:
@@ -123,6 +141,10 @@ def describe(folder: Path) -> dict[str, Any]:
         raise InputError(f"{folder} holds no agent.json; give the folder of an agent, as a run leaves it") from None
     if [type(about.get(key)) for key in ("class", "settings", "arrays")] != [str, dict, str]:
         raise InputError(f"{folder / 'agent.json'} is of no agent; run the benchmark again")
+    for name, key in ((ARRAYS, "arrays"), (CODE, "code")):
+        if isinstance(sha := about.get(key), str) and sha.isalnum():
+            with contextlib.suppress(OSError):  # a folder that cannot be written: what is missing is said below
+                _put_in_place(folder, name, sha)
     if "code" in about and (not (code := folder / CODE).is_file() or _sha256(code.read_bytes()) != about["code"]):
         raise InputError(f"{code} is missing, damaged, or of another agent; run the benchmark again")
     return about

@@ -59,7 +59,10 @@ def tiny_preset() -> Preset:
 
 
 def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
-    """The command `deconf ARGS`, run in a folder, but in this process, jobs and all: others take seconds to begin."""
+    """The command `deconf ARGS`, run in a folder, but in this process, jobs and all: others take seconds to begin.
+
+    Methods from outside that it makes known are unknown afterwards, as they would be after a process of its own.
+    """
     out, err, code = io.StringIO(), io.StringIO(), 0
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with contextlib.ExitStack() as stack:
@@ -67,6 +70,7 @@ def deconf(folder: Path, *args: str) -> "CompletedProcess[str]":
             stack.enter_context(context)
         stack.enter_context(mock.patch.object(sys, "argv", ["deconf", *args]))
         stack.enter_context(mock.patch.object(commands, "local", Here))
+        stack.enter_context(mock.patch.dict(METHODS.outside))
         try:
             __main__.main()
         except SystemExit as ended:

@@ -168,17 +168,20 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
     progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
     def say(job: Some, outcome: str | Exception) -> None:
-        file = errors and errors / f"{job.method}-{in_name(job.seeds)}.txt"
+        name, file = f"{job.method}, {listed(job.seeds)}", errors and errors / f"{job.method}-{in_name(job.seeds)}.txt"
         if file is not None:
             file.unlink(missing_ok=True)
         if isinstance(outcome, Exception):
             failed.append(outcome)
-            outcome = f"failed: {outcome}"
-            if file is not None and (traces := getattr(failed[-1], "__notes__", ())):
+            if isinstance(outcome, InputError):  # which ends a command with its line alone
+                failed[-1] = InputError(f"{name}: {outcome}")
+                failed[-1].__cause__ = outcome
+            traces, outcome = getattr(outcome, "__notes__", ()), f"failed: {outcome}"
+            if file is not None and traces:
                 check_folder(file.parent)
                 write_atomically(file, "\n".join(traces))
                 outcome += f"; its traceback: {file}"
-        progress.line(f"{job.method}, {listed(job.seeds)}: {outcome}")
+        progress.line(f"{name}: {outcome}")
 
     run(sorted(jobs, key=lambda job: -job.ticks), progress.update, say)
     progress.close()

@@ -92,7 +92,8 @@ class TestSeveralTasks:
         assert ended.value.code == 2
         said = capfd.readouterr()
         assert re.match(
-            r"error: 2 of 2 tasks failed; bandit: method mine_bad: .*\(RuntimeError, mine.py:28\)", said.err
+            r"error: 2 of 2 tasks failed; bandit: mine_bad, seed 0: method mine_bad: .*\(RuntimeError, mine.py:28\)",
+            said.err,
         )
         for task in ("bandit", "weak_thruster"):
             assert (mine.parent / "results" / f"{task}-smoke" / "report.html").is_file()
@@ -201,7 +202,9 @@ def test_tracebacks_are_kept_until_it_works(tmp_path: Path, monkeypatch: pytest.
     failure = InputError("no")
     failure.add_note("Traceback ...")
     run: Callable[..., None] = lambda jobs, tick, say: say(jobs[0], failure)  # noqa: E731
-    assert scheduler.run_jobs([job], "one", run, tmp_path / "errors") == [failure]
+    (error,) = scheduler.run_jobs([job], "one", run, tmp_path / "errors")
+    assert str(error) == "random, seed 0: no"
+    assert error.__cause__ is failure
     assert (tmp_path / "errors" / "random-0.txt").read_text() == "Traceback ..."
     scheduler.run_jobs([job], "one", lambda jobs, tick, say: say(jobs[0], "well"), tmp_path / "errors")
     assert not list((tmp_path / "errors").iterdir())

@@ -97,7 +97,7 @@ def test_a_failed_job_is_an_error_when_others_are_done(tmp_path: Path) -> None:
             say(job, became)
             said.append(job.method)
 
-    assert [str(error) for error in scheduler.run_jobs(made, "two", run)] == ["it broke"]
+    assert [str(error) for error in scheduler.run_jobs(made, "two", run)] == ["random, seed 0: it broke"]
     assert said == ["random", "expert"]
 
 
@@ -125,7 +125,7 @@ def test_a_failed_job_s_checkpoint_stays(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
     job = Failing("bandit", tiny_preset(), "blind_bc", (0,), tmp_path)
     _, _, failed = scheduler.run_all([job], "cpu", "failing", Told())
-    assert [str(error) for error in failed] == ["out of memory"]
+    assert [str(error) for error in failed] == ["blind_bc, seed 0: out of memory"]
     assert job.checkpoint.exists()
 
 
@@ -198,8 +198,11 @@ def test_an_error_of_a_task_from_outside(tmp_path: Path, monkeypatch: pytest.Mon
     finished, before, failed = scheduler.run_all(made, "cpu", "rare", Told())
     assert [method for method, *_ in finished] == ["random"]
     assert before == 0
-    assert [str(error) for error in failed] == [f"{reference}: 3 (KeyError, own.py:8)"] * 2
-    for name in ("demonstrations", "blind_bc"):
+    failing = ("demonstrations", "blind_bc")
+    assert [str(error) for error in failed] == [
+        f"{name}, seed 0: {reference}: 3 (KeyError, own.py:8)" for name in failing
+    ]
+    for name in failing:
         assert (tmp_path / "errors" / f"{name}-0.txt").read_text().startswith("Traceback")
 
 

@@ -1,5 +1,6 @@
 """Tasks, methods and experts from somebody's own folder, which has an envs/ and a benchmarks/ of its own; docs/'s."""
 
+import contextlib
 import errno
 import hashlib
 import importlib
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 import deconfounded
 from deconfounded import envs
-from deconfounded.benchmarks import certify, check, play
+from deconfounded.benchmarks import certify, check, play, push
 from deconfounded.benchmarks.console import run_command
 from deconfounded.benchmarks.engine import catalogue, identity, presets, progress, sources
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, evaluate
@@ -1113,6 +1114,40 @@ class Odd(Still):
         with pytest.raises(envs.InputError, match=says):
             saved_agents.save(agent, tmp_path / "kept")
         assert not (tmp_path / "kept").exists()
+
+    @pytest.mark.parametrize("steps", range(7))
+    def test_interrupted_over_another_agent(self, steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """At any of its steps, the folder holds the agent that it held, or the new one, whole; and no litter later."""
+
+        def agent(value: float) -> Any:
+            text = f"""
+class Odd(Still):
+    doubled = {2 * value}
+    def __init__(self, value): self.value = value
+    def state(self): return {{"value": self.value}}, {{"size": np.array(self.value)}}
+    @classmethod
+    def from_state(cls, settings, arrays): return cls(float(arrays["size"]) if settings["value"] else None)
+"""
+            file = tmp_path / f"odd{value}.py"
+            file.write_text(HEAD + text)
+            return outside.find("agent", f"{file}:Odd")(value)
+
+        def replace(*names: Any) -> None:
+            made.append(1)
+            if len(made) > steps:
+                raise KeyboardInterrupt
+            whole(*names)
+
+        folder, made, whole = tmp_path / "kept", list[int](), os.replace
+        saved_agents.save(agent(1.0), folder)
+        with monkeypatch.context() as patch, contextlib.suppress(KeyboardInterrupt):
+            patch.setattr(os, "replace", replace)
+            saved_agents.save(agent(2.0), folder)
+        loaded: Any = deconfounded.load(folder)
+        assert loaded.value == (1.0 if steps < 3 else 2.0)
+        assert loaded.doubled == 2 * loaded.value
+        saved_agents.save(agent(3.0), folder)
+        assert {file.name for file in folder.iterdir()} - {"__pycache__"} == {*push.AGENT_FILES}
 
     @pytest.mark.parametrize(
         ("loaded", "says"),
