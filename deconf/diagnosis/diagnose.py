@@ -20,7 +20,7 @@ from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.envs.support.errors import InputError
 from deconfounded.experts.trials import Trials, check_trials
 
-VERSION = 20  # raised when figures or verdicts of the same trials change
+VERSION = 21  # raised when figures or verdicts of the same trials change
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,8 @@ def _judge(refits: Sequence[Findings], explored: int | None, labels: Sequence[st
             "The clone with a memory did not fit: it predicts less well than one without, so that nothing follows."
         )
         return conclude("cannot tell", None, conclusion, MORE_TRIALS)
-    least = (1 + UNUSED) * max(memory.high, 0) + NEGLIGIBLE
-    unused = in_exploration is not None and not alike and figures["latent_gain"].low > least
+    least = UNUSED * max(memory.high, 0) + NEGLIGIBLE
+    unused = in_exploration is not None and not alike and figures["over_memory"].low > least
     if memory.low <= NEGLIGIBLE and not unused:
         if memory.high > NEGLIGIBLE:
             return conclude("cannot tell", None, "Whether past actions help a clone is not clear.", MORE_TRIALS)

@@ -44,15 +44,16 @@ class Explanation(NamedTuple):
 
     Nats a step, None without exploration. latent_gain: log-likelihood of held-out expert actions at odd steps, given
     the latent inferred from even steps, less that of a policy that was trained with other trials' latents, and has as
-    much to overfit, each at its best. action_evidence: the former less that given other trials' latents;
-    exploration_evidence, expert_evidence: as much of next observations, in exploration and in expert trials.
-    shared: see `shared_with`.
+    much to overfit, each at its best. log_likelihood: the former alone. action_evidence: the former less that given
+    other trials' latents; exploration_evidence, expert_evidence: as much of next observations, in exploration and in
+    expert trials. shared: see `shared_with`.
     """
 
     dynamics: DynamicsHead
     policy: ActionHead
     latents: Tensor
     latent_gain: float | None = None
+    log_likelihood: float | None = None
     action_evidence: float | None = None
     exploration_evidence: float | None = None
     expert_evidence: float | None = None
@@ -97,12 +98,12 @@ def from_dynamics(
     (policy, own), (_, other) = (
         _train_policy(model, train, x, odd, latents, cloning, draws) for x in (belief, belief.roll(per_theta, 1))
     )
-    gain = typical(own - other, odd)
+    gain, likely = typical(own - other, odd), typical(own, odd)
     in_actions = _evidence(_log_action(model, policy), odd, latents, per_theta)
     in_trials = _evidence(log_next(dynamics), odd, latents, per_theta)
     latents = model.for_cloning(belief, draws)
     shared = shared_with(explored.joined(explored_held_out), train, model, LatentPolicy(dynamics, policy, latents))
-    return Explanation(dynamics, policy, latents, gain, in_actions, evidence, in_trials, shared)
+    return Explanation(dynamics, policy, latents, gain, likely, in_actions, evidence, in_trials, shared)
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from deconfounded.deconf.diagnosis import latent, trait, trial_dynamics
 from deconfounded.deconf.diagnosis.deviation import deviation, max_ratio, paired_deviation, paired_score, trajectories
 from deconfounded.deconf.diagnosis.fits import Steps, distinct, select
 from deconfounded.deconf.diagnosis.held_out import BestMonitor, PartMonitor, Report, typical
-from deconfounded.deconf.diagnosis.latent import Explanation
+from deconfounded.deconf.diagnosis.latent import Explanation, odd_steps
 from deconfounded.deconf.diagnosis.learned_env import (
     Actor,
     AgentActor,
@@ -82,6 +82,7 @@ class Findings(NamedTuple):
     memory_gain: gain in log-likelihood of the expert's actions by a memory, over the present observation alone, each
     at its best (`held_out.Best`).
     latent_gain: that by the latent inferred from the dynamics, over latents of other trials, each at its best, too.
+    over_memory: typical log-likelihood at every other step given that latent, less that of the clone with a memory.
     Evidence is the log-likelihood given a trial's own latent less that given other trials'. exploration_evidence,
     expert_evidence: evidence in the dynamics, of exploration and of expert trials. action_evidence: evidence in the
     expert's actions, for which a naive clone takes its own.
@@ -94,8 +95,8 @@ class Findings(NamedTuple):
     model_deviation: mean deviation of trajectories under right latents from the data's. model_length: mean length of
     their episodes, over that of the data's. naive, latent: scores of the naive clone and of posterior sampling, from 0
     for a wrong latent to 1 for the right one (`deviation.paired_score`); naive_by_actions, latent_by_actions: by errors
-    of actions, Eq. (1). Without exploration, latent_gain and evidence are None, and the latent explains actions too,
-    Eq. (7).
+    of actions, Eq. (1). Without exploration, latent_gain, over_memory and evidence are None, and the latent explains
+    actions too, Eq. (7).
 
     Only where a memory gains and dynamics do not differ, others are not None: trait_gain, the gain by a trait of the
     trial that is inferred from the actions of its other half (`trait.py`), and its stakes. shared: the share of what
@@ -104,6 +105,7 @@ class Findings(NamedTuple):
 
     memory_gain: float
     latent_gain: float | None
+    over_memory: float | None
     exploration_evidence: float | None
     expert_evidence: float | None
     action_evidence: float | None
@@ -153,10 +155,13 @@ def measure(
             return LearnedEnv(reference, episodes, batches, per_trial, horizon, ends)
 
         rollouts = _rollouts(explanation, learned_env, recurrent, episodes, amounts, rngs)
-    in_dynamics = explanation.latent_gain, explanation.exploration_evidence, explanation.expert_evidence
+    likely, at_odd_steps = explanation.log_likelihood, odd_steps(held_out)
+    over_memory = None if likely is None else likely - typical(remembering.best.log_prob, at_odd_steps)
+    in_dynamics = explanation.exploration_evidence, explanation.expert_evidence
     differ = None if explore is None else max(_differ(near(trials, explore)), key=lambda alike: alike or 0.0)
     shared = explanation.shared
-    findings = Findings(memory, *in_dynamics, explanation.action_evidence, differ, *rollouts, shared=shared)
+    gains = memory, explanation.latent_gain, over_memory
+    findings = Findings(*gains, *in_dynamics, explanation.action_evidence, differ, *rollouts, shared=shared)
     if differ == 0 and memory > CLEAR:
         whole = Batch.of(train, 1)
         of_trial = trait.fit(whole, held_out, Signature.of(train), amounts.cloning, draws)

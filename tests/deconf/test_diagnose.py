@@ -186,6 +186,7 @@ CLEAR = Findings(
     expert_evidence=0.2,
     action_evidence=50.0,
     latent_gain=0.5,
+    over_memory=-0.5,
     stakes=3.0,
     paired_stakes=9.0,
     model_deviation=3.0,
@@ -196,7 +197,7 @@ CLEAR = Findings(
     latent_by_actions=0.8,
 )
 
-NO_FIGURES = ("latent_gain", "exploration_evidence", "expert_evidence", "action_evidence")
+NO_FIGURES = ("latent_gain", "over_memory", "exploration_evidence", "expert_evidence", "action_evidence")
 SMALL = {"naive_by_actions": 0.8}
 ALONE = dict.fromkeys((*NO_FIGURES, "dynamics_differ"))
 SILENT = {
@@ -237,13 +238,21 @@ class TestJudge:
             ({"expert_evidence": 0.05}, "confounded", 2, advice.EXPLORE),
             ({"latent_gain": -0.1}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
-            ({"latent_gain": 2.0, "naive": 0.98, "latent": 1.0}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"over_memory": 0.4, "naive": 0.98, "latent": 1.0}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"over_memory": 0.3, "naive": 0.98, "latent": 1.0}, "nothing at stake", 1, advice.CLONE_HABITS),
+            ({"over_memory": 0.4}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"latent_gain": 5.0}, "confounded", 2, advice.EXPLORE),  # over a policy that learned trials by heart
             ({"memory_gain": 0.0, "latent_gain": 0.05}, "cannot tell", None, advice.MORE_TRIALS),
-            ({"memory_gain": 0.0, "latent_gain": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"memory_gain": 0.0, "over_memory": 0.3}, "cannot tell", None, advice.MORE_TRIALS),
             ({"memory_gain": 0.0, "latent_gain": 0.05, "model_deviation": 5.0}, "not confounded", 1, advice.CLONE),
             ({"memory_gain": 0.0, "latent_gain": -0.1}, "not confounded", 1, advice.CLONE),
-            ({"memory_gain": 0.0, "latent_gain": 0.3, "dynamics_differ": 0.0}, "cannot tell", None, advice.VARY_LATENT),
-            ({"memory_gain": 0.0, "exploration_evidence": 0.0}, "cannot tell", None, advice.MORE_TRIALS),
+            ({"memory_gain": 0.0, "over_memory": 0.3, "dynamics_differ": 0.0}, "cannot tell", None, advice.VARY_LATENT),
+            (
+                {"memory_gain": 0.0, "exploration_evidence": 0.0, "over_memory": 0.3},
+                "cannot tell",
+                None,
+                advice.MORE_TRIALS,
+            ),
             ({"expert_evidence": -0.5}, "cannot tell", None, advice.EXPLORE_MORE),
             ({"stakes": 1.1}, "confounded", 2, advice.EXPLORE),
             ({"paired_stakes": 1.1}, "confounded", 2, advice.EXPLORE),
@@ -292,7 +301,7 @@ class TestJudge:
         [
             ({"stakes": 1.1, "paired_stakes": 1.4}, {"latent_gain": 0.5}, {"latent_gain": -0.1}, "cannot tell"),
             (SILENT, {"trait_gain": 0.05}, {"trait_gain": 0.12}, "cannot tell"),
-            ({"latent_gain": 1.5}, {"memory_gain": 0.6}, {"memory_gain": 1.4}, "confounded"),
+            ({"over_memory": 0.4}, {"memory_gain": 0.6}, {"memory_gain": 1.4}, "confounded"),
             (
                 {"naive_by_actions": 0.8},
                 {"naive": 0.9, "latent": 0.95},
@@ -310,19 +319,19 @@ class TestJudge:
 
     def test_what_the_others_say(self) -> None:
         """A verdict that most splits give alone stands, and says how sure it is; that of fewer does not."""
-        diagnosis = judge([CLEAR, CLEAR, CLEAR._replace(latent_gain=2.0)])
+        diagnosis = judge([CLEAR, CLEAR, CLEAR._replace(over_memory=1.0)])
         assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.dissenting) == ("confounded", 2, ("cannot tell",))
         assert "Not very: 2 of 3 random splits" in diagnosis.sure
         assert "(the others: cannot tell)" in diagnosis.sure
         assert judge([CLEAR] * 2).dissenting == ()
-        few = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(latent_gain=2.0)])
+        few = judge([CLEAR, CLEAR._replace(latent_gain=-0.1), CLEAR._replace(over_memory=1.0)])
         assert (few.verdict, few.tier, few.agreeing, few.next) == ("cannot tell", None, 2, advice.MORE_TRIALS)
         assert few.dissenting == ("confounded, Tier 2",)
         assert "lead to different verdicts" in few.conclusion
 
     def test_splits_that_agree_against_all_of_them(self) -> None:
         """Each alone says that the memory learned too little, and all together do not: then that is what is said."""
-        splits = [CLEAR._replace(memory_gain=gain, latent_gain=1.3 * gain + 0.3) for gain in (0.5, 1.0, 1.5)]
+        splits = [CLEAR._replace(memory_gain=gain, over_memory=0.3 * gain + 0.3) for gain in (0.5, 1.0, 1.5)]
         diagnosis = judge(splits)
         assert {judge([split]).verdict for split in splits} == {"cannot tell"}
         assert (diagnosis.verdict, diagnosis.next, diagnosis.agreeing) == ("cannot tell", advice.MORE_TRIALS, 3)

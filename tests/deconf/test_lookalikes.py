@@ -73,6 +73,7 @@ def diagnosed(kind: str, explored: int = 96, unit: float = 1.0) -> Diagnosis:
 def test_wind_is_confounded() -> None:
     diagnosis = diagnosed("wind")
     assert (diagnosis.verdict, diagnosis.tier) == ("confounded", 2)
+    assert diagnosis.figures["over_memory"].value < 0.25  # past actions tell a memory all of the wind
 
 
 @pytest.mark.slow
@@ -324,6 +325,10 @@ def test_a_latent_tells_no_more_of_actions_than_what_is_hidden() -> None:
     cloning = MemorylessConfig(updates=600, learning_rate=3e-3)
     exploring = DeconfoundedConfig(inference_updates=200, inference_rate=5e-3, width=32)
     draws = Draws([np.random.default_rng(0)], "cpu")
-    gain = latent.from_dynamics(expert, exploration, 1, exploring, cloning, draws, Monitor()).latent_gain
+    explanation = latent.from_dynamics(expert, exploration, 1, exploring, cloning, draws, Monitor())
+    gain, likely = explanation.latent_gain, explanation.log_likelihood
     assert gain is not None
+    assert likely is not None
     assert 0.5 < gain < np.log(np.hypot(0.05, 0.4 / 3**0.5) / 0.05) + 0.2
+    best = -np.log(0.05 / expert[0].action.std()) - 0.5 * np.log(2 * np.pi * np.e)  # of standardised actions
+    assert best - 0.5 < likely < best + 0.2

@@ -47,7 +47,7 @@ def test_a_memory_that_did_not_fit_in_a_single_split_stops_the_verdict() -> None
 
 def test_half_of_the_splits_are_enough() -> None:
     """A verdict falls where fewer than half of them give it alone."""
-    diagnosis = judge([CLEAR, CLEAR._replace(latent_gain=2.0)])
+    diagnosis = judge([CLEAR, CLEAR._replace(over_memory=1.0)])
     assert (diagnosis.verdict, diagnosis.agreeing, diagnosis.refits) == ("confounded", 1, 2)
 
 
@@ -104,6 +104,28 @@ def test_clones_are_trained_without_the_trials_that_judge_them(monkeypatch: pyte
     rest = {*judged[0].obs.ravel().tolist()}
     assert given == [{*number} - rest] * 2
     assert len(rest) == 4
+
+
+def test_a_latent_and_a_memory_are_compared_at_the_same_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those from which the latent is not inferred: every other one, where the memory has 3 nats, of 0 at the rest."""
+    remembered = 3.0 * (torch.arange(10) % 2).expand(1, 6, 10)
+    best = iter((SimpleNamespace(log_prob=torch.zeros(1, 6, 10)), SimpleNamespace(log_prob=remembered)))
+    monkeypatch.setattr(measures, "BestMonitor", lambda *rest: SimpleNamespace(best=next(best)))
+    for method in (memoryless_bc, naive_rnn):
+        monkeypatch.setattr(method, "train", lambda *rest, **named: SimpleNamespace(scales=SimpleNamespace(obs=None)))
+    monkeypatch.setattr(measures.termination, "fit", lambda *rest: None)
+    explanation = Explanation(None, None, torch.zeros(1, 1, 1), latent_gain=9.0, log_likelihood=2.0)  # type: ignore[arg-type]
+    monkeypatch.setattr(measures, "_explain", lambda *rest: explanation)
+    monkeypatch.setattr(measures, "_rollouts", lambda *rest: (1.0,) * 8)
+    rng = np.random.default_rng(0)
+    trials = Trials(rng.normal(size=(24, 1, 11, 1)), rng.uniform(-1, 1, (24, 1, 10, 1)), np.ones((24, 1, 10)))
+    found = measures.measure(trials, trials, Amounts(), rng)
+    assert (found.memory_gain, found.latent_gain, found.over_memory) == (1.5, 9.0, -1.0)
+    monkeypatch.setattr(
+        measures, "BestMonitor", lambda *rest: SimpleNamespace(best=SimpleNamespace(log_prob=remembered))
+    )
+    monkeypatch.setattr(latent, "from_expert_trials", lambda *rest: explanation._replace(log_likelihood=None))
+    assert measures.measure(trials, None, Amounts(), rng).over_memory is None
 
 
 def test_printed_lines_explore_by_the_log_of_exploration() -> None:
