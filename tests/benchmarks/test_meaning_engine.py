@@ -152,6 +152,21 @@ def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
     assert engine.ran == ["blind_bc"]
 
 
+def test_demonstrations_are_made_for_seeds_that_imitate(tmp_path: Path) -> None:
+    """Once, before them; not for the seeds of methods that imitate nothing."""
+    seeds = {"blind_bc": (1,), "oracle_bc": (1, 2), "random": (0, 1)}
+    made = [BenchmarkJob("bandit", tiny_preset(), name, of, tmp_path) for name, of in seeds.items()]
+    ran: list[tuple[str, tuple[int, ...]]] = []
+
+    class NotingSeeds(Here):
+        def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
+            ran.extend((job.method, job.seeds) for job in jobs)
+
+    scheduler.run_all(made, "cpu", "", NotingSeeds())
+    assert sorted(of for name, of in ran if name == "demonstrations") == [(1,), (2,)]
+    assert {name for name, _ in ran[:3]} == {"demonstrations", "random"}
+
+
 def test_long_jobs_come_first(tmp_path: Path) -> None:
     """So that no core waits for the last one; random actions and the expert before all."""
     wanted = ("blind_bc", "expert", "interventional", "random")
