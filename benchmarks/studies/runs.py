@@ -35,7 +35,7 @@ def run(
 ) -> "list[Record]":
     """The records of the methods' seeds on a task, under a protocol with its settings.
 
-    base: the settings that the folder is for, if others follow there.
+    folder: of this run alone, or new. base: the settings that it is for, if others follow there.
     """
     from deconfounded.benchmarks.engine.benchmark import BenchmarkJob
     from deconfounded.benchmarks.engine.job_files import prepare

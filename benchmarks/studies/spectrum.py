@@ -120,7 +120,7 @@ def main() -> None:
         task, weights = envs.get(name), str(ASSETS / "experts" / f"{base}.safetensors")
         settings, own = changed(preset(args.preset, task, args.device), args.set), folder / task.name
         certificate, wanted = runs.certificate(task, weights, own), (*REFERENCES, *EXACT, *methods)
-        made = runs.run(task, settings, wanted, range(args.seeds), own, expert=weights, **options)
+        made = runs.run(task, settings, wanted, range(args.seeds), own / "run", expert=weights, **options)
         results = aggregation.gather(made)
         scores = last_scores(results["methods"])
         last = {method: [*scores[method].values()] for method in scores if method in wanted}

@@ -106,7 +106,7 @@ def measured(task: envs.Task, source: str | None, folder: Path) -> dict[str, flo
     if of := point(task):
         return {name: float(np.mean(of["scores"][name])) for name in LEARNED}
     made = records.of_task(DOCS / "records", task.name) or runs.run(
-        task, preset("default", task, "cpu"), (*REFERENCES, *LEARNED), range(3), folder, expert=source
+        task, preset("default", task, "cpu"), (*REFERENCES, *LEARNED), range(3), folder / "run", expert=source
     )
     methods = aggregation.gather(made)["methods"]
     return {name: float(methods[name]["score_last"]) for name in LEARNED}

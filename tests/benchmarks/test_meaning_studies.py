@@ -20,7 +20,7 @@ from deconfounded.benchmarks.engine.context import EVALUATION, Context, stream
 from deconfounded.benchmarks.engine.presets import preset
 from deconfounded.benchmarks.engine.published import RECORDS
 from deconfounded.benchmarks.output import records
-from deconfounded.benchmarks.studies import exploration, validate
+from deconfounded.benchmarks.studies import exploration, spectrum, validate
 from deconfounded.benchmarks.studies.foreign import measure as foreign
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.diagnosis import exploration as explorers
@@ -149,6 +149,32 @@ def test_a_row_of_a_validation_is_of_its_case(tmp_path: Path, monkeypatch: pytes
     validate.main()
     (row,) = rows
     assert (row["case"], row["predicted"], row["measured"], row["right"]) == ("curling", 0.4, 0.25, True)
+
+
+@pytest.mark.parametrize(
+    ("study", "task"), [(validate, "NothingHidden"), (spectrum, "tilted_cartpole")], ids=["validate", "spectrum"]
+)
+def test_runs_of_a_study_begin_beside_what_else_it_makes(
+    study: Any, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Data, a diagnosis and a certificate of the same task lie in its folder."""
+
+    def data(task: envs.Task, source: str | None, folder: Path) -> tuple[Path, Path]:
+        made = folder / "expert.npz", folder / "explored.npz"
+        for file in made:
+            file.touch()
+        return made
+
+    def stop(*_: Any) -> None:
+        raise Stopped
+
+    monkeypatch.setattr(validate, "data", data)
+    monkeypatch.setattr(diagnose, "run", lambda *given: (given[4].mkdir(), (diagnosis("cannot tell", None), ""))[1])
+    monkeypatch.setattr(certify, "certify", lambda *_: {"verdict": "failed"})
+    monkeypatch.setattr(scheduler, "run_all", stop)
+    monkeypatch.setattr("sys.argv", ["study", "--tasks", task, "--out", str(tmp_path / "out")])
+    with pytest.raises(Stopped):
+        study.main()
 
 
 @pytest.mark.parametrize(
