@@ -61,6 +61,14 @@ def test_score(share: float, score: float) -> None:
     )
 
 
+def test_a_score_is_of_the_way_from_each_right_trajectory() -> None:
+    """Wherever these go, each elsewhere: half of the way to where a wrong latent leads is 3 / 4, to .05."""
+    courses = 0.5 * walks(2000, 9) + 3
+    right, *repeats, paths, wrong = (courses + lines(2000, seed) for seed in range(5))
+    half = paths + 0.5 * FIRST
+    assert paired_score(half, wrong + FIRST, right, (repeats[0], repeats[1])) == pytest.approx(0.75, abs=0.05)
+
+
 @pytest.mark.parametrize("unit", [1e6, 1e-6, 1e-9])
 def test_units_of_observations_do_not_matter(unit: float) -> None:
     """A course in kilometres or nanometres: the same score, and the same deviation of the mean square."""
