@@ -62,11 +62,14 @@ def test_score(share: float, score: float) -> None:
 
 
 def test_a_score_is_of_the_way_from_each_right_trajectory() -> None:
-    """Wherever these go, each elsewhere: half of the way to where a wrong latent leads is 3 / 4, to .05."""
-    courses = 0.5 * walks(2000, 9) + 3
+    """Wherever these go, each elsewhere: half of the way to where a wrong latent leads is 3 / 4, to .07, the whole 0."""
+    courses = walks(2000, 9)
     right, *repeats, paths, wrong = (courses + lines(2000, seed) for seed in range(5))
-    half = paths + 0.5 * FIRST
-    assert paired_score(half, wrong + FIRST, right, (repeats[0], repeats[1])) == pytest.approx(0.75, abs=0.05)
+    scores = [
+        paired_score(x, wrong + 0.5 * FIRST, right, (repeats[0], repeats[1]))
+        for x in (paths + 0.25 * FIRST, paths + 0.5 * FIRST)
+    ]
+    assert scores == pytest.approx([0.75, 0], abs=0.07)
 
 
 @pytest.mark.parametrize("unit", [1e6, 1e-6, 1e-9])
