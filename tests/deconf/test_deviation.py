@@ -62,7 +62,7 @@ def test_score(share: float, score: float) -> None:
 
 
 def test_a_score_is_of_the_way_from_each_right_trajectory() -> None:
-    """Wherever these go, each elsewhere: half of the way to where a wrong latent leads is 3 / 4, to .07, the whole 0."""
+    """Wherever these go, each elsewhere: half of the way to where wrong latents lead is 3 / 4, to .07, all of it 0."""
     courses = walks(2000, 9)
     right, *repeats, paths, wrong = (courses + lines(2000, seed) for seed in range(5))
     scores = [
