@@ -366,6 +366,15 @@ class TestLearnedEnv:
         assert torch.equal(paths[0], paths[2])
         assert (paths[0] != paths[1]).all()
 
+    def test_episodes_start_where_the_expert_s_do(self) -> None:
+        """Each where one of its trials starts, of all of them."""
+        expert = Batch.of(world(0.2, True, 24, 0), 1)
+        make: Any = LearnedEnv
+        env = make(Noisy(), expert, [expert], 2, 5, None)
+        starts = {float(start) for obs in env.starts for start in obs.ravel()}
+        assert starts <= {*expert.obs[0, :, 0, 0].tolist()}
+        assert len(starts) > 2
+
     def test_errors_of_actions_are_in_units_of_what_latents_do(self) -> None:
         """Of what two latents differ by on average, .2 here; more than that is 1."""
         signature = SimpleNamespace(policy=SimpleNamespace(signature=SimpleNamespace(actions=0)), theta_hat=None)
