@@ -60,6 +60,29 @@ def test_what_the_world_tells_beyond_its_mean_motion(kind: Kind, says: str) -> N
     assert says in doubt
 
 
+def beside(trials: Trials, seed: int) -> Trials:
+    """With an observation and an action more, of noise."""
+    rng = np.random.default_rng(seed)
+    obs, action = (np.concatenate([x, rng.uniform(-0.5, 0.5, x.shape)], -1) for x in (trials.obs, trials.action))
+    return Trials(obs, action, trials.mask)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("kind", "explores", "theta", "says"),
+    [
+        ("spread", True, None, "how much a step varies"),
+        ("cliff", True, None, "where their episodes end"),
+        ("drift", True, 0.3, "under one condition alone"),
+        ("drift", False, None, "seems to see what is hidden"),
+    ],
+)
+def test_one_column_of_two_is_enough(kind: Kind, explores: bool, theta: float | None, says: str) -> None:
+    explored = thetas(kind, 96, 1) if theta is None else np.full(96, theta)
+    explore = beside(roll(kind, explored, not explores, 1), 0)
+    assert says in " ".join(doubts.doubts(beside(roll(kind, thetas(kind, 160, 0), True, 0), 1), explore))
+
+
 @pytest.mark.slow
 def test_episodes_that_a_log_lacks_end_nowhere() -> None:
     """Ends are compared between the first and the last of three episodes, if there is no second one."""
