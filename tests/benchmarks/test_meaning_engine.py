@@ -130,13 +130,18 @@ def test_a_failed_job_s_checkpoint_stays(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 class Noting(Here):
-    """It notes the methods whose jobs it runs."""
+    """It notes the jobs that it runs."""
 
     def __init__(self) -> None:
-        self.ran: list[str] = []
+        self.jobs: list[Any] = []
+
+    @property
+    def ran(self) -> list[str]:
+        """Their methods."""
+        return [job.method for job in self.jobs]
 
     def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
-        self.ran += [job.method for job in jobs]
+        self.jobs += jobs
         super().run(jobs, tick, say)
 
 
@@ -147,24 +152,19 @@ def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
     assert scheduler.run_all(made, "cpu", "first", engine)[1] == 0
     assert engine.ran == ["random", "demonstrations", "blind_bc"]
     made[0].file(0).unlink()
-    engine.ran.clear()
+    engine.jobs.clear()
     assert scheduler.run_all(made, "cpu", "again", engine)[1] == 1  # there before
     assert engine.ran == ["blind_bc"]
 
 
 def test_demonstrations_are_made_for_seeds_that_imitate(tmp_path: Path) -> None:
     """Once, before them; not for the seeds of methods that imitate nothing."""
-    seeds = {"blind_bc": (1,), "oracle_bc": (1, 2), "random": (0, 1)}
-    made = [BenchmarkJob("bandit", tiny_preset(), name, of, tmp_path) for name, of in seeds.items()]
-    ran: list[tuple[str, tuple[int, ...]]] = []
-
-    class NotingSeeds(Here):
-        def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
-            ran.extend((job.method, job.seeds) for job in jobs)
-
-    scheduler.run_all(made, "cpu", "", NotingSeeds())
-    assert sorted(of for name, of in ran if name == "demonstrations") == [(1,), (2,)]
-    assert {name for name, _ in ran[:3]} == {"demonstrations", "random"}
+    wanted = {"blind_bc": (1,), "oracle_bc": (1, 2), "random": (0, 1)}
+    made = [BenchmarkJob("bandit", tiny_preset(), name, seeds, tmp_path) for name, seeds in wanted.items()]
+    engine = Noting()
+    scheduler.run_all(made, "cpu", "", engine)
+    assert sorted(job.seeds for job in engine.jobs if job.method == "demonstrations") == [(1,), (2,)]
+    assert {*engine.ran[:3]} == {"demonstrations", "random"}
 
 
 def test_long_jobs_come_first(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Parts of a diagnosis by what they mean: what a figure is of, and which of two explanations is believed."""
 
 from dataclasses import replace
+from itertools import cycle
 from types import SimpleNamespace
 from typing import Any
 
@@ -109,7 +110,7 @@ def test_clones_are_trained_without_the_trials_that_judge_them(monkeypatch: pyte
 def test_a_latent_and_a_memory_are_compared_at_the_same_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those from which the latent is not inferred: every other one, where the memory has 3 nats, of 0 at the rest."""
     remembered = 3.0 * (torch.arange(10) % 2).expand(1, 6, 10)
-    best = iter((SimpleNamespace(log_prob=torch.zeros(1, 6, 10)), SimpleNamespace(log_prob=remembered)))
+    best = cycle((SimpleNamespace(log_prob=torch.zeros(1, 6, 10)), SimpleNamespace(log_prob=remembered)))
     monkeypatch.setattr(measures, "BestMonitor", lambda *rest: SimpleNamespace(best=next(best)))
     for method in (memoryless_bc, naive_rnn):
         monkeypatch.setattr(method, "train", lambda *rest, **named: SimpleNamespace(scales=SimpleNamespace(obs=None)))
@@ -119,11 +120,8 @@ def test_a_latent_and_a_memory_are_compared_at_the_same_steps(monkeypatch: pytes
     monkeypatch.setattr(measures, "_rollouts", lambda *rest: (1.0,) * 8)
     rng = np.random.default_rng(0)
     trials = Trials(rng.normal(size=(24, 1, 11, 1)), rng.uniform(-1, 1, (24, 1, 10, 1)), np.ones((24, 1, 10)))
-    found = measures.measure(trials, trials, Amounts(), rng)
-    assert (found.memory_gain, found.latent_gain, found.over_memory) == (1.5, 9.0, -1.0)
-    monkeypatch.setattr(
-        measures, "BestMonitor", lambda *rest: SimpleNamespace(best=SimpleNamespace(log_prob=remembered))
-    )
+    findings = measures.measure(trials, trials, Amounts(), rng)
+    assert (findings.memory_gain, findings.latent_gain, findings.over_memory) == (1.5, 9.0, -1.0)
     monkeypatch.setattr(latent, "from_expert_trials", lambda *rest: explanation._replace(log_likelihood=None))
     assert measures.measure(trials, None, Amounts(), rng).over_memory is None
 
