@@ -3,21 +3,25 @@
 import contextlib
 import io
 import os
+import shutil
 import signal
 import sys
 import threading
 import time
 import traceback
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from deconfounded.deconf.core.monitor import Monitor
+from deconfounded.deconf.wall import METHOD_FILE
 from deconfounded.deconf.wire import pack
 from deconfounded.envs.support.errors import InputError, error_line
 from deconfounded.experts.agent import Agent
 
+MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
 RETURNING = ("act", "features")  # calls whose result is sent back
 
 
@@ -101,22 +105,44 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
         send("failed", error_line(error), "".join(traceback.format_exception(error)))
 
 
-def _end_with_parent() -> None:
-    """End with the parent, when standard input closes. It is read without Python's locks, which forks inherit."""
+def kill_marked(mark: str) -> None:
+    """End what processes of a guest are left, in whatever session, but for this one, where the system lists them."""
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            marked = f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0")
+            if marked and int(folder.name) != os.getpid():
+                os.kill(int(folder.name), signal.SIGKILL)
+
+
+def _end_with_parent(folder: str, mark: str) -> None:
+    """End with the parent, when standard input closes, and leave nothing: a parent that was killed does not clean up.
+
+    The input is read without Python's locks, which forks inherit.
+    """
     while os.read(0, 1):
         pass
+    kill_marked(mark)
+    shutil.rmtree(folder, ignore_errors=True)
     if hasattr(os, "killpg"):
         os.killpg(0, signal.SIGKILL)  # this process leads a session
     os._exit(1)
 
 
 def main() -> None:
-    """Serve the requests of the run that started this process, over the connection that the argument numbers."""
+    """Serve the requests of the run that started this process.
+
+    Arguments: a folder, which is removed in the end, and the number of the connection.
+    """
     os.set_inheritable(number := int(sys.argv.pop()), False)  # else what the method starts would keep it open
     sys.stdin = io.StringIO()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end = threading.Thread(target=_end_with_parent, args=(sys.argv.pop(), os.environ[MARK]), daemon=True)
+    end.start()
     with contextlib.suppress(AttributeError):  # characters that the output's encoding lacks are escaped
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
-    with Connection(number) as channel:
-        reference, sys.path[:] = channel.recv()
-        live(reference, channel, channel.recv())
+    try:
+        with Connection(number) as channel:
+            reference, sys.path[:] = channel.recv()
+            os.environ[METHOD_FILE] = reference.rpartition(":")[0]
+            live(reference, channel, channel.recv())
+    finally:
+        end.join()  # which ends this process

@@ -1,16 +1,18 @@
-"""The process of a method from outside, which engine/guest_host.py starts: `python -m deconfounded.deconf.wall FD`.
+"""The process of a method from outside: `python -m deconfounded.deconf.wall FOLDER FD`, by engine/guest_host.py.
 
 It holds no tasks, experts, benchmarks or simulators, and refuses to import them. This prevents accidental leakage and
 simple attacks, not all: the process has the rights of its user.
 """
 
+import os
 import sys
 from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-PACKAGE = "deconfounded"
+PACKAGE, METHOD_FILE = "deconfounded", "DECONFOUNDED_METHOD"
 OPEN = tuple(f"{PACKAGE}.envs.{name}" for name in ("support", "streams"))
 CLOSED = (
     *(f"{PACKAGE}.{name}" for name in ("envs", "benchmarks", "deconf.exact")),
@@ -37,6 +39,20 @@ class Wall(MetaPathFinder):
             raise _refusal(fullname)
 
 
+class MethodFinder(MetaPathFinder):
+    """Finds the method's own module, by the name that `outside` gave it, in processes that the method starts.
+
+    The environment variable METHOD_FILE is its file.
+    """
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        from deconfounded.envs.support import outside  # which is open
+
+        if not fullname.startswith(outside.PREFIX):
+            return None
+        return outside.plugin_spec(fullname, outside.here(Path(os.environ[METHOD_FILE])))
+
+
 class ClosedPackage(ModuleType):
     """The package of environments without its contents; its open modules can be imported."""
 
@@ -52,11 +68,12 @@ def refuse_imports() -> None:
     package = ClosedPackage(name)
     package.__path__ = [str(Path(__file__).resolve().parents[1] / "envs")]
     sys.modules[name] = package
-    sys.meta_path.insert(0, Wall())
+    sys.meta_path[:] = [Wall(), *sys.meta_path, MethodFinder()]
 
 
-if __name__ == "__main__":
+if __name__ in ("__main__", "__mp_main__"):  # the latter where the method starts processes with multiprocessing
     refuse_imports()  # before anything else of this package is imported
+if __name__ == "__main__":
     from deconfounded.deconf.guest import main
 
     main()

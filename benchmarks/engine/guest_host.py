@@ -9,9 +9,11 @@ import hashlib
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Sequence
 from multiprocessing import Pipe
 from pathlib import Path
@@ -25,26 +27,17 @@ from deconfounded import envs
 from deconfounded.benchmarks.engine.context import GUEST, Context, stream
 from deconfounded.benchmarks.engine.provider import Provider
 from deconfounded.deconf.given import Given
+from deconfounded.deconf.guest import MARK, kill_marked
 from deconfounded.deconf.method import Method
 from deconfounded.deconf.wire import unpack
 from deconfounded.envs.support import outside
 from deconfounded.envs.task import Array
 from deconfounded.experts.agent import Agent, AgentWrapper
 
-MARK = "DECONFOUNDED_GUEST"  # environment variable of a guest's processes
-
 
 def _environ(mark: str) -> dict[str, str]:
     """The environment of a guest: this package is found in any folder, and its processes carry a mark."""
     return {**os.environ, "PYTHONPATH": str(Path(deconfounded.__file__).parents[1]), MARK: mark}
-
-
-def _kill_marked(mark: str) -> None:
-    """End what processes of a guest are left, in whatever session, where the system lists them."""
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            if f"{MARK}={mark}".encode() in (folder / "environ").read_bytes().split(b"\0"):
-                os.kill(int(folder.name), signal.SIGKILL)
 
 
 class Guest(Agent):
@@ -58,13 +51,14 @@ class Guest(Agent):
         self.channel, theirs = Pipe()  # no named socket: these fail where the path of temporary files is long
         with theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "deconfounded.deconf.wall", str(theirs.fileno())],
+                [sys.executable, "-m", "deconfounded.deconf.wall", self.folder.name, str(theirs.fileno())],
                 cwd=self.folder.name,
                 env=_environ(self.mark),
                 stdin=subprocess.PIPE,  # which nothing is written to: it closes when this process ends
                 start_new_session=True,
                 pass_fds=[theirs.fileno()],
             )
+        threading.Thread(target=self._disconnect, args=(os.dup(self.channel.fileno()),), daemon=True).start()
         path = [str(Path(entry).resolve()) for entry in sys.path if entry not in outside.FOLDERS]  # of others
         config, rng = context.preset.configs.get(name, {}), stream(GUEST, context.seeds[0], context.salt)
         try:
@@ -75,6 +69,12 @@ class Guest(Agent):
         except BaseException:
             self.close()
             raise
+
+    def _disconnect(self, channel: int) -> None:
+        """End the connection when its process has ended: a child that it forked may still hold the other end open."""
+        self.process.wait()
+        with socket.socket(fileno=channel) as ours, contextlib.suppress(OSError):  # it is over already
+            ours.shutdown(socket.SHUT_RDWR)
 
     def _hear(self) -> list[Any]:
         """What it says next: never unpickled, since that would run its code here."""
@@ -194,7 +194,7 @@ class Guest(Agent):
             self.process.wait()
         with contextlib.suppress(OSError, AttributeError):  # gone already; or a system without process groups
             os.killpg(self.process.pid, signal.SIGKILL)
-        _kill_marked(self.mark)
+        kill_marked(self.mark)
         self.folder.cleanup()
 
 

@@ -14,12 +14,11 @@ import numpy as np
 import torch
 
 from deconfounded import __version__, envs
-from deconfounded.benchmarks.engine import job_files
+from deconfounded.benchmarks.engine import job_files, progress
 from deconfounded.benchmarks.engine.catalogue import METHODS, Method, label
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.identity import commit, identity, machine
 from deconfounded.benchmarks.engine.presets import Preset
-from deconfounded.benchmarks.engine.progress import tick
 from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.sources import last_edit
 from deconfounded.deconf.core.monitor import Monitor, Training
@@ -98,7 +97,8 @@ class Job(ABC):
         budget = {kind: each[i] for kind, each in monitor.budget.items()}
         cpu = round(monitor.cpu() / len(self.seeds), 2)
         if monitor.identity != identity(self):
-            raise envs.InputError(f"files that {self.method} is made of were edited while it ran; run it again")
+            files = "its code, or a file beside it that the code names, where no run may write"
+            raise envs.InputError(f"{self.method} is made of files that changed while it ran ({files}); run it again")
         version = commit()
         if monitor.last_edit != last_edit() and version:  # not the code of that commit alone
             version = f"{version.rstrip('+')}+"
@@ -152,7 +152,7 @@ class DemonstrationJob(Job):
     def run(self) -> str:
         start = time.time()
         trials = self.context().demonstrations
-        tick(self.ticks)
+        progress.tick(self.ticks)
         return f"{len(trials)} expert trials in {time.time() - start:.0f} s"
 
 
@@ -187,7 +187,8 @@ class JobMonitor(Monitor):
 
     def _tell(self, share: float) -> None:
         if (now := int(self.ticks * share)) > self.ticked:
-            tick(now - self.ticked)
+            settle = progress.skip if self.before and not self.ticked else progress.tick
+            settle(now - self.ticked)
             self.ticked = now
 
     def update(self, done: int, total: int, losses: dict[str, float], agent: Agent | None = None) -> None:

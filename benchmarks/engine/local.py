@@ -83,11 +83,11 @@ class Local(Engine):
             arguments = self._ticks, {*outside.FOLDERS}
             self._executor = ProcessPoolExecutor(cores(), self._context, start_worker, arguments)
         with self._ended():
+            self._pass_on(lambda late: None)  # of the jobs before
             with inherited():
                 futures = {self._executor.submit(run_job, job): job for job in jobs}
             while futures:
-                while not self._ticks.empty():
-                    tick(self._ticks.get())
+                self._pass_on(tick)
                 for future in [future for future in futures if future.done()]:
                     job = futures.pop(future)
                     try:
@@ -95,6 +95,11 @@ class Local(Engine):
                     except envs.InputError as error:
                         say(job, error)
                 time.sleep(0.1)
+        self._pass_on(tick)
+
+    def _pass_on(self, tick: Callable[[int], None]) -> None:
+        while not self._ticks.empty():
+            tick(self._ticks.get())
 
     @contextmanager
     def _ended(self) -> Iterator[None]:

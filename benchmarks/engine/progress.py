@@ -20,7 +20,12 @@ class Progress:
             self._bar = tqdm(total=total, desc=label, file=sys.stderr, leave=False, bar_format=BAR)
 
     def update(self, n: int, note: str = "") -> None:
-        """n more are done."""
+        """n more are done; if it is negative, so many fewer are to be done."""
+        if n < 0:
+            self.total += n
+            if self._bar is not None:
+                self._bar.total = self.total
+            return
         self.done += n
         if self._bar is not None:
             self._bar.set_postfix_str(note, refresh=False)
@@ -48,6 +53,7 @@ class Ticks(Protocol):
 
 
 _ticks: Ticks  # of this worker process
+_settled = 0  # ticks of the job in this process, done or not to be done
 
 
 def tell(ticks: Ticks) -> None:
@@ -56,6 +62,26 @@ def tell(ticks: Ticks) -> None:
     _ticks = ticks
 
 
+def begin() -> None:
+    """A job begins in this process."""
+    global _settled
+    _settled = 0
+
+
 def tick(ticks: int) -> None:
     """Work in this process has come so much further."""
+    global _settled
+    _settled += ticks
     _ticks.put(ticks)
+
+
+def skip(ticks: int) -> None:
+    """So much of the work is not to be done: an interrupted run did it."""
+    global _settled
+    _settled += ticks
+    _ticks.put(-ticks)
+
+
+def give_up(ticks: int) -> None:
+    """The job in this process, of so many ticks, ends here."""
+    skip(max(ticks - _settled, 0))

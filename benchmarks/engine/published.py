@@ -35,5 +35,5 @@ def tasks(asked: list[str]) -> list[envs.Task]:
     for each in asked:
         if each not in (choices := [*envs.names(), *groups]) and not outside.is_outside(each):
             raise envs.closest("task", each, choices, "; your own is path/file.py:Class")
-    names = [name for each in asked for name in (groups[each]() if each in groups else [each])]
+    names = [outside.absolute(name) for each in asked for name in (groups[each]() if each in groups else [each])]
     return [envs.get(name) for name in dict.fromkeys(names)]

@@ -1,5 +1,6 @@
 """Jobs side by side on an engine: those whose files are missing or stale, longest first."""
 
+import itertools
 import re
 import traceback
 from abc import ABC, abstractmethod
@@ -10,8 +11,8 @@ from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
-from deconfounded.benchmarks.engine import catalogue
-from deconfounded.benchmarks.engine.catalogue import METHODS, Method
+from deconfounded.benchmarks.engine import catalogue, progress
+from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.job_files import Finished, in_name
 from deconfounded.benchmarks.engine.jobs import DemonstrationJob, Job
 from deconfounded.benchmarks.engine.progress import Progress
@@ -37,6 +38,16 @@ Some = TypeVar("Some", bound=Work)
 
 
 def run_job(job: Work) -> str:
+    """The job's line. Raises InputError as `_run` does; no ticks of the job are left then."""
+    progress.begin()
+    try:
+        return _run(job)
+    except InputError:
+        progress.give_up(job.ticks)
+        raise
+
+
+def _run(job: Work) -> str:
     """The job's line. Raises InputError for SystemExit, which would end the process, and where memory is exhausted.
 
     Of a task or method from outside, any other error is an InputError too, with the traceback as its note.
@@ -106,7 +117,7 @@ def run_all(
     parts = [
         replace(job, seeds=part)
         for job, missing in zip(every, left, strict=True)
-        for part in groups(job.about, missing, engine.slots(device))
+        for part in groups(job, missing, engine.slots(device))
     ]
     ours = [job for job in parts if "demonstrations" in job.about.uses and job.guest is None]
     imitated = {seed: job for job in ours for seed in job.seeds}
@@ -126,6 +137,10 @@ def run_all(
         for stale in folder.glob(f".{job.method}-*.pt"):  # of groups that this command made otherwise
             stale.unlink()
     finished = results(written(every[0], folder), say=True)
+    there = {(method, seed) for method, seed, _ in finished}
+    lost = [job.file(seed).name for job in every for seed in job.seeds if (job.method, seed) not in there]
+    if lost and not failed:
+        failed.append(InputError(f"{', '.join(lost)}: left out, as said above; run it again with --resume"))
     made = {(job.method, seed) for job, missing in zip(every, left, strict=True) for seed in missing}
     return finished, sum((method, seed) not in made for method, seed, _ in finished), failed
 
@@ -151,11 +166,20 @@ def written(like: Job, folder: Path) -> list[Job]:
     return [replace(like, method=name, seeds=(seed,), guest=catalogue.guest(name)) for name, seed in pairs]
 
 
-def groups(method: Method, left: list[int], slots: int) -> list[tuple[int, ...]]:
-    """Seeds to run side by side: as many groups as there are slots; references and guests share nothing."""
-    alone = not method.learned or method.reference
-    n = len(left) if alone else min(slots, len(left))
-    return [tuple(part.tolist()) for part in np.array_split(left, n)] if left else []
+def groups(job: Job, left: list[int], slots: int) -> list[tuple[int, ...]]:
+    """Seeds to run side by side: as many groups as there are slots; references and guests share nothing.
+
+    Groups that were begun stay as they are, since a checkpoint is of all seeds of a group.
+    """
+    if not job.about.learned or job.about.reference:
+        return [(seed,) for seed in left]
+    begun, rest = list[tuple[int, ...]](), [*left]
+    for part in (tuple(left[start:end]) for start, end in itertools.combinations(range(len(left) + 1), 2)):
+        if {*part} <= {*rest} and replace(job, seeds=part).checkpoint.exists():
+            begun.append(part)
+            rest = [seed for seed in rest if seed not in part]
+    n = min(max(slots - len(begun), 1), len(rest))
+    return begun + [tuple(part.tolist()) for part in np.array_split(rest, n)] if rest else begun
 
 
 def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None = None) -> list[Exception]:
@@ -165,7 +189,7 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
     """
     if not jobs:
         return []
-    progress, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
+    bar, failed = Progress(sum(job.ticks for job in jobs), label), list[Exception]()
 
     def say(job: Some, outcome: str | Exception) -> None:
         name, file = f"{job.method}, {listed(job.seeds)}", errors and errors / f"{job.method}-{in_name(job.seeds)}.txt"
@@ -181,10 +205,10 @@ def run_jobs(jobs: list[Some], label: str, run: Run[Some], errors: Path | None =
                 check_folder(file.parent)
                 write_atomically(file, "\n".join(traces))
                 outcome += f"; its traceback: {file}"
-        progress.line(f"{name}: {outcome}")
+        bar.line(f"{name}: {outcome}")
 
-    run(sorted(jobs, key=lambda job: -job.ticks), progress.update, say)
-    progress.close()
+    run(sorted(jobs, key=lambda job: -job.ticks), bar.update, say)
+    bar.close()
     return failed
 
 

@@ -112,18 +112,23 @@ def mjcf(*files: Path) -> set[Path]:
 
 
 @cache
-def _named(file: Path, changed: int) -> tuple[Path, ...]:
-    """Files other than Python's that a Python file names, beside it or in a folder there; `changed` as above."""
+def _names(file: Path, changed: int) -> tuple[str, ...]:
+    """Texts in a Python file that may be names of files other than Python's; `changed` as above."""
     texts = (node.value for node in ast.walk(ast.parse(file.read_bytes(), str(file))) if isinstance(node, ast.Constant))
-    names = [text for text in texts if isinstance(text, str) and FILE_NAME.fullmatch(text)]
-    places = (folder / name for name in names for folder in (file.parent, *file.parent.glob("*/")))
-    return tuple(place for place in places if place.suffix != ".py" and place.is_file())
+    names = {text for text in texts if isinstance(text, str) and FILE_NAME.fullmatch(text)}
+    return tuple(sorted(name for name in names if not name.endswith(".py")))
 
 
 def with_data(files: set[Path]) -> set[Path]:
-    """Python files, and the files beside them that they name: weights, tables, MJCF and what it names."""
-    named = [data for file in files for data in _named(file, file.stat().st_mtime_ns)]
-    return files | mjcf(*named)
+    """Python files, and the files beside them, or in a folder there, that they name: weights, tables, MJCF."""
+    named = {
+        folder / name
+        for file in files
+        if (names := _names(file, file.stat().st_mtime_ns))
+        for folder in (file.parent, *file.parent.glob("*/"))
+        for name in names
+    }
+    return files | mjcf(*(place for place in named if os.path.isfile(place)))  # also of names that no file can have
 
 
 def of_task(task: envs.Task) -> set[Path]:

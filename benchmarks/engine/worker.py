@@ -107,7 +107,7 @@ class Courier:
         threading.Thread(target=self._go, daemon=True).start()
 
     def put(self, ticks: int) -> None:
-        self.ticks += ticks
+        self.ticks += max(ticks, 0)  # what is not to be done is settled when the job has ended
 
     def _go(self) -> None:
         while not self.over.wait(EVERY_S):

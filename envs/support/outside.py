@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Iterator, Set
 from contextlib import contextmanager, nullcontext
-from importlib.machinery import SourceFileLoader
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -177,16 +177,20 @@ def _put_on_path(folder: str) -> None:
         FOLDERS.add(folder)
 
 
+def plugin_spec(name: str, path: Path) -> ModuleSpec:
+    """How to import a plug-in file as the module of that name."""
+    made = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
+    assert made is not None
+    return made
+
+
 def _run(path: Path) -> ModuleType:
     name = _module_name(path)
     if name not in sys.modules:
-        spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
+        module = importlib.util.module_from_spec(made := plugin_spec(name, path))
         sys.modules[name] = module
         try:
-            spec.loader.exec_module(module)
+            made.loader.exec_module(module)  # type: ignore[union-attr]
         except BaseException:
             del sys.modules[name]
             raise

@@ -305,7 +305,7 @@ def test_an_edit_during_a_run_is_noticed(tmp_path: Path, monkeypatch: pytest.Mon
         return evaluate(*given)
 
     monkeypatch.setattr(benchmark, "evaluate", edit)
-    with pytest.raises(envs.InputError, match=r"^files that random is made of were edited while it ran; run it again$"):
+    with pytest.raises(envs.InputError, match=r"^random is made of files that changed while it ran .*; run it again$"):
         job.run()
     assert not job.file(0).exists()
 

@@ -2,7 +2,9 @@
 
 import os
 import queue
+import shutil
 import signal
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,13 +16,15 @@ import pytest
 from deconfounded import envs
 from deconfounded.benchmarks import certify
 from deconfounded.benchmarks.console import run_command
-from deconfounded.benchmarks.engine import jobs, progress, provider, scheduler
+from deconfounded.benchmarks.engine import jobs, progress, provider, published, scheduler
 from deconfounded.benchmarks.engine.benchmark import BenchmarkJob, CurveMonitor
 from deconfounded.benchmarks.engine.catalogue import METHODS
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.local import Here, Local
 from deconfounded.benchmarks.engine.presets import preset
+from deconfounded.deconf.methods import references
 from deconfounded.envs import registry
+from tests import toys
 from tests.tools import tiny_preset
 
 
@@ -157,6 +161,23 @@ def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
     assert engine.ran == ["blind_bc"]
 
 
+def test_a_result_that_fits_no_more_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What it was made of changed when it was done and others were not: no table has it, and the command fails."""
+
+    class Edited(Here):
+        def run(self, jobs: list[Any], tick: Any, say: Any) -> None:
+            super().run(jobs, tick, say)
+            monkeypatch.setattr(references.random, "method", replace(METHODS["random"], version=9))
+
+    job = BenchmarkJob("bandit", tiny_preset(), "random", (0,), tmp_path)
+    finished, _, failed = scheduler.run_all([job], "cpu", "edited", Edited())
+    assert finished == []
+    assert [str(error) for error in failed] == ["random-0.npz: left out, as said above; run it again with --resume"]
+    assert "random-0.npz is left out: it differs in its method_version (was 1, is 9)" in capsys.readouterr().out
+
+
 def test_demonstrations_are_made_for_seeds_that_imitate(tmp_path: Path) -> None:
     """Once, before them; not for the seeds of methods that imitate nothing."""
     wanted = {"blind_bc": (1,), "oracle_bc": (1, 2), "random": (0, 1)}
@@ -237,13 +258,34 @@ def test_a_log_has_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: 
     assert capsys.readouterr().out == "work:  20%, 24 s left\nwork:  50%, 12 s left\n"
 
 
-def test_seeds_side_by_side() -> None:
+def test_seeds_side_by_side(tmp_path: Path) -> None:
     """As many groups as there are slots; references share nothing, nor does what is from outside."""
-    learned = METHODS["naive_rnn"]
+    learned = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", (), tmp_path)
     assert scheduler.groups(learned, [0, 1, 2, 4, 7], 2) == [(0, 1, 2), (4, 7)]
     assert scheduler.groups(learned, [3], 2) == [(3,)]
-    for alone in (METHODS["random"], replace(learned, reference="mine.py:fit")):
+    assert scheduler.groups(learned, [], 2) == []
+    from_outside = replace(learned, guest=replace(learned.about, reference="mine.py:fit"))
+    for alone in (replace(learned, method="random"), from_outside):
         assert scheduler.groups(alone, [0, 1, 2], 2) == [(0,), (1,), (2,)]
+
+
+@pytest.mark.parametrize(
+    ("begun", "left", "slots", "groups"),
+    [
+        ((0, 1), [0, 1], 2, [(0, 1)]),  # seed 2 was done before the interrupt
+        ((3, 4), [0, 1, 2, 3, 4], 3, [(3, 4), (0, 1), (2,)]),
+        ((0, 1, 2), [0, 1, 2, 3], 1, [(0, 1, 2), (3,)]),
+        ((0, 1), [1, 2], 1, [(1, 2)]),  # seed 0 has a file: the checkpoint is of no use
+        (tuple(range(12)), list(range(13)), 2, [tuple(range(12)), (12,)]),
+    ],
+)
+def test_groups_that_were_begun_go_on(
+    begun: tuple[int, ...], left: list[int], slots: int, groups: list[tuple[int, ...]], tmp_path: Path
+) -> None:
+    job = BenchmarkJob("bandit", tiny_preset(), "naive_rnn", begun, tmp_path)
+    job.checkpoint.touch()
+    replace(job, method="blind_bc", seeds=(0,)).checkpoint.touch()  # of another
+    assert scheduler.groups(job, left, slots) == groups
 
 
 @pytest.mark.parametrize(
@@ -286,6 +328,65 @@ def test_progress_of_a_training_is_its_share_of_the_job(tmp_path: Path, monkeypa
         assert sum(ticks.queue) == pytest.approx(sum_of_ticks * job.ticks, abs=1)
     monitor.close()
     assert sum(ticks.queue) == job.ticks
+    resumed = jobs.JobMonitor(job, 0.8)
+    resumed.before = [(0.0, 60.0)]
+    ticks.queue.clear()
+    resumed.update(1, 2, {})
+    resumed.close()
+    assert [*ticks.queue] == pytest.approx([-0.4 * job.ticks, 0.6 * job.ticks], abs=1)
+
+
+def test_what_is_not_to_be_done_takes_no_time(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """4 of 8 were done by an interrupted run: of the others, 1 took 10 s."""
+    monkeypatch.setattr(progress.time, "monotonic", iter([0.0, 10.0, 10.0]).__next__)
+    bar = progress.Progress(8, "work", every_s=5)
+    bar.update(-4)
+    bar.update(1)
+    assert capsys.readouterr().out == "work:  25%, 30 s left\n"
+
+
+def test_a_failed_job_leaves_no_ticks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it failed in the middle or at once, after another."""
+    ticks: queue.Queue[int] = queue.Queue()
+    monkeypatch.setattr(progress, "_ticks", ticks, raising=False)
+
+    class Broken(jobs.Job):
+        done = 30
+
+        def run(self) -> str:
+            progress.tick(self.done)
+            raise envs.InputError("it broke")
+
+    job = Broken("bandit", tiny_preset(), "random", (0,), tmp_path)
+    for Broken.done in (30, 0):
+        with pytest.raises(envs.InputError, match="it broke"):
+            scheduler.run_job(job)
+    assert [*ticks.queue] == [30, 30 - job.ticks, 0, -job.ticks]
+
+
+def test_ticks_are_of_the_jobs_that_run(tmp_path: Path) -> None:
+    """What comes late is not counted for the jobs after; what comes with the last outcome is counted."""
+    engine, counted = Local(), list[int]()
+    engine._ticks = queue.SimpleQueue()  # type: ignore[assignment]
+    engine._ticks.put(5)
+    (future := Future[str]()).set_result("well")
+    engine._executor = Mock(submit=lambda *_: future)
+    engine.run(
+        [Failing("bandit", tiny_preset(), "random", (0,), tmp_path)],
+        counted.append,
+        lambda *_: engine._ticks.put(7),
+    )
+    assert counted == [7]
+
+
+def test_a_task_by_two_paths_is_one_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copy(Path(toys.__file__), tmp_path / "mine.py")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    paths = ("mine.py", "./mine.py", f"{tmp_path}/mine.py")
+    assert [task.name for task in published.tasks([f"{path}:Push" for path in paths])] == ["push"]
 
 
 def test_numbers_of_trials_that_a_method_asks_for() -> None:

@@ -9,6 +9,8 @@ import json
 import os
 import queue
 import re
+import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -512,6 +514,24 @@ def test_a_stubborn_guest_goes(tmp_path: Path) -> None:
     _, agent = guest(tmp_path, text)
     agent.close()
     assert agent.process.poll() is not None
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="/proc lists processes")
+def test_nothing_is_left_of_a_guest_whose_run_is_killed(tmp_path: Path) -> None:
+    """Its standard input closes then: it, what it started in a session of its own, and its folder are gone."""
+    text = "import subprocess\ndef fit(given):\n    open('log.txt', 'w').close()\n"
+    text += "    left = subprocess.Popen(['sleep', '600'], start_new_session=True)\n"
+    text += f"    open({str(tmp_path / 'left')!r}, 'w').write(str(left.pid))\n    return Still()"
+    _, agent = guest(tmp_path, text)
+    sleep, folder = os.pidfd_open(int((tmp_path / "left").read_text())), Path(agent.folder.name)
+    assert (folder / "log.txt").exists()
+    assert agent.process.stdin is not None
+    agent.process.stdin.close()
+    assert agent.process.wait(30) == -signal.SIGKILL
+    assert select.select([sleep], [], [], 30)[0]  # it has ended
+    os.close(sleep)
+    assert not folder.exists()
+    agent.close()
 
 
 class TestWire:

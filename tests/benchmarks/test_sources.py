@@ -123,6 +123,17 @@ def test_data_files_that_code_names_count(tmp_path: Path) -> None:
     assert len({*digests}) == 3
 
 
+def test_data_files_come_and_go(tmp_path: Path) -> None:
+    """Which of them there are is looked up each time; a text that no file can be called by is the name of none."""
+    long = "é" * 190 + ".txt"  # more bytes than a name may have
+    (tmp_path / "mine.py").write_text(f"LOG, LONG = 'log.txt', {long!r}\ndef fit(given): pass\n")
+    named = []
+    for change in (lambda: None, (tmp_path / "log.txt").touch, (tmp_path / "log.txt").unlink):
+        change()
+        named.append({file.name for file in sources.of_reference(f"{tmp_path}/mine.py:fit")})
+    assert named == [{"mine.py"}, {"mine.py", "log.txt"}, {"mine.py"}]
+
+
 def test_whatever_is_read_travels(task: envs.MujocoTask, tmp_path: Path) -> None:
     """To a cluster's worker, where the task is found and compiles, though its folder is gone."""
     pytest.importorskip("ray")

@@ -175,11 +175,33 @@ def test_no_process_is_left(session: bool, tmp_path: Path, monkeypatch: pytest.M
     os.close(process)
 
 
-def test_a_method_may_start_processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers that load its data, say."""
-    steal = """    import multiprocessing
-    with multiprocessing.get_context("fork").Pool(1) as pool:
-        say("sum", pool.apply(sum, ([1, 2],)))
+def test_a_killed_method_is_noticed_while_its_child_lives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that it forked holds the connection open; it is ended, too, before it writes."""
+    steal = """    import multiprocessing, signal, time
+    def write():
+        time.sleep(20)
+        say("late", True)
+    multiprocessing.get_context("fork").Process(target=write).start()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    with pytest.raises(envs.InputError, match="its process was killed"):
+        run(tmp_path, steal, monkeypatch)
+    assert not (tmp_path / "late").exists()
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_a_method_may_start_processes(start: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that load its data, say; they call its own functions, and have no tasks either."""
+    steal = f"""    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+    with ProcessPoolExecutor(1, get_context("{start}")) as pool:
+        say("sum", pool.submit(total, [1, 2]).result())
+
+def total(numbers):
+    try:
+        import deconfounded.envs.task
+    except ImportError:
+        return sum(numbers)
 """
     run(tmp_path, steal, monkeypatch)
     assert (tmp_path / "sum").read_text() == "3"
