@@ -291,3 +291,13 @@ def test_progress_is_sent_with_files_or_without(tmp_path: Path, monkeypatch: pyt
             (tmp_path / "jobs" / ".x-0.pt").write_bytes(content)
         courier._send()
     assert sent == [(3, 2, {}), (3, 6, {"jobs/.x-0.pt": b"a"}), (3, 6, {"jobs/.x-0.pt": b"bc"})]
+
+
+def test_a_seed_s_own_file_is_written_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says that the seed is done: were the command killed before, its agent or its losses would be missing."""
+    written: list[str] = []
+    monkeypatch.setattr(cluster, "write_atomically", lambda file, content: written.append(file.name))
+    job = BenchmarkJob("bandit", tiny_preset(), "blind_bc", (0,), tmp_path / "jobs")
+    names = ("jobs/blind_bc-0.npz", "agents/blind_bc-0/agent.json", "tensorboard/blind_bc-0/events")
+    cluster.keep(job, dict.fromkeys(names, b""))
+    assert written == ["agent.json", "events", "blind_bc-0.npz"]

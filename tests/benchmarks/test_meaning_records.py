@@ -78,8 +78,10 @@ def test_a_folder_of_another_run_is_not_gone_on_with(key: str, tmp_path: Path) -
     described = {**dict.fromkeys(("settings", "versions", "expert", "salt", "preset", "set", "task_version"), "a")}
     job_files.prepare(tmp_path, described, resume=False)
     job_files.prepare(tmp_path, described, resume=True)
-    with pytest.raises(envs.InputError, match=f"holds a run that differs in its {key}"):
-        job_files.prepare(tmp_path, {**described, key: "b"}, resume=True)
+    without = {name: value for name, value in described.items() if name != key}
+    for other in ({**described, key: "b"}, without):
+        with pytest.raises(envs.InputError, match=f"holds a run that differs in its {key}"):
+            job_files.prepare(tmp_path, other, resume=True)
 
 
 def test_what_the_table_lacks_is_of_today_s_settings_and_expert(
@@ -135,6 +137,17 @@ class TestBudget:
         context = Context(toys.Push(), tiny_preset(), [0, 1], expert="tests.toys:control")
         assert len(context.explore(None, context.rngs, n)) == 2 * spent
         assert context.monitor.budget["exploration_trials"] == [spent] * 2
+
+    def test_of_each_seed(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A file has what its own seed used."""
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
+        job = BenchmarkJob("bandit", tiny_preset(), "dagger", (0, 1), tmp_path)
+        monitor = JobMonitor(job, 1)
+        monitor.spend("queries", [30, 50])
+        for seed in job.seeds:
+            job.save(seed, {}, monitor, {})
+        held = [job_files.read(job.file(seed)) for seed in job.seeds]
+        assert [data and data["meta"]["budget"] for data in held] == [{"queries": 30}, {"queries": 50}]
 
     def test_cpu_seconds(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)

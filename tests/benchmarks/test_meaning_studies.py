@@ -133,6 +133,11 @@ def test_exploration_of_a_validation_is_half_at_random(tmp_path: Path, monkeypat
         file = validate.data(envs.get("curling"), None, tmp_path)[1]
         assert explored == [(None, 64), (trials, 64)]
     assert len(Trials.load(file)) == 8
+    monkeypatch.setattr(
+        Context, "demonstrations", run_trials(envs.BatchEnv(PUSH, 4), RandomAgent(PUSH.action_space), 2, 1).trials
+    )
+    validate.data(envs.get("curling"), None, tmp_path)
+    assert len(explored) == 4  # of other demonstrations: its clone is another
 
 
 def test_a_row_of_a_validation_is_of_its_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

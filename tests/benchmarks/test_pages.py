@@ -250,6 +250,9 @@ class TestCurves:
         assert made["a"]["update"] == list(range(1, 401, 8))
         assert made["a"]["loss"][:2] == [0.3333, 3.0]
         assert made["b"] == {"update": [2], "loss": [3.333e8]}
+        for count in (49, 50, 99, 140):
+            (kept,) = records.thinned({"a": [(i, 0.5) for i in range(count)]}).values()
+            assert len(kept["update"]) >= min(count, 50)
 
     def test_rounds_are_not_bridged(self) -> None:
         """Where a curve goes without for longer than it is used to, there is a gap; seeds are averaged."""
@@ -1091,6 +1094,13 @@ def test_commands_of_numbers() -> None:
     assert results.command(task, gathered, episode) == f"{start} --methods deconfounded_discrete"
     assert results.command(task, gathered, "mine") == f"{start} --seeds 2 --methods path/mine.py:fit"
     assert results.command(task, gathered, "expert") == results.command(task, gathered)
+
+
+def test_a_prediction_that_is_the_wrong_way_round_is_told_by_its_sign() -> None:
+    """Pearson's correlation, by hand: of the deviations (-1, 0, 1) and (1, 1, -2), -3 over the root of 2 x 6."""
+    task = envs.get("curling")
+    of = [gap.Gap(task, predicted, measured) for predicted, measured in ((0.1, 0.5), (0.2, 0.5), (0.3, 0.2))]
+    assert f"Pearson's correlation\nis -{3 / 12**0.5:.2f} over 3 tasks" in gap.section(of)
 
 
 @pytest.mark.slow

@@ -236,6 +236,11 @@ def test_settings_share_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert usual["loss"] != wide["loss"]
     tune.main()
     assert (tmp_path / "docs" / "tuning.json").read_text() == kept
+    monkeypatch.setattr(type(envs.get("bandit")), "version", 99)
+    monkeypatch.setattr("sys.argv", ["tune", "--out", str(tmp_path / "again")])
+    tune.main()
+    rows = json.loads((tmp_path / "docs" / "tuning.json").read_text())["rows"]
+    assert [row["task_versions"] for row in rows] == [{"bandit": 99}] * 2
 
 
 def test_a_certificate_is_kept_while_what_made_it_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from deconfounded import envs
-from deconfounded.deconf.core.deployment import deployments
+from deconfounded.deconf.core.data import Draws, Signature
+from deconfounded.deconf.core.deployment import Way, deployments
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
+from deconfounded.deconf.core.nets import Scales
 from deconfounded.deconf.exact import ExactAgent, PatchGrid
 from deconfounded.envs.streams import Array, Streams
 from deconfounded.experts import policy
@@ -53,6 +56,24 @@ def test_the_theta_that_an_exact_policy_acts_on(name: str) -> None:
         assert (acted[way] == high).any(-1).any()
     assert (acted["episode"][0] == acted["episode"][1]).all()
     assert (acted["step"][0] != acted["step"][1]).any()
+
+
+@pytest.mark.parametrize(("way", "steps_differ", "episodes_differ"), [("step", True, True), ("episode", False, True)])
+def test_the_latent_that_a_learned_agent_acts_on(way: Way, steps_differ: bool, episodes_differ: bool) -> None:
+    """Drawn again at every step, or once an episode; in each episode of a trial by itself."""
+    draws = Draws([np.random.default_rng(0)], "cpu")
+    scales = Scales.plain(Signature(obs=2, action=1, actions=0, binary=False), 1)
+    agent = DeconfoundedAgent.new("evidence", 3, 8, scales, draws)
+    agent.way = way
+    latents = []
+    agent.begin(4)
+    for episode in range(2):
+        agent.reset([np.random.default_rng(episode)])
+        latents.append([agent.latent() for _ in range(2)])
+    (first, second), (later, _) = latents
+    assert bool((first != second).all()) is steps_differ
+    assert bool((first == second).all()) is not steps_differ
+    assert bool((second != later).all()) is episodes_differ
 
 
 def test_a_drawn_theta_has_each_patch_s_own_belief() -> None:

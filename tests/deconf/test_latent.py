@@ -199,6 +199,16 @@ def test_episodes_that_did_not_take_place() -> None:
     np.testing.assert_array_equal(episodes.action[4:6, 0], trials.action[1, :2])
 
 
+def test_halves_of_a_trial_are_of_the_steps_that_it_has() -> None:
+    """Of 6 steps of room: 2 and 2 of four, 1 and 1 of two; half of an odd number is rounded down, then up."""
+    taken = np.arange(6) < np.array([[4], [2], [5]])
+    batch = Batch.of(Trials(np.zeros((3, 1, 7, 1)), np.zeros((3, 1, 6, 1)), taken[:, None]), 1)
+    early, late = latent.halves(batch)
+    assert early.mask[0].sum(-1).tolist() == [2, 1, 2]
+    assert late.mask[0].sum(-1).tolist() == [2, 1, 3]
+    assert not (early.mask * late.mask).any()
+
+
 @pytest.mark.parametrize(("of", "share"), [("change", (0.9, 1.0)), ("place", (0.0, 0.3))])
 def test_a_latent_in_the_system_lasts_through_exploration_too(
     of: str, share: tuple[float, float], monkeypatch: pytest.MonkeyPatch

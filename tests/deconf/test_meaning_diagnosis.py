@@ -21,8 +21,8 @@ from deconfounded.deconf.diagnosis.diagnose import DiagnoseConfig
 from deconfounded.deconf.diagnosis.held_out import Best, PartMonitor, Report
 from deconfounded.deconf.diagnosis.judgement import judge
 from deconfounded.deconf.diagnosis.latent import Explanation
-from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, LearnedEnv
-from deconfounded.deconf.diagnosis.measures import Amounts, split
+from deconfounded.deconf.diagnosis.learned_env import LatentPolicy, LearnedEnv, Rollout
+from deconfounded.deconf.diagnosis.measures import Amounts, Findings, split
 from deconfounded.deconf.diagnosis.thresholds import GOOD, MISFIT, NEGLIGIBLE, STAKES
 from deconfounded.deconf.diagnosis.verdict import Diagnosis
 from deconfounded.deconf.methods import memoryless_bc, naive_rnn
@@ -124,6 +124,17 @@ def test_a_latent_and_a_memory_are_compared_at_the_same_steps(monkeypatch: pytes
     assert (findings.memory_gain, findings.latent_gain, findings.over_memory) == (1.5, 9.0, -1.0)
     monkeypatch.setattr(latent, "from_expert_trials", lambda *rest: explanation._replace(log_likelihood=None))
     assert measures.measure(trials, None, Amounts(), rng).over_memory is None
+
+
+def test_the_length_of_rollouts_is_over_that_of_the_data() -> None:
+    """Rollouts of 5 steps are as long as trials that ended after 5 of 10."""
+    paths = torch.randn(1, 8, 10, 1, generator=torch.Generator().manual_seed(0))
+    env: Any = SimpleNamespace(rollout=lambda *_: Rollout(torch.zeros(1), paths, torch.full((1, 8), 5.0)))
+    rng, taken = np.random.default_rng(0), np.broadcast_to(np.arange(10) < 5, (6, 1, 10))
+    episodes = Batch.of(Trials(rng.normal(size=(6, 1, 11, 1)), np.zeros((6, 1, 10, 1)), taken), 1)
+    explanation = Explanation(None, None, torch.arange(4.0)[None, :, None])  # type: ignore[arg-type]
+    figures = measures._rollouts(explanation, lambda _: env, None, episodes, Amounts(rollouts=8), [rng])  # type: ignore[arg-type]
+    assert figures[Findings._fields.index("model_length") - Findings._fields.index("stakes")] == 1
 
 
 def test_printed_lines_explore_by_the_log_of_exploration() -> None:

@@ -629,6 +629,14 @@ def test_labels_are_in_units_of_their_own(method: str) -> None:
     assert scaler.std.item() == pytest.approx(label.std(), abs=1e-5)
 
 
+@pytest.mark.parametrize("drifts", [False, True])
+def test_a_saved_transformer_forgets_as_it_did(drifts: bool) -> None:
+    """dpt: where theta drifts between episodes, what the last one showed is forgotten."""
+    config = DptConfig(16, 1, 2, rounds=1, updates=1, batch=4, drifts=drifts)
+    agent = dpt.train(lambda behaviour: (trials(), trials().action), config, [rng()])
+    assert DptAgent.from_state(*agent.state()).forgets is agent.forgets is drifts
+
+
 def test_contexts_are_read_by_the_encoder_that_was_trained(monkeypatch: pytest.MonkeyPatch) -> None:
     """dadp: its policy is cloned on them, and they are as long as all episodes but one."""
     read, contexts = list[Tensor](), dadp.contexts

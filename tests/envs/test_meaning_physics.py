@@ -250,6 +250,44 @@ def test_servos_reach_the_speed_that_is_asked_for(name: str, joint: str, velocit
     assert task.qvel(state, joint)[0] == pytest.approx(velocity, rel=0.05)
 
 
+def started(name: str, n: int = 500) -> tuple[MujocoTask, Array]:
+    """The task, and the states in which episodes start."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    env = envs.BatchEnv(task, n)
+    env.reset(0)
+    return task, env.state
+
+
+@pytest.mark.parametrize(("name", "along", "radius"), [("icy_stop", "car", 0.1)])
+def test_wheels_roll_at_the_start(name: str, along: str, radius: float) -> None:
+    """The rim is as fast as the car: no slip that would tell theta before anything was done."""
+    task, state = started(name)
+    np.testing.assert_allclose(task.qvel(state, "wheel") * radius, task.qvel(state, along))
+
+
+def test_a_target_swings_no_further_than_it_began() -> None:
+    """By .3 to .5 m, whichever part of its swing it starts in."""
+    task, state = started("heavy_payload", 40)
+    env, heights = envs.BatchEnv(task, 40), list[Array]()
+    env.reset(0)
+    for _ in range(100):  # 4 s; a swing takes 3 s
+        state = env.simulator.outcome(state, np.zeros((40, 1)))
+        heights.append(np.abs(task.qpos(state, "target")))
+    swing = np.max(heights, 0)
+    assert swing.min() > 0.29
+    assert swing.max() < 0.51
+
+
+def test_a_drone_starts_nearly_level() -> None:
+    """Turned by up to a tenth of a radian about each axis, and by nearly as much in some episode."""
+    task, state = started("windy_drone")
+    w, *axes = task.qpos(state, "flight")[:, 3:].T
+    angles = np.abs(2 * np.array(axes) / w)
+    assert (angles.max(1) > 0.09).all()
+    assert (angles <= 0.1 + 1e-9).all()
+
+
 BELL = np.exp(-0.5)
 REWARDS: tuple[tuple[str, dict[str, Any], list[float], list[float], float], ...] = (  # by the formula of a task's page
     ("tilted_cartpole", {"slider": 0.25, "hinge": 0.3}, [1], [0], (1 + np.cos(0.3)) / 2 * (0.3 + 0.7 * BELL)),

@@ -75,6 +75,13 @@ def test_episodes_in_any_order(tmp_path: Path) -> None:
     np.testing.assert_array_equal(datasets.read(place).action, trials.action[::-1])
 
 
+def test_an_agent_s_random_numbers_are_of_the_episode() -> None:
+    """Each has its own, or what an agent tries in one it would try again in the next."""
+    task = envs.get("bandit")
+    action = run_trials(envs.BatchEnv(task, 4), RandomAgent(task.action_space), 3, 0).trials.action
+    assert all((action[:, i] != action[:, j]).any() for i, j in ((0, 1), (0, 2), (1, 2)))
+
+
 def test_as_many_trials_as_a_run_imitates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unless another number is asked for."""
     task, asked = envs.get("slippery_cartpole"), list[int]()
