@@ -153,11 +153,11 @@ def test_a_resumed_run_makes_what_is_missing_alone(tmp_path: Path) -> None:
     """A method whose file is gone; not what it imitates, which is there, nor another method."""
     made = [BenchmarkJob("bandit", tiny_preset(), name, (0,), tmp_path) for name in ("blind_bc", "random")]
     engine = Noting()
-    assert scheduler.run_all(made, "cpu", "first", engine)[1] == 0
+    assert scheduler.run_all(made, "cpu", "first", engine)[1:] == (0, [])  # none was there before, and none failed
     assert engine.ran == ["random", "demonstrations", "blind_bc"]
     made[0].file(0).unlink()
     engine.jobs.clear()
-    assert scheduler.run_all(made, "cpu", "again", engine)[1] == 1  # there before
+    assert scheduler.run_all(made, "cpu", "again", engine)[1:] == (1, [])
     assert engine.ran == ["blind_bc"]
 
 
@@ -179,13 +179,17 @@ def test_a_result_that_fits_no_more_is_an_error(
 
 
 def test_demonstrations_are_made_for_seeds_that_imitate(tmp_path: Path) -> None:
-    """Once, before them; not for the seeds of methods that imitate nothing."""
+    """Once, before them, under their protocol; not for the seeds of methods that imitate nothing."""
     wanted = {"blind_bc": (1,), "oracle_bc": (1, 2), "random": (0, 1)}
-    made = [BenchmarkJob("bandit", tiny_preset(), name, seeds, tmp_path) for name, seeds in wanted.items()]
+    made = [
+        BenchmarkJob("bandit", tiny_preset(), name, seeds, tmp_path, protocol="scarce")
+        for name, seeds in wanted.items()
+    ]
     engine = Noting()
     scheduler.run_all(made, "cpu", "", engine)
     assert sorted(job.seeds for job in engine.jobs if job.method == "demonstrations") == [(1,), (2,)]
     assert {*engine.ran[:3]} == {"demonstrations", "random"}
+    assert {job.protocol for job in engine.jobs} == {"scarce"}
 
 
 def test_long_jobs_come_first(tmp_path: Path) -> None:
