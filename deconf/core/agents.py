@@ -180,6 +180,7 @@ class LearnedAgent(Agent):
         for name, part in agent.parts().items():
             own = {key.removeprefix(f"{name}."): x for key, x in arrays.items() if key.startswith(f"{name}.")}
             part.load_state_dict({key: torch.tensor(x) for key, x in own.items()})
+            part.eval()  # the moments of a belief's evidence stay as they are
         return agent
 
     def of_seed(self, i: int) -> "LearnedAgent":

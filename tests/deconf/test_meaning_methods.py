@@ -17,8 +17,9 @@ from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
 from deconfounded.deconf.core.adam import Adam
 from deconfounded.deconf.core.beliefs import EvidenceBelief
-from deconfounded.deconf.core.data import Batch, Signature
+from deconfounded.deconf.core.data import Batch, Draws, Signature
 from deconfounded.deconf.core.drift import split_episodes
+from deconfounded.deconf.core.latent_agent import DeconfoundedAgent
 from deconfounded.deconf.core.models import VariationalModel
 from deconfounded.deconf.core.monitor import Monitor
 from deconfounded.deconf.core.nets import ActionHead, Scales
@@ -627,6 +628,20 @@ def test_labels_are_in_units_of_their_own(method: str) -> None:
     scaler = agents[method](lambda behaviour: (trials(), label)).policy.scaler
     assert scaler.mean.item() == pytest.approx(label.mean(), abs=1e-5)
     assert scaler.std.item() == pytest.approx(label.std(), abs=1e-5)
+
+
+def test_a_loaded_agent_is_not_in_training() -> None:
+    """Else a loss of it, on other trials, would move the moments by which it reads its evidence."""
+    draws = Draws([rng()], "cpu")
+    made = DeconfoundedAgent.new(
+        "evidence", 2, 8, Scales.plain(Signature(obs=2, action=1, actions=0, binary=False), 1), draws
+    )
+    loaded = DeconfoundedAgent.from_state(*made.state())
+    batch = Batch(torch.ones(1, 3, 4, 2), torch.ones(1, 3, 4, 1), torch.zeros(1, 3, 4, 2), torch.ones(1, 3, 4))
+    before = {key: x.copy() for key, x in loaded.state()[1].items()}
+    loaded.model.loss(batch, None, 1.0, draws)
+    after = loaded.state()[1]
+    assert all(np.array_equal(after[key], x) for key, x in before.items())
 
 
 @pytest.mark.parametrize("drifts", [False, True])
