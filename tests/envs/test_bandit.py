@@ -65,6 +65,17 @@ def test_there_are_five_arms(arm: float) -> None:
         env.step(np.array([[arm]]))
 
 
+def test_a_picture_of_the_arms() -> None:
+    """The best arm stands on green; the arm that was pulled is yellow if it paid, and grey if it did not."""
+    draw = envs.get("bandit").renderer(np.array([3.0]))
+    for paid, colour in ((1.0, (250, 190, 40)), (0.0, (110, 110, 110))):
+        picture = draw(np.array([paid]), np.array([1.0]))
+        columns = [60 * arm + 40 for arm in range(5)]
+        bases, arms = picture[170, columns].tolist(), picture[100, columns].tolist()
+        assert [base == [40, 160, 70] for base in bases] == [arm == 3 for arm in range(5)]
+        assert [tuple(arm) for arm in arms] == [colour if arm == 1 else (225,) * 3 for arm in range(5)]
+
+
 @pytest.mark.slow
 def test_payouts(env: envs.BatchEnv) -> None:
     """Eq. (4): 3/4 for the best arm, 1/4 for others, 4 standard errors."""

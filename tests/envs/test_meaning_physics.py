@@ -14,10 +14,11 @@ from deconfounded.envs import render
 from deconfounded.envs.contract.probe import actions, streams
 from deconfounded.envs.edits import ModelEdit, SpecEdit
 from deconfounded.envs.physics import MujocoTask
-from deconfounded.envs.streams import Array
+from deconfounded.envs.streams import Array, Streams
 from deconfounded.envs.tasks.forked_path import ForkedPath
 from deconfounded.envs.tasks.icy_road import road
 from deconfounded.envs.tasks.loaded_arm import INNER, OUTER
+from deconfounded.envs.tasks.patchy_road import PatchyRoad
 from deconfounded.envs.tasks.windy_drone import HEIGHT
 from deconfounded.experts import policy
 from deconfounded.experts.agent import ExpertAgent, RandomAgent
@@ -109,6 +110,43 @@ def test_wind_blows_along_y_and_a_load_ahead_dips_the_nose() -> None:
     assert abs(left[0]) < 0.01 * left[1]
     assert laden[4] > 0.1  # about y, left: the x axis sinks
     assert abs(laden[3]) < 0.01 * laden[4]
+
+
+def test_each_latent_of_a_loaded_drone_acts_by_itself() -> None:
+    """Wind carries it along; a load ahead dips the nose, one to the left that side, and a weak front left rotor both.
+
+    Without noise, hovering, for .2 s, against a drone that nothing disturbs.
+    """
+    task = envs.get("loaded_drone")
+    assert isinstance(task, MujocoTask)
+    calm = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+    changes = ((0, 12.0), (1, 12.0), (2, 0.02), (3, 0.02), (4, 0.75))
+    thetas = np.array([calm, *(np.where(np.arange(5) == i, value, calm) for i, value in changes)])
+    env = envs.BatchEnv(task, 6)
+    env.reset(0, {"theta": thetas})
+    state = task.state(flight=(np.array([[0, 0, HEIGHT, 1, 0, 0, 0]] * 6), 0))
+    for _ in range(5):
+        state = env.simulator.outcome(state, np.zeros((6, 4)))
+    velocity = task.qvel(state, "flight")
+    moved = (velocity - velocity[0])[1:, [0, 1, 3, 4]]  # along x and y; to the right about x, nose down about y
+    ahead, left, nose_heavy, left_heavy, weak = np.sign(np.where(np.abs(moved) > 0.03, moved, 0)).tolist()
+    assert (ahead[:2], left[:2]) == ([1, 0], [0, 1])
+    assert (nose_heavy[2:], left_heavy[2:], weak[2:]) == ([0, 1], [-1, 0], [-1, 1])
+
+
+@pytest.mark.parametrize("name", PHYSICAL)
+def test_columns_are_what_they_are_called(name: str) -> None:
+    """A column with a joint's name is its position; with `_velocity` behind it, its velocity."""
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    rng = np.random.default_rng(0)
+    joints = [joint for joint in task.process_noise if np.ndim(task.qpos(task.state(), joint)) == 1]
+    there = {joint: (rng.uniform(-1, 1), rng.uniform(-1, 1)) for joint in joints}
+    state = task.state(**there)
+    seen = dict(zip(task.observation, task.observe(state)[0].tolist(), strict=True))
+    for joint, (position, velocity) in there.items():
+        assert seen.get(joint, position) == pytest.approx(position)
+        assert seen.get(f"{joint}_velocity", velocity) == pytest.approx(velocity)
 
 
 @pytest.mark.parametrize("kind", ["compiled", "specified"])
@@ -279,6 +317,57 @@ def test_a_target_swings_no_further_than_it_began() -> None:
     assert swing.max() < 0.51
 
 
+LIMITS = (  # task, joints, column, and what is observed: no further than a lamp or a radar reaches
+    ("weak_thruster", {"height": ([1.9, 2.5, 9.0], 0.0)}, "radar", [1.9, 2.0, 2.0]),
+    ("icy_stop", {"line": ([1.9, 2.5, 9.0], 0.0), "car": (0.0, 0.0)}, "to_line", [1.9, 2.0, 2.0]),
+)
+
+
+@pytest.mark.parametrize(("name", "joints", "column", "seen"), LIMITS)
+def test_what_is_far_is_not_seen(name: str, joints: dict[str, Any], column: str, seen: list[float]) -> None:
+    task = envs.get(name)
+    assert isinstance(task, MujocoTask)
+    np.testing.assert_allclose(task.observe(task.state(**joints))[:, list(task.observation).index(column)], seen)
+
+
+@pytest.mark.parametrize(("name", "joints", "most"), [("hidden_goal", "xy", 0.03), ("forked_path", "xy", 0.03)])
+def test_a_start_tells_nothing_of_the_goal(name: str, joints: str, most: float) -> None:
+    """At rest, within centimetres of the middle."""
+    task, state = started(name)
+    for joint in joints:
+        assert 0.9 * most < np.abs(task.qpos(state, joint)).max() <= most
+        assert not task.qvel(state, joint).any()
+
+
+def test_patches_lie_along_the_road() -> None:
+    """Six of 4 m, from x = 0 on, round and round; the expert heeds that of a metre ahead."""
+    task = envs.get("patchy_road")
+    assert isinstance(task, PatchyRoad)
+    places = np.array([0.1, 2.9, 3.1, 3.9, 4.1, 23.1, 23.9, 24.1])
+    state = task.state(x=(places, 0.0))
+    assert task.patch(state).tolist() == [0, 0, 0, 0, 1, 5, 5, 0]
+    assert task.heeded(task.observe(state)).tolist() == [0, 0, 1, 1, 1, 0, 0, 0]
+    theta = np.tile(np.arange(6.0), (8, 1))
+    assert task.acting_theta(theta, state)[:, 0].tolist() == [0, 0, 0, 0, 1, 5, 5, 0]
+
+
+def test_joints_that_are_not_named_are_at_rest() -> None:
+    """An ant's body stands, upright, where the model has it; its quaternion is one."""
+    task = envs.get("lame_ant")
+    assert isinstance(task, MujocoTask)
+    place = task.qpos(task.state(), "root")[0]
+    np.testing.assert_array_equal(place, task.model.qpos0[:7])
+    np.testing.assert_array_equal(place[3:], [1, 0, 0, 0])
+
+
+def test_a_list_drifts_as_the_page_says() -> None:
+    """By a quarter of the quantiles, from the middle, where few walks reach an end."""
+    task = envs.get("rolling_deck")
+    middle = np.full((4000, 1), task.latents[0].ppf(np.array([0.5]))[0])
+    walked = task.latents[0].cdf(task.drifted(middle, Streams(np.random.default_rng(0).spawn(4000)))[:, 0])
+    assert np.sqrt(np.square(walked - 0.5).mean()) == pytest.approx(0.25, rel=0.1)
+
+
 def test_a_drone_starts_nearly_level() -> None:
     """Turned by up to a tenth of a radian about each axis, and by nearly as much in some episode."""
     task, state = started("windy_drone")
@@ -328,7 +417,17 @@ def test_rewards_by_hand(
     np.testing.assert_allclose(made, [reward], atol=1e-9)
 
 
+TURNED = [(0, 0, HEIGHT, np.cos(angle / 2), np.sin(angle / 2), 0, 0) for angle in (1.5, 1.6)]  # a right angle is 1.57
 ENDS = (  # task, joints, and whether an episode ends there, as the task's page has it
+    ("weak_thruster", {"height": ([0.4, -0.4, -0.6], 0.0)}, [False, False, True]),
+    ("icy_stop", {"line": (5.0, 0.0), "car": ([4.0, 5.4, 5.6], 0.0)}, [False, False, True]),
+    ("heavy_payload", {"load": ([1.1, -1.1, 1.3, -1.3], 0.0), "target": (0.0, 0.0)}, [False, False, True, True]),
+    ("windy_drone", {"flight": ([(x, 0, HEIGHT, 1, 0, 0, 0) for x in (1.4, 1.6)], 0.0)}, [False, True]),
+    (
+        "windy_drone",
+        {"flight": ([(0, 0, HEIGHT, np.cos(x / 2), np.sin(x / 2), 0, 0) for x in (1.5, 1.6)], 0.0)},
+        [False, True],
+    ),
     ("tilted_cartpole", {"hinge": ([1.1, -1.1, 1.3, -1.3], 0.0)}, [False, False, True, True]),
     ("slippery_walker", {"rooty": ([0.55, -0.55, 0.65, -0.65], 0.0)}, [False, False, True, True]),
     ("swapped_lander", {"z": ([0.05, 0.05, 0.05, 1.0], [-0.9, -1.1, 1.1, -1.1])}, [False, True, False, False]),
