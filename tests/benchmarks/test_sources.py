@@ -123,6 +123,22 @@ def test_data_files_that_code_names_count(tmp_path: Path) -> None:
     assert len({*digests}) == 3
 
 
+def test_modules_that_a_package_s_module_imports_count(tmp_path: Path) -> None:
+    """Of its own folder and of the one above, with the packages that these imports run; not the others there."""
+    texts = {
+        **{"pack/__init__.py": "", "pack/gains.py": "", "pack/unused.py": "", "pack/inner/__init__.py": ""},
+        **{"pack/inner/mine.py": "from ..gains import K\nfrom . import beside\nimport other.deep.module\n"},
+        **{"pack/inner/beside.py": "", "pack/inner/gains.py": ""},
+        **{"other/__init__.py": "", "other/deep/__init__.py": "", "other/deep/module.py": "", "other/unused.py": ""},
+    }
+    for name, text in texts.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    reached = sources.closure([tmp_path / "pack/inner/mine.py"])
+    left = {"pack/unused.py", "other/unused.py", "pack/inner/gains.py"}
+    assert {str(file.relative_to(tmp_path)) for file in reached} == {*texts} - left
+
+
 def test_data_files_come_and_go(tmp_path: Path) -> None:
     """Which of them there are is looked up each time; a text that no file can be called by is the name of none."""
     long = "é" * 190 + ".txt"  # more bytes than a name may have
