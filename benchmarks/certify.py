@@ -19,7 +19,7 @@ from deconfounded.benchmarks.engine import identity, sources
 from deconfounded.benchmarks.engine.catalogue import EXACT
 from deconfounded.benchmarks.engine.context import DEMOS, EXPLORATION, stream
 from deconfounded.benchmarks.engine.progress import Progress
-from deconfounded.benchmarks.output.certificate import picture
+from deconfounded.benchmarks.output.certificate import check_kept, picture
 from deconfounded.benchmarks.output.scoring import check_expert, normalise
 from deconfounded.benchmarks.output.trial_scores import standard_error
 from deconfounded.deconf.exact import GRID, Grid, grid_of, grid_size
@@ -279,6 +279,7 @@ def main() -> None:
     envs.check_task(task)
     expert = policy.load(task, args.expert)
     check_folder(folder := args.out)
+    check_kept(folder / f"{task.name}.json", task, args.trials)
     start, progress = time.time(), Progress(len(STAGES), task.name, every_s=0)
     result = certify(task, expert, args.trials, done=lambda stage: progress.update(1, f"({stage} done)"))
     progress.close()
@@ -289,7 +290,7 @@ def main() -> None:
         doubt = "" if check["sure"] else ": within two standard errors; --trials says more"
         print(f"{'ok  ' if check['passed'] else 'FAIL'} {name}: {value}{doubt}")
     if learned := result.get("learned_dynamics"):
-        fit = "R2 {r2:.3f} on held-out trials, likelihood to the power {exponent:g}".format(**learned)
+        fit = "R2 {r2:.3f} on held-out trials; likelihoods to the power {exponent:g}".format(**learned)
         print(f"conditional, interventional and evidence are of learned dynamics, not exact: {fit}")
     nats = "dynamics {dynamics:.3g} nats, actions {actions:.3g} nats".format(**result["evidence_nats_per_step"])
     inferred = ", ".join(f"{name} {value:.2f}" for name, value in result["inferability"][-1].items())

@@ -34,13 +34,20 @@ def ready(folder: Path, task: envs.Task) -> Agent:
         signature = agent.policy.signature
         theirs = {"observations": signature.obs, "action": signature.action, "actions": signature.actions}
     if theirs not in (None, ours):
-        raise envs.InputError(f"the agent in {folder} is for {theirs}; {task.name} has {ours}")
+        raise envs.InputError(f"the agent in {folder} is for {described(theirs)}; {task.name} has {described(ours)}")
     if isinstance(agent, MemorylessAgent) and agent.shape()["theta"]:
         raise envs.InputError(f"the agent in {folder} is an oracle, which acts on theta; give one that does not")
     trained = about.get("task")
     if trained and trained.rpartition(":")[2] != (task.reference or task.name).rpartition(":")[2]:
         print(f"note: the agent in {folder} was trained on {trained}")
     return agent if isinstance(agent, LearnedAgent) else ReseededAgent(agent)
+
+
+def described(spaces: dict[str, int]) -> str:
+    """Spaces that `benchmark.spaces` gives, e.g. `3 observations and 1 continuous action`."""
+    width, actions = spaces["action"], spaces["actions"]
+    acts = f"one of {actions} actions" if actions else f"{width} continuous action{'s' * (width > 1)}"
+    return f"{spaces['observations']} observation{'s' * (spaces['observations'] > 1)} and {acts}"
 
 
 def play(agent: Agent, env: envs.GymEnv, episodes: int, seed: int, theta: Any = None) -> tuple[list[float], list[Any]]:
@@ -79,6 +86,8 @@ def main() -> None:
     if args.video is not None:
         if args.video.suffix != ".mp4":
             raise envs.InputError(f"--video was {args.video}; it must end in .mp4")
+        if not task.has_likelihood:
+            raise envs.InputError(f"--video was given, and {task.name} is a black box, which has no pictures")
         check_file(args.video)
     agent = ready(args.agent, task)
     env = envs.GymEnv(task, render_mode="rgb_array" if args.video else None)

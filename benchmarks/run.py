@@ -70,7 +70,7 @@ def main() -> None:
     if args.debug and (args.cluster or args.out or args.resume):
         raise envs.InputError("--debug runs in this process and keeps nothing; leave out --cluster, --out and --resume")
     from deconfounded.benchmarks.engine.job_files import know_guests
-    from deconfounded.benchmarks.engine.presets import changed, preset  # torch takes seconds
+    from deconfounded.benchmarks.engine.presets import changed, preset, whose  # torch takes seconds
 
     with tempfile.TemporaryDirectory(prefix="deconfounded-debug-") as aside:
         base = Path(aside) if args.debug else args.out or Path("results")
@@ -80,6 +80,11 @@ def main() -> None:
         for task in tasks:
             know_guests(folders[task.name] / "jobs")
             changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set)
+        if not args.resume:  # which has to have the same --set
+            for change in args.set:
+                if (method := whose(change)) not in ("", *wanted):
+                    right = "add it to --methods, or leave the change out"
+                    raise envs.InputError(f"--set had {change}, and method {method} does not run; {right}")
         run_tasks(tasks, args, [name for name in METHODS if name in wanted], folders)
 
 

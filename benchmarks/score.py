@@ -2,6 +2,7 @@
 
 Thetas are drawn from p(theta) by --seed and --salt, or with --range from another range, which may exceed the task's.
 The expert and random actions are run under the same thetas: the score is 1 for the expert, and 0 for random actions.
+The interval is a percentile bootstrap over trials, with the share of cases in which one of so many holds the mean.
 """
 
 from dataclasses import replace
@@ -90,7 +91,8 @@ def main() -> None:
     from deconfounded.benchmarks.output import scoring
 
     scored = rescore(agent, task, expert, args.trials, stream(EVALUATION, args.seed, args.salt), where)
-    last = f"last {scoring.interval(scored['ci95_last'], args.trials)} over trials"
+    held = f"{scoring.coverage(args.trials):.0%} of such intervals hold the mean"
+    last = f"last {scoring.interval(scored['ci95_last'])} over trials; {held}"
     scores = " ".join(map(scoring.two_decimals, scored["score"]))
     print(f"{task.name}, {args.trials} trials: score of each episode {scores} (0 random, 1 expert; {last})")
     if args.out is not None:

@@ -1,11 +1,28 @@
-"""A certificate as a picture: stakes, exact policies and evidence."""
+"""Certificates: which of two is kept, and a picture of stakes, exact policies and evidence."""
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from deconfounded import envs
+from deconfounded.benchmarks.engine import sources
 from deconfounded.benchmarks.output.pictures import panels
+
+
+def check_kept(file: Path, task: envs.Task, trials: int) -> None:
+    """Raise InputError if the file has a certificate of the same task, of more trials than are asked for."""
+    files = sources.of_task(task)
+    today = (task.version, sources.digest(files) if files else None)
+    try:
+        kept = json.loads(file.read_bytes())
+        more = (kept["task_version"], kept.get("text")) == today and kept["trials"] > trials
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):  # there is none
+        return
+    if more:
+        right = f"give --trials {kept['trials']} or more, or another --out"
+        raise envs.InputError(f"--trials was {trials}, and {file} is of {kept['trials']} trials; {right}")
 
 
 def picture(result: dict[str, Any], file: Path) -> None:

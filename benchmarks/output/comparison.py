@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from deconfounded import envs
 from deconfounded.benchmarks.engine.catalogue import METHODS, REFERENCES
 from deconfounded.benchmarks.engine.protocols import STANDARD
 from deconfounded.benchmarks.engine.published import RECORDS
@@ -106,7 +107,8 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
             methods = [each for each in dict.fromkeys([*scores, *package]) if each not in REFERENCES]
             near = difflib.get_close_matches(name, methods, 1)
             hint = f"did you mean {near[0]}? " if near else ""
-            made = f"; `deconf run --task {next(iter(tasks))} --methods {name}` makes them" * (name in METHODS)
+            task = next((task for task in tasks if task in envs.names()), "path/file.py:Class")
+            made = f"; `deconf run --task {task} --methods {name}` makes them" * (name in METHODS)
             raise InputError(
                 f"--against {name}: no record is of it on these tasks; {hint}there are {', '.join(methods)}{made}"
             )

@@ -7,6 +7,8 @@ from deconfounded.envs.contract.probe import Skipped, actions, needs_likelihood,
 from deconfounded.envs.physics import MujocoTask
 from deconfounded.envs.task import Array, Task
 
+FEW = 32  # next states
+
 
 def _noise(task: Task, m: int) -> Array:
     return np.concatenate(task.sample_noise(streams(*range(m // task.horizon + 1))))[:m]
@@ -50,6 +52,13 @@ def log_prob_is_the_density_of_the_noise(task: Task) -> None:
     if isinstance(task, MujocoTask):  # at most one, so that the ratio's variance is finite
         distance = np.sqrt(2 * (task.log_prob(p, p) - task.log_prob(p, q)))
         q = p + (q - p) / max(1, distance[0])
+    then, counts = np.unique(drawn, axis=0, return_counts=True)
+    if len(then) <= FEW:  # these have probabilities, which do not need another outcome
+        stated, share = np.exp(task.log_prob(then, p)), counts / m
+        i = np.abs(share - stated).argmax()
+        often = f"{stated[i]:.3f} to {then[i].tolist()}, which is {share[i]:.3f} of {m:,} next states"
+        error = np.sqrt(share[i] * (1 - share[i]) / m)
+        require(abs(share[i] - stated[i]) < 5 * error + 1e-9, f"log_prob of {task.name} gives {often}")
     ratio = task.log_prob(drawn, p) - task.log_prob(drawn, q)
     _density_ratio(f"log_prob of {task.name}", ratio, "outcomes that differ")
     if isinstance(task, MujocoTask):  # half of a chi-squared, a degree of freedom for each noisy coordinate

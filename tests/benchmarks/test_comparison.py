@@ -436,7 +436,9 @@ class TestComparison:
             comparison.gathered(twice[:1], ["nobody"])
         own = [record("mine", 0, 0.5) | {"task": "own_task"}, record("random", 0, 0.1) | {"task": "own_task"}]
         own.append(record("expert", 0, 0.9) | {"task": "own_task"})
-        says = r"--against dagger: .* there are mine; `deconf run --task own_task --methods dagger` makes them$"
+        says = (
+            r"--against dagger: .* there are mine; `deconf run --task path/file.py:Class --methods dagger` makes them$"
+        )
         with pytest.raises(InputError, match=says):
             comparison.gathered(own, ["dagger"])
         for wrong, near in (("naive_rn", "naive_rnn"), ("deconfounded_modes", "deconfounded_mode")):

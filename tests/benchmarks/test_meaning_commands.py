@@ -1,5 +1,6 @@
 """What commands and the engine say and take, by what it means: returns that are played, versions, and digests."""
 
+import json
 import os
 from argparse import ArgumentTypeError
 from pathlib import Path
@@ -15,8 +16,9 @@ from deconfounded.benchmarks.console import whole
 from deconfounded.benchmarks.engine import catalogue, guest_host, job_files, local, sources
 from deconfounded.benchmarks.engine.context import Context
 from deconfounded.benchmarks.engine.provider import fit
-from deconfounded.benchmarks.output import records
+from deconfounded.benchmarks.output import certificate, records
 from deconfounded.benchmarks.studies import cards, table
+from deconfounded.envs.support.origin import ROOT
 from deconfounded.experts.agent import RandomAgent
 from deconfounded.experts.datasets.units import Units
 from deconfounded.experts.rollout import run_trials
@@ -236,6 +238,30 @@ def test_an_agent_on_another_task_than_it_was_trained_on(
     assert capsys.readouterr().out == f"note: the agent in mine was trained on {trained}\n" * noted
 
 
+def test_a_certificate_of_more_trials_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the same task; one of fewer trials, or of another version of the task, is replaced."""
+    task, file = toys.Push(), tmp_path / "push.json"
+    certificate.check_kept(file, task, 64)
+    text = sources.digest(sources.of_task(task))
+    file.write_text(json.dumps({"task_version": task.version, "text": text, "trials": 256}))
+    certificate.check_kept(file, task, 256)
+    with pytest.raises(
+        envs.InputError, match=r"^--trials was 255, and .*push.json is of 256 trials; give --trials 256 or"
+    ):
+        certificate.check_kept(file, task, 255)
+    file.write_text(json.dumps({"task_version": task.version, "text": "another", "trials": 256}))
+    certificate.check_kept(file, task, 64)
+    file.write_text("half a")
+    certificate.check_kept(file, task, 64)
+
+
+def test_pictures_of_a_world_are_refused_by_their_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = f"{ROOT}/docs/worlds/reversed_cart.py:ReversedCart"
+    monkeypatch.setattr("sys.argv", ["play", "--agent", "gone", "--task", world, "--video", "a.mp4"])
+    with pytest.raises(envs.InputError, match=r"^--video was given, and .* is a black box, which has no pictures"):
+        play.main()
+
+
 def test_an_agent_of_other_units_or_actions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a folder that states no spaces: `agent.save` and `units.agent(agent).save` write such."""
     units = Units(("x", "velocity"), ("push",), (-100.0,), (100.0,))
@@ -245,7 +271,7 @@ def test_an_agent_of_other_units_or_actions(monkeypatch: pytest.MonkeyPatch) -> 
         play.ready(Path("mine"), toys.Push())
     context = Context(envs.get("bandit"), tiny_preset(), [0])
     monkeypatch.setattr(play.deconfounded, "load", lambda folder: fit(context, "blind_bc"))
-    with pytest.raises(envs.InputError, match=r"is for .*'actions': 5.*; push has .*'actions': 0"):
+    with pytest.raises(envs.InputError, match="1 observation and one of 5 actions; push has 2 observations"):
         play.ready(Path("mine"), toys.Push())
 
 

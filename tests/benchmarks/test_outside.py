@@ -286,6 +286,7 @@ TOY = "from tests.toys import Push\nclass Task(Push):\n    name = 'mine'\n"
         ("import math\nfrom pathlib import Path\nclass Mine:\n    pass", "Task", "has no 'Task'; it has Mine$"),
         ("from deconfounded.envs import InputError\nraise InputError('odd')", "Task", r"odd \(mine\.py:2\)"),
         ("Task = 3", "Task", "is 3; it must be a subclass of deconfounded.envs.Task"),
+        ("import numpy as np\nTask = np.arange(3)", "Task", r"is array\(\[0, 1, 2\]\); it must be a subclass of"),
         ("1 / 0", "Task", r"division by zero \(ZeroDivisionError, mine.py:1\)"),
         ("import nonsuch", "Task", "No module named 'nonsuch'"),
         ("x = 1\ndef f(:", "Task", r"invalid syntax \(SyntaxError, mine.py:2\)"),

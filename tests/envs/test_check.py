@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -182,7 +183,7 @@ def test_slips_are_named(task: type[envs.Task], says: str) -> None:
             r"gave \[0.5, 0.5, 0.5\]",
         ),
         (lambda theta: np.full((len(theta), 2), 0.5), r"had shape \(16, 2\); it must be \(16, 3\)"),
-        (lambda theta: None, r"had shape \(0,\); it must be \(16, 3\)"),
+        (lambda theta: None, r"was None, as where a class has no expert_probs; it must be \(16, 3\)"),
     ],
 )
 def test_an_expert_takes_each_discrete_action_sometimes(probs: Any, says: str) -> None:
@@ -230,6 +231,31 @@ def test_a_density_of_another_width_is_noticed(factor: float) -> None:
         log_prob_is_the_density_of_the_noise(wrong())
 
 
+@pytest.mark.parametrize("swapped", [False, True])
+def test_stated_probabilities_are_those_of_the_noise(swapped: bool) -> None:
+    """Of next states of which there are few, also where theta has no part in it: here a coin beside the push."""
+
+    class Coin(Arms):
+        def sample_noise(self, rng: Any) -> Any:
+            return rng.random((rng.groups, self.horizon, 2))
+
+        def init_state(self, rng: Any) -> Any:
+            return np.zeros((rng.groups, 2))
+
+        def apply_noise(self, outcome: Any, noise: Any) -> Any:
+            return np.concatenate([super().apply_noise(outcome, noise[:, :1]), noise[:, 1:] < 0.8], -1)
+
+        def log_prob(self, next_state: Any, outcome: Any) -> Any:
+            heads = np.where(next_state[..., 1] == 1, *((0.2, 0.8) if swapped else (0.8, 0.2)))
+            return super().log_prob(next_state[..., :1], outcome) + np.log(heads)
+
+        def observe(self, state: Any) -> Any:
+            return super().observe(state[:, :1])
+
+    with pytest.raises(AssertionError, match=r"log_prob of arms gives") if swapped else nullcontext():
+        log_prob_is_the_density_of_the_noise(Coin())
+
+
 UNSURE = np.random.default_rng(0)
 
 
@@ -239,7 +265,7 @@ UNSURE = np.random.default_rng(0)
         (lambda obs: 0.1 * UNSURE.normal(size=(len(obs), 1)), "gave two actions for one observation"),
         (lambda obs: np.repeat(-obs[:1, :1], len(obs), 0), "gave two actions for one observation"),
         (lambda obs: -obs[:, 0], r"had shape \(16,\); it must be \(16, 1\), a row for each observation"),
-        (lambda obs: None, r"had shape \(0,\); it must be \(16, 1\)"),
+        (lambda obs: None, r"was None, .* no expert_mean; it must be \(16, 1\)"),
         (lambda obs: np.where(obs[:, :1] > 0, np.nan, 0), r"gave \[nan\]; it must be finite"),
         (lambda obs: obs[:, 4, None], r"index 4.*"),
     ],

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from deconfounded import envs
 from deconfounded.benchmarks import data
@@ -80,6 +81,19 @@ def test_an_agent_s_random_numbers_are_of_the_episode() -> None:
     task = envs.get("bandit")
     action = run_trials(envs.BatchEnv(task, 4), RandomAgent(task.action_space), 3, 0).trials.action
     assert all((action[:, i] != action[:, j]).any() for i, j in ((0, 1), (0, 2), (1, 2)))
+
+
+@pytest.mark.parametrize("name", ["curling", "bandit"])
+def test_random_actions_are_uniform(name: str) -> None:
+    """Each tenth of [-1, 1] as often, or each arm; of 40,000, to five standard errors."""
+    space = envs.get(name).action_space
+    agent = RandomAgent(space)
+    agent.reset(np.random.default_rng(0).spawn(1))
+    action, groups = agent.act(np.zeros((40_000, 1), np.float32)), int(getattr(space, "n", 10))
+    assert isinstance(space, spaces.Discrete) or np.abs(action).max() <= 1
+    index = action if isinstance(space, spaces.Discrete) else np.floor((action + 1) / 2 * groups)
+    counts = np.bincount(index[:, 0].astype(int), minlength=groups)
+    np.testing.assert_allclose(counts, 40_000 / groups, atol=5 * (40_000 / groups) ** 0.5)
 
 
 def test_as_many_trials_as_a_run_imitates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
