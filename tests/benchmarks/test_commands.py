@@ -77,7 +77,6 @@ REFUSALS: list[tuple[tuple[str, ...], str]] = [
     (("run", "--task", "bandit", "--set", "seeds=10000"), "at most 1,000"),
     (("table", "--list", "--set", "seeds=2"), "--set had seeds=2, and --seeds is 10; give --seeds alone"),
     (("run", "--task", "bandit", "--set", "random.updates=5"), "method 'random' has no config"),
-    (("run", "--task", "bandit", "--methods", "naive_rnn", "--set", "dagger.updates=5"), "method dagger does not run"),
     (("run", "--task", "bandit", "--methods", "my.py"), "one of your own is my.py:FUNCTION"),
     (("run", "--task", "bandit", "--set", f"eval_trials={10**20}"), "it must be like 4000"),
     (("certify", "--task", "slippery_cartpole", "--expert", ""), "expert was ''; it must be"),

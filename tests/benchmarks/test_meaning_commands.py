@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from deconfounded import envs
-from deconfounded.benchmarks import play
+from deconfounded.benchmarks import play, run
 from deconfounded.benchmarks.console import whole
 from deconfounded.benchmarks.engine import catalogue, guest_host, job_files, local, sources
 from deconfounded.benchmarks.engine.context import Context
@@ -253,6 +253,20 @@ def test_a_certificate_of_more_trials_is_kept(tmp_path: Path, monkeypatch: pytes
     certificate.check_kept(file, task, 64)
     file.write_text("half a")
     certificate.check_kept(file, task, 64)
+
+
+def test_settings_of_methods_are_of_those_that_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But `--resume` has to be given what the run was given, though other methods may be left."""
+    began: list[Any] = []
+    monkeypatch.setattr(run, "run_tasks", lambda *given: began.append(given[2]))
+    command = ["run", "--task", "bandit", "--methods", "naive_rnn", "--out", str(tmp_path), "--set"]
+    for changes in (["naive_rnn.updates=5"], ["eval_trials=64"], ["dagger.updates=5", "--resume"]):
+        monkeypatch.setattr("sys.argv", [*command, *changes])
+        run.main()
+    assert [{*methods} for methods in began] == [{"naive_rnn", "expert", "random"}] * 3
+    monkeypatch.setattr("sys.argv", [*command, "naive_rnn.updates=5", "dagger.updates=5"])
+    with pytest.raises(envs.InputError, match=r"^--set had dagger.updates=5, and method dagger does not run; add it"):
+        run.main()
 
 
 def test_pictures_of_a_world_are_refused_by_their_option(monkeypatch: pytest.MonkeyPatch) -> None:
