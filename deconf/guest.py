@@ -102,7 +102,9 @@ def live(reference: str, channel: Connection, about: dict[str, Any]) -> None:
             except Exception as error:
                 send("done", error_line(error), time.process_time())
     except (Exception, SystemExit) as error:  # among them that the other end is gone
-        send("failed", error_line(error), "".join(traceback.format_exception(error)))
+        relative = isinstance(error, FileNotFoundError) and not os.path.isabs(error.filename or os.sep)
+        hint = "; a method runs in an empty folder: give the file's whole path" if relative else ""
+        send("failed", error_line(error) + hint, "".join(traceback.format_exception(error)))
 
 
 def kill_marked(mark: str) -> None:

@@ -73,6 +73,8 @@ def episodes_of(table: Table, roles: Roles) -> Episodes:
     action_names = names[1]
     groups = [() if name is None else table.select(what, [name]) for what, name in _groups(table, roles)]
     grouping = [name for group in groups for name in group]
+    if twice := {*groups[0]} & {*groups[1]}:
+        raise InputError(f"trial {min(twice)!r} of {table.where} is the episode too; a column has one role")
     for what, given, taken in (("obs", roles.obs, (*action_names, *grouping)), ("action", action_names, grouping)):
         if both := [name for name in given if name in taken]:
             role = "an action" if what == "obs" and both[0] in action_names else "what a trial or an episode is"
@@ -198,7 +200,8 @@ def _numbers(table: Table, name: str) -> NDArray[np.float64]:
         try:
             numbers[i] = number(cell)
         except ValueError:
-            raise InputError(f"{name!r} of {table.where} is {cell!r} in row {i + 1}; it must be a number") from None
+            right = "a number, with a decimal point" if re.fullmatch(r"-?\d+,\d+", cell.strip()) else "a number"
+            raise InputError(f"{name!r} of {table.where} is {cell!r} in row {i + 1}; it must be {right}") from None
     return numbers
 
 
@@ -232,12 +235,14 @@ def _notes(
     """What is odd, but can be worked with."""
     notes = []
     if single:
-        notes.append(f"{single} episodes of one row, without a step, are left out.")
+        notes.append(f"Episodes of one row, without a step, are left out: {single}.")
     if lost:
         notes.append(f"In {lost} episodes the last action has no next observation; it is dropped.")
     constant = [name for name in (*obs, *action) if _constant(table.columns[name])]
     if constant:
         notes.append(f"Constant: {', '.join(constant)}.")
+    if {*action} <= {*constant}:
+        notes.append("The action is always the same: there is nothing to imitate.")
     inside = _inside(len(table), first)
     rows = np.stack([table.columns[name] for name in (*obs, *action)], 1)
     same = (rows[1:] == rows[:-1]).all(1) & inside

@@ -454,6 +454,8 @@ def guest(folder: Path, text: str, task: str = CONTROL, *uses: str) -> tuple[Con
         ("def fit(given): raise EOFError('mine')", r"mine \(EOFError, mine.py:11\)"),
         ("def fit(given): given.progress(float('nan'))", "progress was nan, {}; it must be finite numbers"),
         ("def fit(given): given._ask('environment')", "it asked for environment, and declares"),
+        ("def fit(given): open('w.npy')", r".*'w.npy' .*, mine.py:11\); a method .*: give the file's whole path"),
+        ("def fit(given): open('/gone/w.npy')", r".*/gone/w.npy' \(FileNotFoundError, mine.py:11\)(?!;)"),
         ("def fit(given): return 3", "it returned 3; it must return a deconfounded.experts.agent.Agent"),
         ("def fit(given): 1 / 0", r"division by zero \(ZeroDivisionError, mine.py:11\)"),
         ("def fit(given): given.query()", "it asked for queries, and declares that it uses demonstrations"),

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import queue
 import re
 import sys
 from dataclasses import asdict, replace
@@ -20,6 +21,7 @@ from safetensors.torch import save_file as torch_save
 from deconfounded import envs
 from deconfounded.benchmarks import check, data
 from deconfounded.benchmarks.console import run_command
+from deconfounded.benchmarks.engine import progress
 from deconfounded.benchmarks.engine.scheduler import run_job
 from deconfounded.deconf import methods
 from deconfounded.deconf.core.adam import Adam
@@ -342,16 +344,22 @@ class TestTasks:
         assert re.fullmatch(r"error: .*SystemExit, test_doors.py:\d+\)\n", capsys.readouterr().err)
 
         class Ending:
+            ticks = 0
+
             def run(self) -> str:
                 raise SystemExit(0)
 
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
         with pytest.raises(envs.InputError, match=r"ended by 0 \(SystemExit, test_doors.py"):
             run_job(Ending())  # type: ignore[arg-type]
 
-    def test_a_job_that_memory_is_too_small_for(self) -> None:
+    def test_a_job_that_memory_is_too_small_for(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """It fails, and the others go on; any other error of a method of ours is one of the program."""
+        monkeypatch.setattr(progress, "_ticks", queue.Queue(), raising=False)
 
         class Large:
+            ticks = 0
+
             def __init__(self, error: Exception) -> None:
                 self.error = error
 

@@ -288,7 +288,10 @@ class TestNotes:
         assert "1 gaps: more than 1.5 times the usual 0.1 of time passes (the first: row 7 of" in notes
         assert "1 rows have the time of the row before them: duplicates? (the first: row 4" in notes
         assert "Constant: gear." in notes
+        assert "nothing to imitate" not in notes
         assert "Constant" not in " ".join(of_csv(tmp_path).notes)
+        still = write_csv(tmp_path / "still.csv", [{**row, "throttle": 3} for row in rows()])
+        assert "there is nothing to imitate." in " ".join(datasets.read(still, **ROLES).notes)
 
     def test_time_that_runs_backwards(self, tmp_path: Path) -> None:
         """In all of it, in a shuffled part, or where a column that says what an episode is was forgotten."""
@@ -331,7 +334,7 @@ class TestNotes:
         assert "In 5 episodes the last action has no next observation; it is dropped." in notes
         made = [*rows(), {**rows()[0], "lap": 9}]
         notes = " ".join(datasets.read(write_csv(tmp_path / "x.csv", made), **ROLES).notes)
-        assert "1 episodes of one row, without a step, are left out." in notes
+        assert "Episodes of one row, without a step, are left out: 1." in notes
         assert "is dropped" not in notes
 
 
@@ -580,6 +583,11 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     ),
     "case": ({"trial": "VEHICLE"}, {}, "trial 'VEHICLE' is no column of .*; did you mean 'vehicle'?"),
     "text": ({}, {"speed x": "fast"}, "'speed x' of .*x.csv is 'fast' in row 3; it must be a number"),
+    "a decimal comma": (
+        {},
+        {"speed x": "-0,5"},
+        "'speed x' of .*x.csv is '-0,5' in row 3; it must be a number, with a decimal point",
+    ),
     "text among actions": ({}, {"throttle": "off"}, "'throttle' of .*x.csv is 'off' in row 3; it must be a number"),
     "NaN": ({}, {"speed x": "nan"}, "'speed x' of .*x.csv holds no number in row 3"),
     "no action": ({}, {"throttle": ""}, "'throttle' of .*x.csv is empty in row 3"),
@@ -587,6 +595,11 @@ BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {  # roles; changes
     "infinite observation": ({}, {"speed x": "-inf"}, "'speed x' of .*x.csv is infinite in row 3"),
     "two roles": ({"obs": ["speed x", "throttle"]}, {}, "obs 'throttle' of .*x.csv is an action too; a column has one"),
     "a trial observed": ({"obs": ["speed x", "vehicle"]}, {}, "obs 'vehicle' of .* is what a trial or an episode is"),
+    "a trial and an episode": (
+        {"episode": "vehicle"},
+        {},
+        "trial 'vehicle' of .* is the episode too; a column has one",
+    ),
     "apart": (
         {},
         {"lap": 7},
