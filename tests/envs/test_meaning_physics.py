@@ -260,6 +260,16 @@ def test_a_grid_is_of_mid_quantiles(distribution: Any) -> None:
     np.testing.assert_allclose(latent.grid(5), by_hand)
 
 
+@pytest.mark.parametrize(
+    ("name", "k", "values"), [("windy_drone", 8, 4), ("windy_drone", 27, 9), ("windy_drone", 26, 8)]
+)
+def test_a_grid_of_two_latents(name: str, k: int, values: int) -> None:
+    """All combinations of as many values of each as k^(2/3) has room for, also where that is a whole number."""
+    grid = envs.get(name).theta_grid(k)
+    assert [len({*column}) for column in grid.T] == [values] * 2
+    assert len({tuple(theta) for theta in grid.tolist()}) == len(grid) == values**2
+
+
 def test_quantiles_of_categories() -> None:
     """Of five, each begins a fifth after the one before, and is that of all quantiles up to the next."""
     latent = envs.Latent("x", "", 2, 6, "categorical")

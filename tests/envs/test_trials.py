@@ -33,6 +33,19 @@ def test_a_reset_of_some_environments() -> None:
     np.testing.assert_array_equal(env.theta[where], given[where])
 
 
+def test_actions_of_episodes_that_are_over_may_be_anything() -> None:
+    """As an agent's that was not asked; of the others NaN is an error."""
+    env = envs.BatchEnv(envs.get("weak_thruster"), 2)
+    env.reset(0)
+    env.state[0, 1] = -0.4  # m; it falls below the ground in the first step
+    env.state[0, 2] = -5.0
+    _, _, terminated, _ = env.step(np.zeros((2, 1)))
+    assert terminated.tolist() == [True, False]
+    env.step(np.array([[np.nan], [0.0]]))
+    with pytest.raises(envs.InputError, match="held NaN or infinity"):
+        env.step(np.array([[0.0], [np.nan]]))
+
+
 def test_a_theta_out_of_bounds_is_named() -> None:
     """It, and not one of those beside it."""
     env = envs.BatchEnv(envs.get("tilted_cartpole"), 3)
