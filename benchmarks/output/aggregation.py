@@ -103,7 +103,7 @@ def one_text(records: Sequence[Record]) -> None:
     texts = {record["task"]: record["outside"].get("task") for record in records}
     for record in records:
         if record["outside"].get("task") != texts[record["task"]]:
-            raise InputError(f"records of {record['task']} are of two texts of its file; make them again with one")
+            raise InputError(f"records of {record['task']} are from two versions of its file; make them again with one")
 
 
 def _versions(records: Sequence[Record]) -> dict[str, str]:

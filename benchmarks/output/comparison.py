@@ -90,7 +90,7 @@ def gathered(every: Sequence[Record], against: Sequence[str]) -> dict[str, dict[
     aggregation.one_text(every)
     for name, of_method in records.grouped(every, lambda record: record["method"]).items():
         if len({record["outside"].get("method") for record in of_method}) > 1:
-            raise InputError(f"records of {name} are of two texts of its file; make them again with one")
+            raise InputError(f"records of {name} are from two versions of its file; make them again with one")
     for record in every:
         if records.named(record) not in REFERENCES:
             add(record)

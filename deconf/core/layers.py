@@ -1,7 +1,9 @@
 """Layers of S seeds side by side: linear maps and MLPs.
 
 S seeds train in one program: every parameter and every tensor has a leading axis of S. Seeds share nothing, so that a
-seed's numbers are the same, bit for bit, whatever runs beside it.
+seed's numbers are the same, bit for bit, whatever runs beside it. Exceptions are sigmoid, softplus and sinh, of binary
+observations and labels of heavy tails, on tensors whose size is no multiple of 32: torch computes what is left over,
+which is of the last seed, by other code, whose last bits may differ.
 """
 
 import ctypes

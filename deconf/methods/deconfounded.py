@@ -40,7 +40,7 @@ class DeconfoundedConfig(Configuration):
     width: int = 64
     latent: int = 8  # dimensions of theta_hat, or its number of values if discrete
     beta: float = 1e-3
-    warm_up: float = 0.5  # share of inference updates over which beta rises to its value
+    warm_up: float = 0.5  # share of a model's inference updates over which beta rises to its value
     rounds: int = 8
     inference_updates: int = 300  # a round
     inference_batch: int | None = 16  # trials, whose every step is evidence; None: all there are
@@ -91,8 +91,7 @@ def train(
     if config.drifts:
         inference_batch = inference_batch and inference_batch * episodes  # as many steps as of whole trials
     by_round = config.inference_by_round()
-    inferences = sum(by_round)
-    total = inferences + config.rounds * config.imitation_updates + config.final_updates
+    total = sum(by_round) + config.rounds * config.imitation_updates + config.final_updates
 
     def begun(updates: int) -> tuple[DeconfoundedAgent, Adam, Adam, Checkpoint]:
         """An untrained agent, the optimizers of its model, for so many updates, and of its policy; what is saved."""
@@ -111,8 +110,9 @@ def train(
         optimizer.step(loss)
         monitor.update(done + 1, total, {"imitation": loss.mean().item()}, agent)
 
-    begin, done = 0, 0
-    agent, inference, imitation, checkpoint = begun(sum(by_round[:-1] if config.restarts else by_round))
+    begin, done, start = 0, 0, 0
+    span = sum(by_round[:-1] if config.restarts else by_round)  # updates of the model that there is, from start on
+    agent, inference, imitation, checkpoint = begun(span)
     if before := checkpoint.load():
         begin, belief, latents, explored = before["round"], before["belief"], before["latents"], Batch(*before["seen"])
         expert = Batch(*before["expert"]) if before["expert"] else expert
@@ -125,10 +125,11 @@ def train(
             if not config.accumulate:
                 expert = Batch.of(unit(trials_of(trials)), seeds, device)
         if config.restarts and i == config.rounds - 1:
-            agent, inference, imitation, checkpoint = begun(by_round[-1])
+            start, span = span, by_round[-1]
+            agent, inference, imitation, checkpoint = begun(span)
         model, online = agent.model, agent.online
         for j in range(sum(by_round[:i]), sum(by_round[: i + 1])):  # of phi and psi
-            warm = ramp(j, config.warm_up * inferences)
+            warm = ramp(j - start, config.warm_up * span)
             beginnings = explored.beginnings(j, config.shortest)
             batch = beginnings.draw_trials(inference_batch, draws)
             loss = model.learn(inference, batch, config.inference_steps, config.beta * warm, draws)

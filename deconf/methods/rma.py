@@ -128,7 +128,8 @@ def train(
     teacher = memoryless_bc.train(trials, _teacher(config), rngs, theta)
     adapter = Adapter(config.width, theta.shape[-1], teacher.scales, draws)
     agent = RmaAgent(adapter, teacher.policy)
-    chunks = -(-trials.mask[0].size // config.chunk)
+    first = trials_and("their theta [B, E, F]", explore(None))
+    chunks = -(-first[0].mask[0].size // config.chunk)  # of roll-outs, whatever length the expert's trials have
     share = config.updates / (chunks * config.rounds * (config.rounds + 1) / 2)
     passes = [max(1, round(share * (i + 1))) for i in range(config.rounds)]
     total = sum(passes) * chunks
@@ -138,7 +139,7 @@ def train(
     if before := checkpoint.load():
         begin, data, targets = before["round"], Batch(*before["data"]), before["targets"]
     for i in range(begin, config.rounds):
-        own, thetas = trials_and("their theta [B, E, F]", explore(agent if i > 0 else None))
+        own, thetas = trials_and("their theta [B, E, F]", explore(agent)) if i > 0 else first
         new, target = Batch.of(own, len(rngs), config.device), joined_theta(own, thetas, len(rngs), config.device)
         data, targets = (new, target) if data is None else (data.joined(new), joined_trials(targets, target))
         for j in range(passes[i]):
@@ -156,7 +157,10 @@ def _teacher(config: RmaConfig) -> MemorylessConfig:
 
 
 def _pass(agent: RmaAgent, optimizer: Adam, batch: Batch, theta: Tensor, chunk: int) -> float:
-    """One pass through trials [S, B, T]: an update a chunk, the memory passed on; returns the mean error."""
+    """One pass through trials [S, B, T]: an update a chunk, the memory passed on; returns the mean error.
+
+    A chunk in which no trial has a step, as in round 0 where random actions end episodes early, is an update too.
+    """
     state, errors = agent.adapter.start(len(batch)), []
     for begin in range(0, batch.mask.shape[2], chunk):
         part = slice(begin, begin + chunk)

@@ -153,7 +153,8 @@ class RecurrentAgent(LearnedAgent):
 class RecurrentTrainer:
     """Trains by truncated backpropagation: in a pass through trials, each chunk is an update and hands its memory on.
 
-    `done` and `total` count updates; there is at least one pass.
+    `done` and `total` count updates; there is at least one pass. A chunk in which no trial of the batch has a step, as
+    where one trial of the data is much longer than the others, is an update too: it moves weights by Adam's moments.
     """
 
     def __init__(self, agent: RecurrentAgent, config: RecurrentConfig, steps: int, monitor: Monitor) -> None:

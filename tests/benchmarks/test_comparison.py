@@ -170,7 +170,7 @@ def test_records_of_two_kinds_are_not_compared(key: str) -> None:
 def test_records_of_two_texts_of_a_method_are_not_compared() -> None:
     """On two tasks; they would be averaged over."""
     of_texts = [record("mine", 0, 0.5, task) | {"outside": {"method": task}} for task in ("curling", "bandit")]
-    with pytest.raises(InputError, match="records of mine are of two texts of its file; make them again with one"):
+    with pytest.raises(InputError, match="records of mine are from two versions of its file; make them again with one"):
         comparison.gathered(of_texts, [])
     assert comparison.gathered([made | {"outside": {"method": "a"}} for made in of_texts], [])
 

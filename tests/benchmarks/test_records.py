@@ -406,7 +406,7 @@ class TestRecords:
         assert records.read(tmp_path / "bandit.jsonl") == ([edited] if kind == "task" else [other, edited])
         superseded = records.read(tmp_path / "superseded" / "bandit.jsonl")
         assert superseded == without_curve(*([two, one, other] if kind == "task" else [two, one]))
-        says = "of two texts of its file" if kind == "task" else "of two versions of blind_bc"
+        says = "from two versions of its file" if kind == "task" else "of two versions of blind_bc"
         with pytest.raises(envs.InputError, match=says):
             aggregation.gather([edited, one])
 

@@ -602,6 +602,18 @@ class TestMethods:
         assert replace(config, rounds=1).inference_by_round() == [20]
         assert replace(config, restart=False).inference_by_round() == [20] * 5
 
+    def test_a_restart_warms_up_anew(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """beta rises over half of the updates of the first networks, and again over half of those of the new ones."""
+        trials, _ = demonstrations("slippery_cartpole", 4)
+        betas, learn = list[float](), VariationalModel.learn
+        spy = lambda self, *given: (betas.append(given[3]), learn(self, *given))[1]  # noqa: E731
+        monkeypatch.setattr(VariationalModel, "learn", spy)
+        changed = {**FEW, "model": "evidence", "rounds": 2, "inference_updates": 4, "beta": 1.0, "warm_up": 0.5}
+        deconfounded.train(
+            trials, lambda agent: trials, DeconfoundedConfig(**changed, restart=True), np.random.default_rng(0)
+        )
+        assert betas == [0, 0.5, 1, 1] * 2
+
     @pytest.mark.parametrize("restart", [False, True])
     def test_a_restart_renews_networks(self, restart: bool) -> None:
         """Weights after the last round have as much to do with those before it as those of a network drawn anew."""

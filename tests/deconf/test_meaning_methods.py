@@ -127,6 +127,17 @@ class TestRounds:
         agent = rma.train(trials(), np.zeros((N, EPISODES, 1)), explore, config, [rng()])
         assert behaviours == [None, agent]
 
+    def test_of_rma_are_as_many_as_roll_outs_have_chunks(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Else the learning rate is 0 before the last rounds, where roll-outs are longer than the expert's trials."""
+        steps, step, twice = list[int](), Adam.step, np.concatenate([trials().mask] * 2, 1)
+        long = Trials(np.concatenate([trials().obs] * 2, 1), np.concatenate([trials().action] * 2, 1), twice)
+        config = RmaConfig(width=8, chunk=STEPS, updates=6, rounds=2, batch=4, teacher_updates=1, teacher_batch=8)
+        monkeypatch.setattr(Adam, "step", lambda self, loss: (steps.append(self._updates or 0), step(self, loss))[1])
+        theta = np.zeros((N, EPISODES, 1))
+        rma.train(trials(), theta, lambda agent: (long, np.repeat(theta, 2, 1)), config, [rng()])
+        _, *student = steps  # the first is the teacher's
+        assert {*student} == {len(student)}
+
     def test_of_dpt(self, sizes: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
         """Each label stays with its trial: here it is the trial's number."""
         behaviours = list[Agent | None]()
