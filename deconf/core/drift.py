@@ -30,7 +30,12 @@ def episodes_of(trials: Trials) -> Trials:
 
 @torch.no_grad()
 def choose_kept(model: LatentModel, episodes: Batch, per_trial: int, draws: Draws) -> None:
-    """Set `kept` of each seed's model to the share of highest likelihood on episodes [S, B E, T], E = per_trial."""
+    """Set `kept` of each seed's model to the share of highest likelihood on episodes [S, B E, T], E = per_trial.
+
+    Trials of one episode tell nothing of it, and leave it as it is.
+    """
+    if per_trial == 1:
+        return
     seeds, steps = len(episodes.mask), episodes.mask.shape[2]
     trials = Batch(*(x.unflatten(1, (-1, per_trial)).repeat(1, SHARES, *[1] * (x.dim() - 1)) for x in episodes.tensors))
     shares = torch.linspace(0, 1, SHARES, device=episodes.mask.device) ** model.share_power

@@ -176,6 +176,9 @@ def test_kept_share_is_chosen_without_theta(power: int) -> None:
     assert model.kept[1] == 0
     assert 0 < model.kept[2] < 1
     assert torch.isclose(model.kept[2], torch.linspace(0, 1, SHARES) ** power).any()
+    before = model.kept.clone()
+    choose_kept(model, episodes, 1, Draws([np.random.default_rng(i) for i in range(3)], "cpu"))
+    assert torch.equal(model.kept, before)  # trials of one episode do not tell
 
 
 @pytest.mark.parametrize("kind", ["evidence", "discrete"])
