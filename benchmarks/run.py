@@ -80,7 +80,7 @@ def main() -> None:
         for task in tasks:
             know_guests(folders[task.name] / "jobs")
             changed(amounts(args.protocol, preset(args.preset, task, args.device)), args.set)
-        if not args.resume:  # which has to have the same --set
+        if not args.resume:  # a resumed run has to be given the same --set
             for change in args.set:
                 if (method := whose(change)) not in ("", *wanted):
                     right = "add it to --methods, or leave the change out"

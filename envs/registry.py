@@ -108,7 +108,7 @@ def get(name: str) -> Task:
     if before and not outside.edited(before):
         return before()
     cls = outside.find("task", name)
-    if any(cls is known for known in TASKS.values()):  # one of this package's, by the module that it is in
+    if any(cls is task for task in TASKS.values()):  # one of this package's, by the module that it is in
         return cls()
     if not isinstance(cls, type):
         raise InputError(f"task {name!r} is {cls!r}; it must be a subclass of deconfounded.envs.Task, or a world")

@@ -43,7 +43,7 @@ class Pane:
         self._renderers: dict[int, Any] = {}
         state, action, theta = clip["state"], clip["action"], clip["theta"][clip["episode"]]
         reward = np.append(0.0, task.reward(state[:-1], action[1:], state[1:], theta[1:]))
-        total = reward.cumsum()  # of a start, which is of no step, it is subtracted
+        total = reward.cumsum()  # what a start has, which is no step, is subtracted below
         self.earned = total - np.repeat(total[self.starts], np.diff(np.append(self.starts, len(total))))
 
     def row(self, episode: int, t: int) -> tuple[int, bool]:

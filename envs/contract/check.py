@@ -226,11 +226,11 @@ def _of_expert(task: Task, name: str, acted: Acted, obs: Array, theta: Array) ->
     """
     with _part(task, name):
         given = acted(obs.copy(), theta.copy())
-        shape = len(obs), task.n_actions or task.action_width
+        rows = np.empty(0) if given is None else np.asarray(given, float)
+    shape = len(obs), task.n_actions or task.action_width
     right = f"{shape}, a row for each observation"
     if given is None:
         raise InputError(f"{name} of {task.name} was None, as where a class has no {name}; it must be {right}")
-    rows = np.asarray(given, float)
     if rows.shape != shape:
         raise InputError(f"{name} of {task.name} had shape {rows.shape}; it must be {right}")
     fits = (rows > 0).all(-1) & np.isclose(rows.sum(-1), 1) if task.n_actions else np.isfinite(rows).all(-1)

@@ -268,6 +268,7 @@ UNSURE = np.random.default_rng(0)
         (lambda obs: None, r"was None, .* no expert_mean; it must be \(16, 1\)"),
         (lambda obs: np.where(obs[:, :1] > 0, np.nan, 0), r"gave \[nan\]; it must be finite"),
         (lambda obs: obs[:, 4, None], r"index 4.*"),
+        (lambda obs: [[0.0], [0.0, 1.0]], "setting an array element with a sequence"),
     ],
 )
 def test_a_closed_form_expert_is_checked(mean: Any, says: str) -> None:
